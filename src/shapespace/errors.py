@@ -1,0 +1,37 @@
+"""The tree of errors that shapespace raises: one sentence each, saying what is wrong, where, and what to do."""
+
+
+class ShapespaceError(Exception):
+    """Base of every error that shapespace raises on purpose."""
+
+
+class InputError(ShapespaceError, ValueError):
+    """An argument or an array has the wrong shape, type or value."""
+
+
+class MeshError(InputError):
+    """A surface cannot be used: no points, not finite, degenerate, or faces that point nowhere."""
+
+
+class CorrespondenceError(InputError):
+    """Meshes, or a mesh and a model, do not share their vertices or their triangles."""
+
+
+class FileError(ShapespaceError):
+    """A file cannot be read or written; the sentence names it."""
+
+
+class FileFormatError(FileError, ValueError):
+    """A file is not in the format it claims, or it is cut short or damaged."""
+
+
+class ModelFileError(FileFormatError):
+    """A model file is damaged, of an unknown version, or not a shapespace model."""
+
+
+class DataError(ShapespaceError):
+    """An open data set is missing, could not be downloaded, or does not match its published hash."""
+
+
+class FitError(ShapespaceError):
+    """A scan cannot be fitted at all; a fit that merely went badly is a result with a status instead."""
