@@ -1,0 +1,123 @@
+"""Files that are either whole or not there: atomic writing, hashes, and errors that name the file."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from shapespace.errors import FileError
+
+_WRITE_HINTS = {
+    errno.ENOSPC: "the disk is full; free some space and run again",
+    errno.EACCES: "no permission; choose another folder",
+    errno.EPERM: "no permission; choose another folder",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
+    errno.EISDIR: "it is a folder; give a file name",
+    errno.EEXIST: "a file of that name is in the way; choose another folder",
+}
+
+
+def write_error(path: Path, error: OSError) -> FileError:
+    """Return the one-sentence error for an `OSError` met while writing `path`."""
+    hint = _WRITE_HINTS.get(error.errno or 0, error.strerror or str(error))
+    return FileError(f"Cannot write {path}: {hint}.")
+
+
+def read_error(path: Path, error: OSError) -> FileError:
+    """Return the one-sentence error for an `OSError` met while reading `path`."""
+    if isinstance(error, FileNotFoundError):
+        return FileError(f"Cannot read {path}: there is no such file; check the name.")
+    if isinstance(error, IsADirectoryError):
+        return FileError(f"Cannot read {path}: it is a folder; give the files in it.")
+    if isinstance(error, PermissionError):
+        return FileError(f"Cannot read {path}: no permission to read it.")
+    return FileError(f"Cannot read {path}: {error.strerror or error}.")
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the whole content of `path`.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise read_error(path, error) from error
+
+
+def make_folder(path: Path) -> Path:
+    """Create the folder `path` and its parents, and return it.
+
+    Raises:
+        FileError: it cannot be created.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from error
+    return path
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` that replaces it when the block ends well and vanishes otherwise.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}.", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise write_error(path, error) from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    except OSError as error:
+        raise write_error(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` to `path`, whole or not at all.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` as UTF-8 with newlines as they are, whole or not at all.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def sha256_of_file(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of the file at `path`.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise read_error(path, error) from error
