@@ -20,9 +20,7 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int32]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
-MM_PER_UNIT: Mapping[str, float] = MappingProxyType(
-    {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0}
-)
+MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0})
 """Millimetres in one of each unit a scan may come in."""
 
 
@@ -137,9 +135,7 @@ class Similarity:
 
     def __matmul__(self, other: Similarity) -> Similarity:
         """Compose: `T_c_b @ T_b_a` is `T_c_a`."""
-        return Similarity(
-            self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation)
-        )
+        return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:

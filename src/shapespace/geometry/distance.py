@@ -1,0 +1,93 @@
+"""Distances between two surfaces, both ways, and their summaries in mm.
+
+A one-way average is zero for a model that has shrunk to a point of the scan, so both directions always travel
+together (`method.md` section 6b; Sariyanidi et al., IJCB 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
+from shapespace.geometry.surface import boundary_vertices
+from shapespace.types import BoolArray, FloatArray, Mesh
+
+
+@dataclass(frozen=True)
+class DistanceSummary:
+    """What is said of one direction, in mm; `count` points were measured, `fraction` of those there were."""
+
+    mean: float
+    median: float
+    rms: float
+    p95: float
+    max: float
+    count: int
+    fraction: float
+
+    @staticmethod
+    def of(distance_mm: FloatArray, counted: BoolArray | None = None) -> DistanceSummary:
+        """Summarise `distance_mm` (M,) over the points `counted` (M,); not-a-number where none are."""
+        kept = distance_mm if counted is None else distance_mm[counted]
+        if len(kept) == 0:
+            nan = float("nan")
+            return DistanceSummary(nan, nan, nan, nan, nan, 0, 0.0)
+        return DistanceSummary(
+            float(kept.mean()),
+            float(np.median(kept)),
+            float(np.sqrt((kept**2).mean())),
+            float(np.percentile(kept, 95)),
+            float(kept.max()),
+            len(kept),
+            len(kept) / len(distance_mm),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceDistances:
+    """Closest distances between a model surface and a scan, both ways.
+
+    Args:
+        model_to_scan_mm: (V,) from each model vertex to the scan.
+        scan_to_model_mm: (S,) from each scan vertex to the model.
+        scan_counted: (S,) False where the closest model point lies on the model's rim: there the scan shows
+            something that the model does not cover, such as the back of a head.
+    """
+
+    model_to_scan_mm: FloatArray
+    scan_to_model_mm: FloatArray
+    scan_counted: BoolArray
+
+    @property
+    def model_to_scan(self) -> DistanceSummary:
+        """Summary over all model vertices: the paper's metric."""
+        return DistanceSummary.of(self.model_to_scan_mm)
+
+    @property
+    def scan_to_model(self) -> DistanceSummary:
+        """Summary over the scan vertices that the model covers."""
+        return DistanceSummary.of(self.scan_to_model_mm, self.scan_counted)
+
+    def as_dict(self) -> dict[str, dict[str, float]]:
+        """Return both summaries as plain numbers for a result file."""
+        return {"model_to_scan": asdict(self.model_to_scan), "scan_to_model": asdict(self.scan_to_model)}
+
+
+def surface_distances(
+    model: Mesh, scan: Mesh, *, scan_engine: ClosestPointEngine | None = None, mm_per_length: float = 1.0
+) -> SurfaceDistances:
+    """Measure closest distances between the vertices of each surface and the other surface.
+
+    Args:
+        model: the model's surface, in the frame of the scan.
+        scan: the scan; point clouds are measured to their points.
+        scan_engine: the scan's search structure when it is there already.
+        mm_per_length: what one length in this frame is worth in mm of the model's frame.
+    """
+    engine = scan_engine or build_engine(scan)
+    forward = engine.query(model.vertices)
+    backward = build_engine(model).query(scan.vertices)
+    counted = ~on_boundary(backward, model, boundary_vertices(model))
+    return SurfaceDistances(forward.distance * mm_per_length, backward.distance * mm_per_length, counted)

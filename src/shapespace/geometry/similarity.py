@@ -1,0 +1,64 @@
+"""Least-squares similarity between two matched point sets: equations 8 to 18 of the paper, misprints corrected.
+
+Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `docs/errata.md` lists what the
+paper prints and what is right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray, Similarity
+
+_RANK_TOLERANCE = 1e-9
+
+
+def fit_similarity(
+    source: FloatArray, target: FloatArray, weights: FloatArray | None = None, *, with_scale: bool = True
+) -> Similarity:
+    """Return the `T_target_source` that minimises sum_i w_i |target_i - (s R source_i + T)|^2.
+
+    The rotation is a proper one even where a mirror image would fit better, and the data may lie on a plane.
+
+    Args:
+        source: (N, 3) points p, mm.
+        target: (N, 3) matched points p', mm.
+        weights: (N,) non-negative; None for ones.
+        with_scale: False fits a rigid motion (s = 1).
+
+    Raises:
+        InputError: shapes differ, values are not finite, weights are negative, or the points with weight lie on
+            a line, so that no rotation is determined.
+    """
+    if source.ndim != 2 or source.shape[1] != 3 or source.shape != target.shape:
+        raise InputError(
+            f"A similarity needs two point sets of the same shape (N, 3), not {source.shape} and {target.shape}."
+        )
+    w = np.ones(len(source)) if weights is None else weights
+    if w.shape != (len(source),) or (w < 0).any() or not np.isfinite(w).all():
+        raise InputError("The weights of a similarity must be one finite, non-negative number a point.")
+    total = w.sum()
+    if total <= 0:
+        raise InputError("A similarity needs at least three points with a positive weight.")
+    w = w / total
+
+    mean_source, mean_target = w @ source, w @ target  # eqs 8-9
+    q, q_prime = source - mean_source, target - mean_target  # eqs 10-11
+    spread = w @ (q * q).sum(axis=1)
+    if not (np.isfinite(spread) and np.isfinite(q_prime).all()):
+        raise InputError("The points of a similarity must be finite.")
+
+    H = (q * w[:, None]).T @ q_prime  # eq 12
+    U, D, Vt = np.linalg.svd(H)  # eq 13
+    if spread <= 0 or D[1] <= _RANK_TOLERANCE * max(D[0], np.finfo(float).tiny):
+        raise InputError(
+            "The matched points lie on a line or coincide, so they determine no rotation; use more points."
+        )
+    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # eq 16: the reflection guard
+    R = (Vt.T * Z) @ U.T  # eqs 14-15, as corrected
+    s = float((D * Z).sum() / spread) if with_scale else 1.0  # eq 18, as corrected
+    if s <= 0:
+        raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
+    T = mean_target - s * R @ mean_source  # eq 17, as corrected
+    return Similarity(s, R, T)

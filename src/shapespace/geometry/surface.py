@@ -1,0 +1,77 @@
+"""What can be said of a surface from its vertices and triangles alone: areas, normals, boundary, samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.errors import MeshError
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+
+def faces_of(mesh: Mesh) -> IntArray:
+    """Return the triangles of `mesh`, (F, 3) int32.
+
+    Raises:
+        MeshError: it is a point cloud.
+    """
+    if mesh.faces is None:
+        raise MeshError(f"{mesh.name} has no faces, and triangles are needed here; give a mesh, not a point cloud.")
+    return mesh.faces
+
+
+def face_vectors(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Return (F, 3) cross products: normals of the triangles, as long as twice their areas."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return np.cross(b - a, c - a)
+
+
+def face_areas(mesh: Mesh) -> FloatArray:
+    """Return the area of each triangle, (F,) in squared units of the vertices."""
+    return 0.5 * np.linalg.norm(face_vectors(mesh.vertices, faces_of(mesh)), axis=1)
+
+
+def vertex_normals(mesh: Mesh) -> FloatArray:
+    """Return unit normals at the vertices, (V, 3), area-weighted; zero where no triangle gives one."""
+    faces = faces_of(mesh)
+    vectors = face_vectors(mesh.vertices, faces)
+    flat = faces.ravel()
+    normals = np.stack([np.bincount(flat, np.repeat(vectors[:, k], 3), len(mesh.vertices)) for k in range(3)], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+
+def vertex_areas(mesh: Mesh) -> FloatArray:
+    """Return the area that belongs to each vertex, (V,): a third of each triangle around it."""
+    areas = np.repeat(face_areas(mesh) / 3.0, 3)
+    return np.bincount(faces_of(mesh).ravel(), areas, len(mesh.vertices))
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """Return the edges (E, 2) that belong to exactly one triangle."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    base = int(faces.max()) + 1 if len(faces) else 1
+    keys, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
+    single = keys[counts == 1]
+    return np.stack([single // base, single % base], axis=1).astype(np.int32)
+
+
+def boundary_vertices(mesh: Mesh) -> BoolArray:
+    """Return (V,) True for the vertices on the rim of the surface; all False for a point cloud."""
+    mask = np.zeros(len(mesh.vertices), dtype=np.bool_)
+    if mesh.faces is not None:
+        mask[boundary_edges(mesh.faces).ravel()] = True
+    return mask
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return `count` points drawn evenly by area from the surface, (count, 3)."""
+    faces = faces_of(mesh)
+    areas = face_areas(mesh)
+    if not areas.sum() > 0:
+        raise MeshError(f"{mesh.name}: all its triangles have no area, so no points can be drawn from it.")
+    chosen = rng.choice(len(faces), size=count, p=areas / areas.sum())
+    u, v = rng.random(count), rng.random(count)
+    flip = u + v > 1
+    u[flip], v[flip] = 1 - u[flip], 1 - v[flip]
+    a, b, c = (mesh.vertices[faces[chosen, k]] for k in range(3))
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a)

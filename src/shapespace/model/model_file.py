@@ -1,0 +1,84 @@
+"""The model file: one HDF5 file with everything that the model is. Version 1."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace import __version__
+from shapespace.errors import FileFormatError, ModelFileError
+from shapespace.io.hdf5 import Attribute, read_hdf5, write_hdf5
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+
+FORMAT_NAME = "shapespace model"
+FORMAT_VERSION = 1
+
+
+def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
+    """Return the arrays and attributes that make up `model`; the software version is not part of them."""
+    arrays: dict[str, npt.NDArray[Any]] = {"mean": model.mean, "basis": model.basis, "stddev": model.stddev}
+    if model.faces is not None:
+        arrays["faces"] = model.faces
+    attributes: dict[str, Attribute] = {
+        "format": FORMAT_NAME,
+        "format_version": FORMAT_VERSION,
+        "units": "mm",
+        "variance_divisor": "N - 1",
+        "gauge": model.gauge,
+        "representation": model.representation,
+        "total_variance": model.total_variance,
+        "n_training": model.n_training,
+        "landmarks": json.dumps(dict(model.landmarks)),
+        "provenance": model.provenance,
+        "licence": model.licence,
+    }
+    return arrays, attributes
+
+
+def save(model: ShapeModel, path: Path) -> None:
+    """Write `model` to `path`, whole or not at all."""
+    arrays, attributes = contents(model)
+    write_hdf5(path, arrays, {**attributes, "model_hash": model.content_hash, "software_version": __version__})
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Return the fields of the `ShapeModel` in `path`.
+
+    Raises:
+        FileError: it cannot be read.
+        ModelFileError: it is damaged, of another version, or not a model.
+    """
+    try:
+        arrays, attributes = read_hdf5(path)
+    except FileFormatError as error:
+        raise ModelFileError(str(error)) from error
+    if attributes.get("format") != FORMAT_NAME:
+        raise ModelFileError(f"{path} is HDF5 but not a shapespace model; give a file written by shapespace build.")
+    if attributes.get("format_version") != FORMAT_VERSION:
+        raise ModelFileError(
+            f"{path} is a model of format version {attributes.get('format_version')}, but this shapespace reads "
+            f"version {FORMAT_VERSION}; update shapespace."
+        )
+    try:
+        stored = cast(dict[str, int], json.loads(str(attributes["landmarks"])))
+        return {
+            "mean": arrays["mean"].astype(np.float64),
+            "basis": arrays["basis"].astype(np.float64),
+            "stddev": arrays["stddev"].astype(np.float64),
+            "faces": arrays["faces"].astype(np.int32) if "faces" in arrays else None,
+            "total_variance": float(attributes["total_variance"]),
+            "n_training": int(attributes["n_training"]),
+            "gauge": str(attributes["gauge"]),
+            "landmarks": {str(name): int(vertex) for name, vertex in stored.items()},
+            "representation": str(attributes["representation"]),
+            "provenance": str(attributes["provenance"]),
+            "licence": str(attributes["licence"]),
+        }
+    except (KeyError, ValueError, TypeError) as error:
+        raise ModelFileError(f"{path} is a shapespace model but a part of it is missing: {error}.") from error

@@ -1,0 +1,150 @@
+"""Principal components by the Gram trick: equations 1 to 5 of the paper, divisor N - 1.
+
+The (3V, 3V) covariance is never formed. The (N, N) Gram matrix of the centred shapes has the same non-zero
+eigenvalues, and costs one symmetric rank-k product. The shapes are centred in the Gram matrix rather than one by
+one, so that nothing as large as the data is ever copied. Alignment is not done here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from scipy.linalg import blas, eigh, solve_triangular
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray
+
+_BLOCK = 1024
+_CANCELLATION = 1e6
+"""Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
+_NO_VARIANCE = 1e-10
+"""Modes with less than this share of the first mode's variance are rounding, not shape (erratum to eq 4)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalComponents:
+    """The outcome of a PCA of N shapes with D coordinates.
+
+    Args:
+        mean: (D,) mm.
+        basis: (D, K) orthonormal columns, in order of falling variance, signs fixed.
+        variance: (K,) of the coefficients, mm^2, divisor N - 1.
+        total_variance: of all modes together, kept or not, mm^2.
+        n_samples: N.
+    """
+
+    mean: FloatArray
+    basis: FloatArray
+    variance: FloatArray
+    total_variance: float
+    n_samples: int
+
+
+def modes_for_variance(variance: FloatArray, share: float) -> int:
+    """Return the smallest number of modes that hold `share` (0 < share <= 1) of the sum of `variance` (R,).
+
+    Raises:
+        InputError: a share outside (0, 1].
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"A share of the variance lies above 0 and at most at 1, not at {share:g}.")
+    cumulative = np.cumsum(variance) / variance.sum()
+    return int(min(np.searchsorted(cumulative, share * (1 - 1e-12)) + 1, len(variance)))
+
+
+def principal_components(data: FloatArray, modes: int | float | None = None) -> PrincipalComponents:
+    """Return the exact principal components of `data`.
+
+    Args:
+        data: (N, D) float64, one shape a row; C order avoids a copy.
+        modes: how many, at most N - 1; a float below 1 for a share of the variance; None for all that vary.
+
+    Raises:
+        InputError: fewer than two samples, values that are not finite, no variation at all, or more modes asked
+            for than the samples can give.
+    """
+    n, d = data.shape
+    if n < 2:
+        raise InputError(f"A shape model needs at least two training shapes, not {n}.")
+    if isinstance(modes, int) and not 1 <= modes <= n - 1:
+        raise InputError(
+            f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "
+            f"ask for 1 to {n - 1} or add shapes."
+        )
+    data = np.ascontiguousarray(data)
+    gram = _centred_gram(data)
+    if not np.isfinite(np.diag(gram)).all():
+        raise InputError("The training shapes hold values that are not finite.")
+    total = float(gram.trace())
+    if total <= n * d * (64 * np.finfo(float).eps * float(np.abs(data[0]).max())) ** 2:
+        raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
+
+    wanted = modes if isinstance(modes, int) else n - 1
+    values, vectors = cast(
+        tuple[FloatArray, FloatArray],
+        eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True),
+    )
+    variance = values[::-1] / (n - 1)  # eq 4
+    variance = variance[variance > _NO_VARIANCE * variance[0]]
+    if isinstance(modes, float):
+        variance = variance[: modes_for_variance(variance, modes)]
+    weights = vectors[:, ::-1][:, : len(variance)] / np.sqrt(variance * (n - 1))
+    mean, basis = _mean_and_basis(data, weights)
+    return PrincipalComponents(mean, basis, variance.copy(), total / (n - 1), n)
+
+
+def _syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
+    """Return the lower triangle of block @ block.T, (N, N) Fortran-ordered, added to `onto` where given."""
+    dsyrk = cast(Any, blas).dsyrk
+    # block.T is Fortran-ordered, so BLAS reads it in place.
+    if onto is None:
+        return dsyrk(1.0, block.T, trans=1, lower=1)
+    return dsyrk(1.0, block.T, beta=1.0, c=onto, trans=1, lower=1, overwrite_c=1)
+
+
+def _centred_gram(data: FloatArray) -> FloatArray:
+    """Return the lower triangle of X^T X (N, N), X the centred shapes (eqs 1-3)."""
+    n = len(data)
+    raw = _syrk(data)
+    raw_trace = raw.trace()
+    lower = np.tril(raw, -1)
+    row_mean = (raw.diagonal() + lower.sum(axis=0) + lower.sum(axis=1)) / n
+    raw -= row_mean[:, None]
+    raw -= row_mean[None, :]
+    raw += row_mean.mean()
+    if np.isfinite(raw_trace) and raw.trace() * _CANCELLATION < raw_trace:
+        return _centred_gram_by_blocks(data)
+    return raw
+
+
+def _centred_gram_by_blocks(data: FloatArray) -> FloatArray:
+    """Do the same to full precision for shapes far from the origin, centring a block of coordinates at a time."""
+    n, d = data.shape
+    gram = np.zeros((n, n), order="F")
+    for start in range(0, d, _BLOCK):
+        block = data[:, start : start + _BLOCK] - data[0, start : start + _BLOCK]
+        block -= block.mean(axis=0)
+        gram = _syrk(block, onto=gram)
+    return gram
+
+
+def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean (D,) and P = X weights (D, K) (eq 5), orthonormal to rounding, with deterministic signs."""
+    n, k = weights.shape
+    combined = np.vstack([weights.T, np.full((1, n), 1.0 / n)]) @ data  # one pass over the data for both
+    mean, rows = combined[k].copy(), combined[:k]
+    column_sums = weights.sum(axis=0)
+    for row, column_sum in zip(rows, column_sums, strict=True):
+        row -= column_sum * mean
+        if -row.min() > row.max():
+            row *= -1.0
+    # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
+    overlap = rows @ rows.T
+    if np.abs(overlap - np.eye(k)).max() > 1e-12:
+        factor = np.linalg.cholesky(overlap)
+        for start in range(0, rows.shape[1], _BLOCK):
+            part = slice(start, start + _BLOCK)
+            rows[:, part] = np.asarray(solve_triangular(factor, rows[:, part], lower=True))
+    return mean, rows.T

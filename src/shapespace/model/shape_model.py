@@ -1,0 +1,266 @@
+"""The shape space: a mean, an orthonormal basis of modes, and how far each mode reaches (eqs 1-6)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import CorrespondenceError, InputError
+from shapespace.geometry.procrustes import Gauge, align_in_place
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.hdf5 import content_hash
+from shapespace.model import model_file
+from shapespace.model.choose_modes import choose_modes
+from shapespace.model.pca import principal_components
+from shapespace.model.representation import REPRESENTATIONS, Representation
+from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeModel:
+    """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (eq 6).
+
+    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b.
+
+    Args:
+        mean: (D,) mm; D = 3V for vertices.
+        basis: (D, K) orthonormal columns.
+        stddev: (K,) of each coefficient, mm.
+        total_variance: of all modes of the training set, kept or not, mm^2.
+        n_training: number of training shapes.
+        faces: (F, 3) int32 or None for point models.
+        gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).
+        landmarks: name -> vertex index.
+        representation: a name of `REPRESENTATIONS`.
+        provenance: what it was made from, in words.
+        licence: licence of the training data.
+
+    Raises:
+        InputError: arrays whose shapes do not belong together.
+    """
+
+    mean: FloatArray
+    basis: FloatArray
+    stddev: FloatArray
+    total_variance: float
+    n_training: int
+    faces: IntArray | None = None
+    gauge: Gauge = "shape"
+    landmarks: Mapping[str, int] = field(default_factory=lambda: dict[str, int]())
+    representation: str = "vertices"
+    provenance: str = ""
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
+        d, k = len(mean), len(stddev)
+        if mean.ndim != 1 or d % 3 or basis.shape != (d, k) or k < 1:
+            raise InputError(
+                f"A shape model needs mean (D,), basis (D, K) and stddev (K,), not {mean.shape}, {basis.shape} "
+                f"and {stddev.shape}."
+            )
+        if self.representation not in REPRESENTATIONS:
+            raise InputError(f"There is no representation {self.representation!r} in this version of shapespace.")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "basis", basis)
+        object.__setattr__(self, "stddev", stddev)
+        object.__setattr__(self, "landmarks", MappingProxyType(dict(self.landmarks)))
+        checked = Mesh(self._coder.decode(mean), self.faces, name="model")
+        object.__setattr__(self, "faces", checked.faces)
+        for name, vertex in self.landmarks.items():
+            if not 0 <= vertex < len(checked.vertices):
+                raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
+
+    @classmethod
+    def fit(
+        cls,
+        meshes: Sequence[Mesh],
+        *,
+        modes: int | float | Literal["auto"] | None = None,
+        gauge: Gauge = "shape",
+        align: bool = True,
+        alignment_vertices: IntArray | None = None,
+        landmarks: Mapping[str, int] | None = None,
+        provenance: str = "",
+        licence: str = "",
+        seed: int = 0,
+    ) -> ShapeModel:
+        """Build the shape space of corresponding `meshes` (eqs 1-5), in mm.
+
+        Args:
+            meshes: at least two, same vertices in the same order, same triangles.
+            modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
+                vertices; None for every mode that varies.
+            gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
+            align: False takes the meshes as they stand.
+            alignment_vertices: indices that carry the alignment, such as forehead and nose when expressions vary.
+            landmarks: name -> vertex index, kept in the model.
+            provenance: what the meshes are, in words.
+            licence: of the meshes.
+            seed: of the cross-validation.
+
+        Raises:
+            CorrespondenceError: the meshes differ in vertices or triangles.
+            InputError: too few meshes, values that are not finite, no variation, too many modes asked for.
+        """
+        faces = common_faces(meshes)
+        if len(meshes) < 2:
+            raise InputError(
+                f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
+            )
+        shapes = np.stack([mesh.vertices for mesh in meshes])
+        finite = np.isfinite(shapes).all(axis=(1, 2))
+        if not finite.all():
+            name = meshes[int(np.argmin(finite))].name
+            raise InputError(f"{name} holds vertices that are not finite; repair it or leave it out.")
+        _refuse_equal(shapes)
+        if align:
+            align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
+        data = REPRESENTATIONS["vertices"]().encode(shapes)
+        wanted = choose_modes(data, seed=seed).modes if modes == "auto" else modes
+        pc = principal_components(data, wanted)
+        return cls(
+            mean=pc.mean,
+            basis=pc.basis,
+            stddev=np.sqrt(pc.variance),
+            total_variance=pc.total_variance,
+            n_training=pc.n_samples,
+            faces=faces,
+            gauge=gauge,
+            landmarks=landmarks or {},
+            provenance=provenance,
+            licence=licence,
+        )
+
+    @cached_property
+    def _coder(self) -> Representation:
+        return REPRESENTATIONS[self.representation]()
+
+    @property
+    def n_modes(self) -> int:
+        """K, the number of modes."""
+        return len(self.stddev)
+
+    @property
+    def n_vertices(self) -> int:
+        """V, the number of vertices."""
+        return len(self.mean_vertices)
+
+    @cached_property
+    def mean_vertices(self) -> FloatArray:
+        """Vertices of the mean shape, (V, 3) mm."""
+        return self._coder.decode(self.mean)
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance per coordinate that the kept modes leave over, mm^2 (Tipping and Bishop, JRSS B 61(3), 1999)."""
+        kept = float((self.stddev**2).sum())
+        return max(self.total_variance - kept, 0.0) / max(len(self.mean) - self.n_modes, 1)
+
+    @cached_property
+    def cumulative_variance(self) -> FloatArray:
+        """Share of the training variance that the first k modes hold, (K,)."""
+        return np.cumsum(self.stddev**2) / self.total_variance
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of everything the model is, whatever file it stands in."""
+        return content_hash(*model_file.contents(self))
+
+    def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
+        """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
+
+        Args:
+            b: (k,) mm, k at most K; missing ones are zero.
+
+        Raises:
+            InputError: more coefficients than modes, or values that are not finite.
+        """
+        b = self._coefficients(b)
+        return self._coder.decode(self.mean + self.basis[:, : len(b)] @ b)
+
+    def mesh(self, b: npt.ArrayLike = ()) -> Mesh:
+        """Return the shape with coefficients `b` (k,) mm as a mesh with the model's triangles and landmarks."""
+        vertices = self.reconstruct(b)
+        landmarks = {name: vertices[index] for name, index in self.landmarks.items()}
+        return Mesh(vertices, self.faces, landmarks, name="model")
+
+    def project(self, shape: Mesh | FloatArray, *, align: bool = True) -> FloatArray:
+        """Return the coefficients b (K,), mm, of a shape in vertex correspondence: b = P^T (Q - mean) (eq 19).
+
+        Args:
+            shape: a mesh or (V, 3) vertices, mm, in the model's vertex order.
+            align: bring it to the model's mean first, by the model's gauge; False if it is in the model's frame.
+
+        Raises:
+            CorrespondenceError: another number of vertices than the model's.
+            InputError: values that are not finite.
+        """
+        vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, dtype=np.float64)
+        if vertices.shape != (self.n_vertices, 3):
+            name = shape.name if isinstance(shape, Mesh) else "The shape"
+            raise CorrespondenceError(
+                f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
+                "model's vertex order can be projected, so fit this one instead."
+            )
+        if not np.isfinite(vertices).all():
+            raise InputError("A shape to be projected must be finite.")
+        if align:
+            T_model_shape = fit_similarity(vertices, self.mean_vertices, with_scale=self.gauge == "shape")
+            vertices = T_model_shape.apply(vertices)
+        return self.basis.T @ (self._coder.encode(vertices) - self.mean)
+
+    def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return coefficients (count, K), mm, drawn from the normal distribution of the model."""
+        return rng.standard_normal((count, self.n_modes)) * self.stddev
+
+    def truncate(self, modes: int) -> ShapeModel:
+        """Return the model with its first `modes` modes; what they leave over joins `noise_variance`.
+
+        Raises:
+            InputError: fewer than one, or more than the model has.
+        """
+        if not 1 <= modes <= self.n_modes:
+            raise InputError(f"This model has {self.n_modes} modes, so it cannot be cut to {modes}.")
+        return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes])
+
+    def save(self, path: Path | str) -> None:
+        """Write the model to one HDF5 file, whole or not at all.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        model_file.save(self, Path(path))
+
+    @classmethod
+    def load(cls, path: Path | str) -> ShapeModel:
+        """Read a model written by `save`, checking its hashes.
+
+        Raises:
+            FileError: it cannot be read.
+            ModelFileError: it is damaged, of another version, or not a model.
+        """
+        return cls(**model_file.load(Path(path)))
+
+    def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
+        array = np.atleast_1d(np.asarray(b, dtype=np.float64))
+        if array.ndim != 1 or len(array) > self.n_modes:
+            raise InputError(f"Coefficients must have the shape (k,) with k at most {self.n_modes}, not {array.shape}.")
+        if not np.isfinite(array).all():
+            raise InputError("Coefficients must be finite.")
+        return array
+
+
+def _refuse_equal(shapes: FloatArray) -> None:
+    """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
+    spread = float(np.ptp(shapes, axis=0).max())
+    if spread <= 64 * np.finfo(float).eps * float(np.abs(shapes).max()):
+        raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
