@@ -1,0 +1,524 @@
+"""Open data sets: where they are, what they must hash to, and how to get them.
+
+A data set is looked for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder holding `<name>/`),
+the cache folder of the platform (`pooch.os_cache`, or `SHAPESPACE_CACHE`), and then the network: the published
+repository at a pinned commit, or the server that `SHAPESPACE_DATA_URL` names, laid out like a local mirror.
+Nothing is used before it is verified, and a file that is cut short is never taken for whole.
+
+James is checked by the SHA-256 of each file. ICT-FaceKit is 158 OBJ files (400 MB); they are checked one by one by
+the SHA-256 of their content (see `ict_files`), packed into one `.npz` (11 MB) in the cache, and then deleted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import importlib.resources
+import json
+import logging
+import os
+import shutil
+import sys
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO, cast
+
+import pooch
+from tqdm import tqdm
+
+from shapespace.datasets import ict_files
+from shapespace.errors import DataError
+from shapespace.io.files import (
+    atomic_path,
+    make_folder,
+    read_error,
+    sha256_of_file,
+    write_error,
+    write_text,
+)
+
+_ATTEMPTS = 3
+_TIMEOUT_S = 30.0
+_BLOCK = 1 << 16
+_MAX_FILE_BYTES = 32 << 20
+_TYPICAL_OBJ_BYTES = 2_558_000
+_LICENCE_NAME = "LICENSE.txt"
+# A mesh is of no use without these; its material and picture are taken along where they are.
+_OPTIONAL_SUFFIXES = (".mtl", ".jpg")
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """One file of a data set.
+
+    Args:
+        path: relative to the folder of the data set, with forward slashes.
+        remote: relative to the root of the published repository.
+        sha256: of the raw file, or None where only the content is known.
+        content_sha256: of the parsed content (see `ict_files`), or None.
+        bytes: size of the raw file, or None where it is not known.
+    """
+
+    path: str
+    remote: str
+    sha256: str | None
+    content_sha256: str | None
+    bytes: int | None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An open data set as it was published.
+
+    Args:
+        name: as in `shapespace data get NAME`.
+        title, licence, citation: for people.
+        licence_text: the full licence, written beside the files.
+        repository: `owner/name` on GitHub.
+        commit: 40 hexadecimal digits; the files are those of this commit.
+        files: every file of it that is downloaded.
+        packed: name of the one file that stands for all of them once converted, or None.
+    """
+
+    name: str
+    title: str
+    licence: str
+    licence_text: str
+    citation: str
+    repository: str
+    commit: str
+    files: tuple[DataFile, ...]
+    packed: str | None
+
+    @property
+    def published_url(self) -> str:
+        """The address below which the published files lie, with a slash at the end."""
+        return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/"
+
+    @property
+    def download_bytes(self) -> int:
+        """How much a download moves; a good estimate where sizes are not known."""
+        return sum(file.bytes or _TYPICAL_OBJ_BYTES for file in self.files)
+
+
+def _read_registry() -> Mapping[str, Dataset]:
+    text = importlib.resources.files("shapespace.datasets").joinpath("data/registry.json").read_text("utf-8")
+    datasets: dict[str, Dataset] = {}
+    for name, entry in cast("dict[str, dict[str, Any]]", json.loads(text)).items():
+        files = tuple(
+            DataFile(path, entry["remote_folder"] + path, f.get("sha256"), f.get("content_sha256"), f.get("bytes"))
+            for path, f in entry["files"].items()
+        )
+        datasets[name] = Dataset(
+            name,
+            entry["title"],
+            entry["licence"],
+            entry["licence_text"],
+            entry["citation"],
+            entry["repository"],
+            entry["commit"],
+            files,
+            ict_files.PACKED_NAME if any(f.content_sha256 for f in files) else None,
+        )
+    return MappingProxyType(datasets)
+
+
+DATASETS: Mapping[str, Dataset] = _read_registry()
+"""Every open data set that can be got, by name."""
+
+
+def dataset(name: str) -> Dataset:
+    """Return the data set called `name`.
+
+    Raises:
+        DataError: there is none of that name.
+    """
+    if name not in DATASETS:
+        raise DataError(f"There is no data set {name!r}; there are: {', '.join(DATASETS)}.")
+    return DATASETS[name]
+
+
+def cache_folder() -> Path:
+    """Return the folder that downloads are kept in: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
+    named = os.environ.get("SHAPESPACE_CACHE")
+    return Path(named) if named else Path(pooch.os_cache("shapespace"))
+
+
+def data_folder(name: str | Dataset, *, cache: Path | None = None) -> Path | None:
+    """Return the folder that holds a whole data set, from the mirror or the cache, or None; never downloads.
+
+    Files are looked for by name here; their hashes are checked by `data_get` and by the loaders.
+
+    Args:
+        name: of the data set, or the data set itself.
+        cache: instead of `cache_folder()`.
+
+    Raises:
+        DataError: there is no data set of that name, or the mirror has a part of it only.
+    """
+    wanted = dataset(name) if isinstance(name, str) else name
+    mirror = _mirror_folder(wanted)
+    if mirror is not None:
+        return mirror
+    cached = (cache or cache_folder()) / wanted.name
+    return None if _missing(wanted, cached) else cached
+
+
+def data_list(*, cache: Path | None = None) -> list[dict[str, object]]:
+    """Return the facts of every data set as plain values, with where it is: `mirror`, `cache` or `not here`.
+
+    Args:
+        cache: instead of `cache_folder()`.
+    """
+    facts: list[dict[str, object]] = []
+    for name, entry in DATASETS.items():
+        problem = ""
+        try:
+            folder = data_folder(name, cache=cache)
+        except DataError as error:
+            folder, problem = None, str(error)
+        in_cache = folder is not None and folder == (cache or cache_folder()) / name
+        facts.append(
+            {
+                "name": name,
+                "title": entry.title,
+                "licence": entry.licence,
+                "citation": entry.citation,
+                "source": f"https://github.com/{entry.repository}/tree/{entry.commit}",
+                "commit": entry.commit,
+                "files": len(entry.files),
+                "download_bytes": entry.download_bytes,
+                "state": "not here" if folder is None else "cache" if in_cache else "mirror",
+                "folder": None if folder is None else str(folder),
+                "problem": problem,
+            }
+        )
+    return facts
+
+
+def data_get(
+    name: str | Dataset,
+    *,
+    to: Path | None = None,
+    progress: bool | None = None,
+    base_url: str | None = None,
+    cache: Path | None = None,
+) -> Path:
+    """Return the folder of a data set whose files are all there and verified, downloading it if need be.
+
+    Args:
+        name: of the data set, or the data set itself.
+        to: copy the verified files to `to/<name>/` and return that; `to` can then serve as a mirror.
+        progress: show a bar on standard error; None shows it on a terminal only.
+        base_url: a server laid out like a local mirror (`<base_url>/<name>/...`), instead of
+            `SHAPESPACE_DATA_URL` or the published repository.
+        cache: instead of `cache_folder()`.
+
+    Raises:
+        DataError: unknown name, a file that does not match its hash, an incomplete mirror, or no network.
+        FileError: the cache or `to` cannot be written.
+    """
+    wanted = dataset(name) if isinstance(name, str) else name
+    root = cache or cache_folder()
+    folder = data_folder(wanted, cache=root)
+    if folder is not None:
+        folder = _verified(wanted, folder, root)
+    else:
+        make_folder(root / wanted.name)
+        with _locked(root / f".{wanted.name}.lock"):
+            # Another process may have finished it while this one waited.
+            if data_folder(wanted, cache=root) is None:
+                _download_all(wanted, root / wanted.name, base_url, progress)
+            folder = _verified(wanted, root / wanted.name, root)
+    return folder if to is None else _copy(wanted, folder, Path(to))
+
+
+def _mirror_folder(wanted: Dataset) -> Path | None:
+    named = os.environ.get("SHAPESPACE_DATA")
+    if not named or not (folder := Path(named) / wanted.name).is_dir():
+        return None
+    missing = _missing(wanted, folder)
+    if missing:
+        raise DataError(
+            f"{folder}, named by SHAPESPACE_DATA, lacks {len(missing)} of the files of {wanted.name} "
+            f"({missing[0]}{', ...' if len(missing) > 1 else ''}); complete it, or unset SHAPESPACE_DATA."
+        )
+    return folder
+
+
+def _missing(wanted: Dataset, folder: Path) -> list[str]:
+    if wanted.packed and (folder / wanted.packed).is_file():
+        return []
+    needed = [f.path for f in wanted.files if not f.path.endswith(_OPTIONAL_SUFFIXES)]
+    return [path for path in needed if not (folder / path).is_file()]
+
+
+def _verified(wanted: Dataset, folder: Path, root: Path) -> Path:
+    if wanted.packed is None:
+        for file in wanted.files:
+            path = folder / file.path
+            if path.is_file() and sha256_of_file(path) != file.sha256:
+                raise DataError(f"{path} does not match its published SHA-256; delete it and get {wanted.name} again.")
+        return folder
+    hashes = {file.path: file.content_sha256 for file in wanted.files if file.content_sha256}
+    if (folder / wanted.packed).is_file():
+        ict_files.check_content(ict_files.read_packed(folder / wanted.packed), hashes, folder / wanted.packed)
+        return folder
+    # A mirror may be read-only, so its OBJ files are packed into the cache.
+    packed = ict_files.read_obj_folder((folder / wanted.files[0].path).parent)
+    ict_files.check_content(packed, hashes, folder)
+    target = make_folder(root / wanted.name)
+    ict_files.write_packed(target / wanted.packed, packed)
+    write_text(target / _LICENCE_NAME, wanted.licence_text)
+    return target
+
+
+def _copy(wanted: Dataset, folder: Path, to: Path) -> Path:
+    target = make_folder(to / wanted.name)
+    names = [wanted.packed] if wanted.packed else [file.path for file in wanted.files]
+    for name in names:
+        if (folder / name).is_file() and (folder / name) != (target / name):
+            try:
+                with atomic_path(target / name) as temporary:
+                    shutil.copyfile(folder / name, temporary)
+            except shutil.SameFileError:
+                continue
+    write_text(target / _LICENCE_NAME, wanted.licence_text)
+    return target
+
+
+def _download_all(wanted: Dataset, folder: Path, base_url: str | None, progress: bool | None) -> None:
+    server = base_url or os.environ.get("SHAPESPACE_DATA_URL")
+    if server and urllib.parse.urlsplit(server).scheme not in ("http", "https"):
+        raise DataError(f"{server} cannot serve data: give an address that begins with http:// or https://.")
+    with tqdm(
+        total=wanted.download_bytes,
+        desc=wanted.name,
+        unit="B",
+        unit_scale=True,
+        file=sys.stderr,
+        disable=None if progress is None else not progress,
+    ) as bar:
+        if server and wanted.packed and _fetch_packed(wanted, f"{server.rstrip('/')}/{wanted.name}/", folder, bar):
+            return
+        neutral = None
+        for file in sorted(wanted.files, key=lambda f: ict_files.NEUTRAL_NAME not in f.path):
+            url = f"{server.rstrip('/')}/{wanted.name}/{file.path}" if server else wanted.published_url + file.remote
+            path = folder / file.path
+            make_folder(path.parent)
+            if file.content_sha256 is None:
+                _fetch(file, url, path, bar)
+            else:
+                _fetch_obj(file, url, path, neutral, bar)
+                neutral = ict_files.read_obj(path)[0] if neutral is None else neutral
+    if wanted.packed:
+        objs = (folder / wanted.files[0].path).parent
+        ict_files.write_packed(folder / wanted.packed, ict_files.read_obj_folder(objs))
+        for file in wanted.files:
+            (folder / file.path).unlink(missing_ok=True)
+    write_text(folder / _LICENCE_NAME, wanted.licence_text)
+
+
+def _fetch_packed(wanted: Dataset, address: str, folder: Path, bar: tqdm[Any]) -> bool:
+    """Get the packed file from a server of our own; False if it has none. Its content is verified all the same."""
+    assert wanted.packed
+    path = folder / f"unverified.{wanted.packed}"
+    try:
+        _fetch(DataFile(wanted.packed, wanted.packed, None, None, None), address + wanted.packed, path, bar)
+    except _NotThereError:
+        return False
+    hashes = {file.path: file.content_sha256 for file in wanted.files if file.content_sha256}
+    try:
+        ict_files.check_content(ict_files.read_packed(path), hashes, path)
+        path.replace(folder / wanted.packed)
+    finally:
+        path.unlink(missing_ok=True)
+    write_text(folder / _LICENCE_NAME, wanted.licence_text)
+    return True
+
+
+def _fetch_obj(file: DataFile, url: str, path: Path, neutral: Any, bar: tqdm[Any]) -> None:
+    """Get one OBJ file and check its content; one that is already there from a broken run is checked first."""
+    assert file.content_sha256
+    if path.is_file():
+        try:
+            ict_files.check_obj(path, neutral, file.content_sha256)
+        except DataError:
+            path.unlink()
+        else:
+            bar.update(path.stat().st_size)
+            return
+    _fetch(file, url, path, bar)
+    try:
+        ict_files.check_obj(path, neutral, file.content_sha256)
+    except Exception as error:
+        path.unlink(missing_ok=True)
+        raise DataError(
+            f"{url} is not the published file: its content does not match the known hash; what came was deleted, "
+            "so try again later or set SHAPESPACE_DATA to a local copy."
+        ) from error
+
+
+def _fetch(file: DataFile, url: str, path: Path, bar: tqdm[Any]) -> None:
+    download = _ResumingDownload(path.with_name(f"{path.name}.part"), file.bytes, bar)
+    try:
+        with _quiet_pooch():
+            pooch.retrieve(  # pyright: ignore[reportUnknownMemberType]  # its os.PathLike is bare
+                url,
+                None if file.sha256 is None else f"sha256:{file.sha256}",
+                fname=path.name,
+                path=path.parent,
+                downloader=download,
+            )
+    except OSError as error:
+        raise write_error(path, error) from error
+    except ValueError as error:
+        raise DataError(
+            f"{url} does not match its published SHA-256; what came was deleted, so try again later or set "
+            "SHAPESPACE_DATA to a local copy."
+        ) from error
+
+
+class _NotThereError(DataError):
+    """The server says that it has no such file."""
+
+
+class _CutError(Exception):
+    """The connection ended before the file did."""
+
+
+@dataclass(frozen=True)
+class _ResumingDownload:
+    """A downloader for pooch that keeps what it has in a `.part` file and asks only for the rest.
+
+    Pooch's own names for the arguments of the call are misleading: `fname` is the address, `action` the target.
+    """
+
+    part: Path
+    expected_bytes: int | None
+    bar: tqdm[Any]
+
+    def __call__(self, fname: str, action: Any, pooch: Any = None, *, check_only: bool | None = None) -> bool | None:
+        reason: Exception | None = None
+        for attempt in range(_ATTEMPTS):
+            if attempt:
+                time.sleep(0.2 * 2**attempt)
+            try:
+                self._get_rest(fname)
+                self.part.replace(cast(str, action))
+                return None
+            except urllib.error.HTTPError as error:
+                error.close()
+                if error.code == 416:
+                    self.part.unlink(missing_ok=True)
+                elif error.code < 500:
+                    kind = _NotThereError if error.code in (404, 410) else DataError
+                    raise kind(
+                        f"Cannot download {fname}: the server answered {error.code} {error.reason}; "
+                        "set SHAPESPACE_DATA to a local copy, or SHAPESPACE_DATA_URL to a server that has it."
+                    ) from error
+                reason = error
+            except (
+                _CutError,
+                urllib.error.URLError,
+                http.client.HTTPException,
+                ConnectionError,
+                TimeoutError,
+            ) as error:
+                reason = error
+        why = getattr(reason, "reason", None) or reason
+        raise DataError(
+            f"Cannot download {fname} ({str(why).strip('.')}), and {self.part.parent} does not hold it yet: "
+            "check the network and run again, which goes on where it stopped, or set SHAPESPACE_DATA to a local copy."
+        ) from reason
+
+    def _get_rest(self, url: str) -> None:
+        have = self.part.stat().st_size if self.part.is_file() else 0
+        if have > (self.expected_bytes or _MAX_FILE_BYTES):
+            self.part.unlink()
+            have = 0
+        if have and have == self.expected_bytes:
+            return
+        request = urllib.request.Request(url, headers={"User-Agent": "shapespace", "Accept-Encoding": "identity"})
+        if have:
+            request.add_header("Range", f"bytes={have}-")
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            resumed = answer.status == 206 and str(answer.headers.get("Content-Range", "")).startswith(f"bytes {have}-")
+            if answer.status == 206 and not resumed:
+                raise _CutError("the server sent another part than was asked for")
+            have = have if resumed else 0
+            length = answer.headers.get("Content-Length")
+            total = have + int(length) if length and length.isdigit() else self.expected_bytes
+            limit = self.expected_bytes or _MAX_FILE_BYTES
+            if total is not None and total > limit:
+                raise DataError(f"{url} is larger than the published file ({total} bytes); it is not the same file.")
+            try:
+                stream = self.part.open("ab" if resumed else "wb")
+            except OSError as error:
+                raise write_error(self.part, error) from error
+            with stream:
+                self.bar.update(have)
+                self._copy(answer, stream, url, limit - have)
+                size = stream.tell()
+        if total is not None and size < total:
+            self.bar.update(-size)
+            raise _CutError(f"the connection was cut after {size} of {total} bytes")
+
+    def _copy(self, answer: Any, stream: BinaryIO, url: str, room: int) -> None:
+        while block := cast(bytes, answer.read(_BLOCK)):
+            room -= len(block)
+            if room < 0:
+                raise DataError(f"{url} is larger than the published file; it is not the same file.")
+            try:
+                stream.write(block)
+            except OSError as error:
+                raise write_error(self.part, error) from error
+            self.bar.update(len(block))
+
+
+@contextlib.contextmanager
+def _quiet_pooch() -> Generator[None]:
+    """Keep pooch from logging to standard error, where the progress bar is."""
+    logger = pooch.get_logger()
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Generator[None]:
+    """Hold a lock on the file `path`; the system lets go of it even if the process is killed."""
+    try:
+        stream = path.open("a+b")
+    except OSError as error:
+        raise write_error(path, error) from error
+    with stream:
+        if sys.platform == "win32":
+            import msvcrt
+
+            while True:
+                with contextlib.suppress(OSError):
+                    msvcrt.locking(stream.fileno(), msvcrt.LK_LOCK, 1)
+                    break
+            try:
+                yield
+            finally:
+                stream.seek(0)
+                msvcrt.locking(stream.fileno(), msvcrt.LK_UNLCK, 1)
+        else:
+            import fcntl
+
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX)
+            except OSError as error:
+                raise read_error(path, error) from error
+            yield

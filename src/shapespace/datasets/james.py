@@ -1,0 +1,43 @@
+"""James: a real 3dMD head scan with hair, ears and collar, and 68 landmarks (BSD, from menpo3d)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shapespace.datasets import fetch
+from shapespace.errors import DataError
+from shapespace.io.landmarks import read_landmarks
+from shapespace.io.meshes import read_mesh
+from shapespace.types import Mesh
+
+NAME = "james"
+
+
+def james_available() -> bool:
+    """Whether the mirror or the cache holds James; never downloads.
+
+    Raises:
+        DataError: the mirror holds a part of it only.
+    """
+    return fetch.data_folder(NAME) is not None
+
+
+def load_james(folder: Path | None = None) -> Mesh:
+    """Return James in millimetres, 6,393 vertices and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
+
+    Args:
+        folder: holds `james.obj` and `james.ljson`; None takes the mirror or the cache, verified, and never downloads.
+
+    Raises:
+        DataError: `folder` is None and James is not here or does not match its hash.
+        FileError: a file cannot be read or is damaged.
+    """
+    if folder is None:
+        if fetch.data_folder(NAME) is None:
+            raise DataError(
+                f"James is not here; run `shapespace data get {NAME}`, or set SHAPESPACE_DATA to a folder that holds "
+                f"{NAME}/."
+            )
+        folder = fetch.data_get(NAME)
+    scan = read_mesh(Path(folder) / "james.obj")
+    return Mesh(scan.vertices, scan.faces, read_landmarks(Path(folder) / "james.ljson"), "james")

@@ -1,0 +1,425 @@
+"""Raw scans simulated from a known surface: new triangles, new pose and scale, noise, holes, hair and collar.
+
+What a real scanner does to a face, with the truth kept: where each vertex of the model truly lies in the scan. The
+frame of the given mesh must have y up and the face looking along +z, as all faces of this package have, in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import igl
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.surface import face_vectors, faces_of, vertex_normals
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
+
+LongArray: TypeAlias = npt.NDArray[np.int64]
+
+_UP, _FRONT = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Hole:
+    """A ball cut out of the scan.
+
+    Args:
+        radius_mm: of the ball, in the model's millimetres.
+        center: (3,) in the model's frame; None takes a random vertex of the surface.
+    """
+
+    radius_mm: float
+    center: npt.ArrayLike | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A plane that cuts away everything on the side its normal points to.
+
+    Args:
+        point: (3,) on the plane, in the model's frame.
+        normal: (3,) of any length.
+    """
+
+    point: npt.ArrayLike
+    normal: npt.ArrayLike
+
+
+@dataclass(frozen=True)
+class Hair:
+    """Hair as a 3dMD scanner sees it: a bumpy sheet over the scalp, tufts over the forehead, floating shreds.
+
+    Args:
+        fringe_mm: how far down over the upper border of the surface the sheet comes.
+        thickness_mm: least and greatest distance of the sheet from the head.
+        sideburns_mm: how much lower the sheet comes at the temples.
+        tufts: number of locks that hang from the sheet.
+        shreds: number of small patches that float free.
+        spacing_mm: length of the edges of the sheet.
+    """
+
+    fringe_mm: float = 18.0
+    thickness_mm: tuple[float, float] = (2.0, 15.0)
+    sideburns_mm: float = 45.0
+    tufts: int = 24
+    shreds: int = 30
+    spacing_mm: float = 2.0
+
+
+@dataclass(frozen=True)
+class Collar:
+    """A collar: a bumpy band around the neck, below the surface and overlapping its lower border.
+
+    Args:
+        height_mm: of the band.
+        overlap_mm: how far it comes up over the lower border of the surface.
+        spacing_mm: length of its edges.
+    """
+
+    height_mm: float = 45.0
+    overlap_mm: float = 12.0
+    spacing_mm: float = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedScan:
+    """A simulated raw scan with the truth.
+
+    Args:
+        scan: the surface as a scanner would give it: its own triangles and frame, no landmarks.
+        truth_vertices: (V, 3) float64, the vertices of the model's mesh, in its order, in the frame of the scan.
+        truth_landmarks: name -> (3,), the landmarks of the model's mesh in the frame of the scan.
+        T_scan_model: from the model's frame to the scan's.
+        on_surface: (S,) bool, which vertices of the scan belong to the true surface, and are no outliers.
+    """
+
+    scan: Mesh
+    truth_vertices: FloatArray
+    truth_landmarks: Mapping[str, FloatArray]
+    T_scan_model: Similarity
+    on_surface: BoolArray
+
+
+def random_similarity(
+    rng: np.random.Generator,
+    max_angle_deg: float = 20.0,
+    scale_range: tuple[float, float] = (0.9, 1.1),
+    translation_mm: float = 100.0,
+) -> Similarity:
+    """Return a random similarity about the origin.
+
+    Args:
+        rng: draws it.
+        max_angle_deg: the angle is uniform in [0, max] about a random axis.
+        scale_range: least and greatest scale, drawn evenly in its logarithm.
+        translation_mm: each coordinate is uniform in [-this, this].
+
+    Raises:
+        InputError: a scale that is not positive.
+    """
+    low, high = scale_range
+    if not 0 < low <= high:
+        raise InputError(f"The range of scales must be positive and in order, not {scale_range}.")
+    axis = rng.standard_normal(3)
+    angle = np.deg2rad(rng.uniform(0.0, max_angle_deg))
+    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    scale = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return Similarity(scale, rotation, rng.uniform(-translation_mm, translation_mm, 3))
+
+
+def simulate_scan(
+    mesh: Mesh,
+    rng: np.random.Generator,
+    *,
+    triangles: int = 40_000,
+    noise_mm: float = 0.2,
+    T_scan_model: Similarity | None = None,
+    holes: Sequence[Hole] = (),
+    crop: Sequence[Cut] = (),
+    hair: Hair | None = None,
+    collar: Collar | None = None,
+    outlier_fraction: float = 0.0,
+    name: str = "simulated scan",
+) -> SimulatedScan:
+    """Return a raw scan of `mesh`; the same `rng` state gives the same scan.
+
+    Args:
+        mesh: the true surface, in mm, y up and facing +z.
+        rng: every random choice comes from it.
+        triangles: of the re-triangulated surface, before anything is cut away or added.
+        noise_mm: standard deviation of the noise along the normals, in mm of the model's frame.
+        T_scan_model: pose and scale of the scan; None leaves it in the model's frame.
+        holes: balls to cut out.
+        crop: planes to cut with.
+        hair: to put on, or None.
+        collar: to put on, or None.
+        outlier_fraction: share of the vertices thrown 3 to 15 mm off the surface, either way.
+        name: of the scan.
+
+    Raises:
+        InputError: an option out of range, or holes and cuts that leave nothing.
+        MeshError: `mesh` has no faces, or edges that more than two triangles share.
+    """
+    if triangles < 4 or noise_mm < 0 or not 0 <= outlier_fraction < 1:
+        raise InputError(
+            f"A simulated scan needs at least 4 triangles, noise of at least 0 mm and a share of outliers in [0, 1), "
+            f"not {triangles}, {noise_mm} and {outlier_fraction}."
+        )
+    T = T_scan_model or Similarity.identity()
+    vertices, faces = retriangulate(mesh, rng, triangles)
+    normals = vertex_normals(Mesh(vertices, faces.astype(np.int32)))
+    vertices = vertices + normals * (noise_mm * rng.standard_normal(len(vertices)))[:, None]
+    thrown = rng.random(len(vertices)) < outlier_fraction
+    throw = rng.uniform(3.0, 15.0, len(vertices)) * rng.choice([-1.0, 1.0], len(vertices))
+    vertices = vertices + normals * (thrown * throw)[:, None]
+
+    parts = [(vertices, faces)]
+    if hair is not None:
+        parts += _hair(mesh, hair, rng)
+    if collar is not None:
+        parts.append(_collar(mesh, collar, rng))
+    on_surface = np.concatenate([~thrown, np.zeros(sum(len(v) for v, _ in parts[1:]), dtype=np.bool_)])
+    vertices, faces = _merge(parts)
+    keep = _kept(vertices, mesh, holes, crop, rng)
+    faces = faces[keep[faces].all(axis=1)]
+    if not len(faces):
+        raise InputError(f"The holes and cuts leave nothing of {mesh.name}; make them smaller.")
+    # The order of vertices and triangles must not give away the model's.
+    used = rng.permutation(np.unique(faces))
+    new_index = np.full(len(vertices), -1, dtype=np.int64)
+    new_index[used] = np.arange(len(used))
+    faces = rng.permutation(new_index[faces])
+    return SimulatedScan(
+        Mesh(T.apply(vertices[used]), faces.astype(np.int32), name=name),
+        read_only(T.apply(mesh.vertices)),
+        {key: T.apply(point) for key, point in mesh.landmarks.items()},
+        T,
+        on_surface[used],
+    )
+
+
+def retriangulate(mesh: Mesh, rng: np.random.Generator, triangles: int) -> tuple[FloatArray, LongArray]:
+    """Return other vertices (S, 3) and triangles (T, 3) on the same surface, T about `triangles`.
+
+    Triangles are split, the new vertices slid at random along the surface, short edges collapsed until the number is
+    reached, and every vertex put back onto the surface; so none of the model's vertices is left as such.
+
+    Raises:
+        MeshError: `mesh` has no faces, or edges that more than two triangles share.
+    """
+    original = np.asarray(mesh.vertices)
+    faces = faces_of(mesh).astype(np.int64)
+    fine_vertices, fine_faces = original, faces
+    while len(fine_faces) < 1.5 * triangles or fine_faces is faces:
+        fine_vertices, fine_faces = igl.upsample(fine_vertices, fine_faces, 1)
+    fine_vertices = _slide(original, faces, fine_vertices, fine_faces, 0.3, rng)
+    try:
+        coarse_vertices, coarse_faces, _, _ = igl.decimate(fine_vertices, fine_faces, triangles)
+    except (RuntimeError, ValueError) as error:
+        raise MeshError(
+            f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
+        ) from error
+    if not len(coarse_faces):
+        raise MeshError(
+            f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
+        )
+    coarse_vertices = _slide(original, faces, coarse_vertices, coarse_faces, 0.15, rng)
+    return coarse_vertices, coarse_faces.astype(np.int64)
+
+
+def _slide(
+    surface_vertices: FloatArray,
+    surface_faces: LongArray,
+    vertices: FloatArray,
+    faces: LongArray,
+    share: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Move each vertex at random by up to `share` of its shortest edge, then onto the nearest point of the surface."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    shortest = np.full(len(vertices), np.inf)
+    np.minimum.at(shortest, edges.ravel(), np.repeat(length, 2))
+    shortest[~np.isfinite(shortest)] = 0.0
+    normals = vertex_normals(Mesh(vertices, faces.astype(np.int32)))
+    step = rng.uniform(-1.0, 1.0, vertices.shape)
+    step -= normals * (step * normals).sum(axis=1, keepdims=True)
+    moved = vertices + share * shortest[:, None] * step
+    return igl.point_mesh_squared_distance(moved, np.ascontiguousarray(surface_vertices), surface_faces)[2]
+
+
+def _kept(
+    vertices: FloatArray, mesh: Mesh, holes: Sequence[Hole], crop: Sequence[Cut], rng: np.random.Generator
+) -> BoolArray:
+    keep = np.ones(len(vertices), dtype=np.bool_)
+    for hole in holes:
+        center = mesh.vertices[rng.integers(len(mesh.vertices))] if hole.center is None else hole.center
+        keep &= np.linalg.norm(vertices - np.asarray(center, dtype=np.float64), axis=1) > hole.radius_mm
+    for cut in crop:
+        keep &= (vertices - np.asarray(cut.point)) @ np.asarray(cut.normal, dtype=np.float64) <= 0
+    return keep
+
+
+def _merge(parts: Sequence[tuple[FloatArray, LongArray]]) -> tuple[FloatArray, LongArray]:
+    starts = np.cumsum([0] + [len(v) for v, _ in parts])
+    faces = np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=False)])
+    return np.concatenate([v for v, _ in parts]), faces
+
+
+def _bumps(points: FloatArray, rng: np.random.Generator, wavelength_mm: float) -> FloatArray:
+    """Return smooth random values (M,) of about unit size at `points` (M, 3): a sum of sixteen random waves."""
+    waves = rng.standard_normal((16, 3)) * (2 * np.pi / wavelength_mm / np.sqrt(3))
+    return np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 16)).sum(axis=1) / np.sqrt(8.0)
+
+
+def _grid(rows: int, columns: int) -> LongArray:
+    """Return the triangles of a grid of `rows` x `columns` vertices, numbered row by row."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    lower = np.stack([corner, corner + 1, corner + columns], axis=1)
+    upper = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
+    return np.concatenate([lower, upper]).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """A sphere fitted to the upper part of a face, bulged to follow it where the face is."""
+
+    center: FloatArray
+    radius: float
+    directions: cKDTree
+    excess: FloatArray
+    top_mm: float
+
+    @staticmethod
+    def of(mesh: Mesh) -> _Head:
+        vertices = np.asarray(mesh.vertices)
+        height = vertices @ _UP
+        low, top = np.quantile(height, [0.0, 1.0])
+        upper = vertices[height > low + 0.6 * (top - low)]
+        A = np.c_[2 * upper, np.ones(len(upper))]
+        solution = np.linalg.lstsq(A, (upper**2).sum(axis=1), rcond=None)[0]
+        center = solution[:3]
+        radius = float(np.sqrt(solution[3] + center @ center))
+        ray = vertices - center
+        distance = np.linalg.norm(ray, axis=1)
+        outer = distance > 0.5 * radius
+        tree = cKDTree(ray[outer] / distance[outer, None])
+        return _Head(center, radius, tree, distance[outer] - radius, float(top))
+
+    def surface(self, directions: FloatArray) -> FloatArray:
+        """Return the distance (M,) from the centre to the head along unit `directions` (M, 3)."""
+        gap, nearest = self.directions.query(directions, k=6)
+        near = np.exp(-((gap * self.radius / 12.0) ** 2))
+        # Fading to the sphere away from the face keeps the scalp round where there is no surface at all.
+        return self.radius + (near * self.excess[nearest]).sum(axis=1) / np.maximum(near.sum(axis=1), 1.0)
+
+
+def _hair(mesh: Mesh, hair: Hair, rng: np.random.Generator) -> list[tuple[FloatArray, LongArray]]:
+    head = _Head.of(mesh)
+    parts = [_hair_sheet(head, hair, rng)]
+    parts += [_tuft(head, hair, rng) for _ in range(hair.tufts)]
+    parts += [_shred(head, hair, rng) for _ in range(hair.shreds)]
+    return parts
+
+
+def _hairline(directions: FloatArray, head: _Head, hair: Hair) -> FloatArray:
+    """Return the height (M,) above which there is hair: lower at the temples, low at the back."""
+    azimuth = np.abs(np.arctan2(directions[:, 0], directions[:, 2]))
+    side = np.clip((azimuth - np.deg2rad(35)) / np.deg2rad(40), 0.0, 1.0)
+    return head.top_mm - hair.fringe_mm - hair.sideburns_mm * side * side * (3 - 2 * side)
+
+
+def _hair_sheet(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
+    reach = np.deg2rad(115.0)
+    count = int(2 * reach * head.radius / hair.spacing_mm)
+    u, v = np.meshgrid(np.linspace(-reach, reach, count), np.linspace(-reach, reach, count))
+    u, v = (w.ravel() + rng.uniform(-0.3, 0.3, w.size) * 2 * reach / count for w in (u, v))
+    angle = np.hypot(u, v)
+    ring = np.where(angle > 0, np.sin(angle) / np.maximum(angle, 1e-9), 1.0)
+    # An azimuthal map about the crown has no seam and no pole within the hair.
+    pole = (_UP - 0.4 * _FRONT) / np.linalg.norm(_UP - 0.4 * _FRONT)
+    right = np.cross(_UP, _FRONT)
+    directions = (
+        np.cos(angle)[:, None] * pole + (ring * u)[:, None] * right + (ring * v)[:, None] * np.cross(right, pole)
+    )
+    at = head.center + directions * head.surface(directions)[:, None]
+    edge = at @ _UP - _hairline(directions, head, hair) - 5.0 * _bumps(at, rng, 18.0)
+    low, high = hair.thickness_mm
+    swell = np.clip(edge / 30.0, 0.0, 1.0)
+    thickness = low + (high - low) * swell * (0.65 + 0.35 * _bumps(at, rng, 35.0))
+    thickness = np.clip(thickness, low, high) + 1.2 * _bumps(at, rng, 9.0) + 0.8 * rng.standard_normal(len(at))
+    vertices = at + directions * np.maximum(thickness, 0.5 * low)[:, None]
+    holes = _bumps(at, rng, 22.0) > 1.9
+    keep = (edge > 0) & (angle < reach) & ~holes
+    faces = _grid(count, count)
+    return vertices, faces[keep[faces].all(axis=1)]
+
+
+def _tuft(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
+    """A lock: a narrow wavy ribbon from the hairline down over the skin, a few millimetres above it."""
+    azimuth = rng.uniform(-1.2, 1.2)
+    length, width = rng.uniform(10.0, 32.0), rng.uniform(2.0, 6.0)
+    rows, columns = max(3, int(length / hair.spacing_mm)), max(3, int(width / 1.5))
+    along = np.linspace(0.0, 1.0, rows)
+    start = _hairline(np.array([[np.sin(azimuth), 0.0, np.cos(azimuth)]]), head, hair)[0] + 4.0
+    height = np.clip((start - head.center @ _UP - along * length) / head.radius, -0.95, 0.95)
+    sway = azimuth + rng.uniform(-0.2, 0.2) * along + 0.03 * np.sin(rng.uniform(2, 6) * along + rng.uniform(0, 6))
+    across = np.linspace(-0.5, 0.5, columns) * width / head.radius
+    bearing = sway[:, None] + across * (1.0 - 0.7 * along[:, None])
+    level = np.sqrt(1 - height**2)[:, None]
+    directions = np.stack(
+        [level * np.sin(bearing), np.broadcast_to(height[:, None], bearing.shape), level * np.cos(bearing)], axis=2
+    ).reshape(-1, 3)
+    lift = np.repeat(rng.uniform(2.0, 7.0) * (1.0 - 0.6 * along), columns) + 0.4 * rng.standard_normal(rows * columns)
+    return head.center + directions * (head.surface(directions) + lift)[:, None], _grid(rows, columns)
+
+
+def _shred(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
+    """A small crumpled patch that floats above the hair or beside the head."""
+    direction = rng.standard_normal(3)
+    direction[1] = abs(direction[1]) * 1.2 - 0.2
+    direction /= np.linalg.norm(direction)
+    center = head.center + direction * (head.radius + hair.thickness_mm[1] + rng.uniform(2.0, 25.0))
+    rows, columns = rng.integers(3, 6, 2)
+    frame = Rotation.random(random_state=rng).as_matrix()
+    u, v = np.meshgrid(np.arange(columns), np.arange(rows))
+    flat = 1.8 * np.c_[u.ravel() - u.mean(), v.ravel() - v.mean(), np.zeros(u.size)]
+    crumpled = flat + 0.6 * rng.standard_normal(flat.shape)
+    return center + crumpled @ frame.T, _grid(int(rows), int(columns))
+
+
+def _collar(mesh: Mesh, collar: Collar, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
+    vertices = np.asarray(mesh.vertices)
+    height = vertices @ _UP
+    low, top = height.min(), height.max()
+    wide = np.ptp(vertices[:, 0])
+    middle = 0.5 * (vertices[:, 0].max() + vertices[:, 0].min())
+    chin = vertices[height < low + 0.25 * (top - low)]
+    radius_x, radius_z = 0.55 * wide, 0.5 * wide
+    center_z = np.quantile(chin[:, 2], 0.9) - 1.1 * radius_z
+    rows = max(3, int(collar.height_mm / collar.spacing_mm))
+    columns = max(8, int(np.pi * (radius_x + radius_z) * 0.8 / collar.spacing_mm))
+    around, down = np.meshgrid(np.linspace(-0.8 * np.pi, 0.8 * np.pi, columns), np.linspace(0.0, 1.0, rows))
+    around, down = around.ravel(), down.ravel()
+    flare = 1.0 + 0.25 * down
+    vertices = np.stack(
+        [
+            middle + radius_x * flare * np.sin(around),
+            low + collar.overlap_mm - collar.height_mm * down,
+            center_z + radius_z * flare * np.cos(around),
+        ],
+        axis=1,
+    )
+    vertices = vertices + 0.3 * rng.standard_normal(vertices.shape)
+    vertices[:, 2] += 1.5 * _bumps(vertices, rng, 30.0)
+    faces = _grid(rows, columns)
+    facing = face_vectors(vertices, faces.astype(np.int32))
+    outward = vertices[faces].mean(axis=1) - [middle, 0.0, center_z]
+    # The grid is wound so that its normals point outward, as on the face.
+    return vertices, faces if (facing * outward)[:, [0, 2]].sum() > 0 else faces[:, ::-1]
