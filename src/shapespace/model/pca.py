@@ -82,10 +82,7 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
         raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
 
     wanted = modes if isinstance(modes, int) else n - 1
-    values, vectors = cast(
-        tuple[FloatArray, FloatArray],
-        eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True),
-    )
+    values, vectors = eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True)
     variance = values[::-1] / (n - 1)  # eq 4
     variance = variance[variance > _NO_VARIANCE * variance[0]]
     if isinstance(modes, float):

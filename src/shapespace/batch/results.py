@@ -1,0 +1,197 @@
+"""The plain files that a fit ends in: NAME.fit.json, NAME.fitted.ply, NAME.stages.npz and coefficients.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace import __version__
+from shapespace.errors import FileFormatError
+from shapespace.fit.result import STAGES, FitResult
+from shapespace.io.files import atomic_path, read_bytes, write_text
+from shapespace.io.meshes import write_mesh
+from shapespace.model.shape_model import ShapeModel
+
+RECORD_FORMAT = "shapespace fit"
+RECORD_VERSION = 1
+_DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that took part: its name and the SHA-256 of its content (a model's content hash for models)."""
+
+    name: str
+    content_hash: str
+
+    def as_dict(self) -> dict[str, str]:
+        """Return it as it stands in a result file."""
+        return {"name": self.name, "hash": self.content_hash}
+
+
+def fit_record(result: FitResult, scan: Source, model: Source) -> dict[str, Any]:
+    """Return what NAME.fit.json says of `result`."""
+    T = result.T_scan_model
+    return {
+        "format": RECORD_FORMAT,
+        "format_version": RECORD_VERSION,
+        "scan": scan.as_dict(),
+        "model": model.as_dict(),
+        "status": result.status,
+        "reason": result.reason,
+        "method": result.method,
+        "config": dict(result.config),
+        "start": result.start,
+        "notes": list(result.notes),
+        "T_scan_model": {
+            "scale": T.scale,
+            "rotation": T.rotation.tolist(),
+            "translation": T.translation.tolist(),
+        },
+        "mm_per_scan_unit": result.mm_per_scan_unit,
+        "b": result.b.tolist(),
+        "z": result.z.tolist(),
+        "b_stddev": result.b_stddev.tolist(),
+        "b_stddev_calibrated": False,
+        "distances_mm": {name: result.stages[name].distances.as_dict() for name in STAGES},
+        "history": [
+            {
+                "phase": state.phase,
+                "iteration": state.iteration,
+                "rms_mm": state.rms_mm,
+                "motion_mm": state.motion_mm,
+                "scale": state.T_scan_model.scale,
+            }
+            for state in result.history
+        ],
+        "iterations": result.iterations,
+        "seconds": dict(result.seconds),
+        "version": __version__,
+    }
+
+
+def failed_record(scan: Source, model: Source, reason: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record of a scan that could not be fitted at all."""
+    return {
+        "format": RECORD_FORMAT,
+        "format_version": RECORD_VERSION,
+        "scan": scan.as_dict(),
+        "model": model.as_dict(),
+        "status": "failed",
+        "reason": reason,
+        "config": dict(config),
+        "version": __version__,
+    }
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record as JSON; numbers that are not finite become null.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    write_text(path, json.dumps(_finite(record), indent=1, allow_nan=False) + "\n")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Return the record in a NAME.fit.json.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is not the record of a fit.
+    """
+    try:
+        record = json.loads(read_bytes(path))
+    except ValueError as error:
+        raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
+    if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
+        raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
+    return cast(dict[str, Any], record)
+
+
+def write_fitted_mesh(path: Path, result: FitResult, model: ShapeModel) -> None:
+    """Write the fitted surface, in the model's vertex order and the scan's own frame and unit."""
+    write_mesh(path, result.surface(model))
+
+
+def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
+    """Write the surfaces at each stage and their distances, for figures.
+
+    Vertices are in the scan's frame in mm; distances are mm of the model's frame.
+    """
+    arrays: dict[str, Any] = {}
+    for name in STAGES:
+        distances = result.stages[name].distances
+        arrays[name] = (result.surface(model, name).vertices * result.mm_per_scan_unit).astype(np.float32)
+        arrays[f"model_to_scan_{name}"] = distances.model_to_scan_mm.astype(np.float32)
+        arrays[f"scan_to_model_{name}"] = distances.scan_to_model_mm[distances.scan_counted].astype(np.float32)
+    if model.faces is not None:
+        arrays["faces"] = model.faces
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
+
+
+def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row of coefficients.csv for `record`; a failed scan has its reason and no numbers."""
+    row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
+    if "b" not in record:
+        return row
+    for letter in ("b", "z"):
+        row |= {f"{letter}{k}": value for k, value in enumerate(record[letter], 1)}
+    final = record["distances_mm"]["final"]
+    for direction in ("model_to_scan", "scan_to_model"):
+        for measure in _DISTANCE_COLUMNS:
+            unit = "" if measure == "count" else "_mm"
+            row[f"{direction}_{measure}{unit}"] = final[direction][measure]
+    row["scale"] = record["T_scan_model"]["scale"]
+    row["mm_per_scan_unit"] = record["mm_per_scan_unit"]
+    row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
+    return row
+
+
+def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: int) -> None:
+    """Write the coefficient table, one row a scan, in the order given.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    modes = range(1, n_modes + 1)
+    columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes)]
+    for direction in ("model_to_scan", "scan_to_model"):
+        columns += [f"{direction}_{m}" + ("" if m == "count" else "_mm") for m in _DISTANCE_COLUMNS]
+    # The two means come first: they are what a reader looks for.
+    lead = ["model_to_scan_mean_mm", "scan_to_model_mean_mm"]
+    start = 3 + 2 * n_modes
+    columns = columns[:start] + lead + [c for c in columns[start:] if c not in lead]
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(_safe_cells(row) for row in rows)
+    write_text(path, text.getvalue())
+
+
+def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    # A spreadsheet would run a cell that starts like a formula; only names and reasons are text.
+    return {
+        key: "'" + value if isinstance(value, str) and value[:1] in "=+@" and value else value
+        for key, value in row.items()
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in cast(Mapping[Any, Any], value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in cast(Sequence[Any], value)]
+    return value

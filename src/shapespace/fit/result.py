@@ -1,0 +1,137 @@
+"""What a fit gives: pose, coefficients, distances both ways, how it went, and whether to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.fit.state import IcpState
+from shapespace.geometry.distance import SurfaceDistances
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, Mesh, Similarity
+
+Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
+STAGES = ("before", "initial", "final")
+"""Stages whose distances are kept: centroids aligned, after phase 1, after phase 2."""
+
+_SHRUNK = 0.85
+_FAR_SHARE = 0.05
+_GAP_RATIO = 4.0
+_GAP_SHARE = 0.02
+_SEEN_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The model's surface at one moment of the fit.
+
+    Args:
+        T_scan_model: from the model's frame (mm) to the scan's frame and unit.
+        b: (K,) coefficients, mm.
+        distances: to the scan and back, mm of the model's frame.
+    """
+
+    T_scan_model: Similarity
+    b: FloatArray
+    distances: SurfaceDistances
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A fitted scan.
+
+    Args:
+        scan_name: as the mesh was named.
+        status: `converged`, `max_iterations`, or `doubtful` when the fit should not be trusted.
+        reason: one sentence on why it has that status.
+        T_scan_model: from the model's frame (mm) to the scan's frame and unit.
+        mm_per_scan_unit: the scan's unit as found or given.
+        b: (K,) coefficients, mm.
+        b_stddev: (K,) their standard deviation by the model's own noise, mm; not calibrated, mostly too small.
+        z: (K,) b in standard deviations of the model.
+        stages: the surface at each of `STAGES`.
+        history: every state the loop went through, in the scan's mm frame.
+        method: the method that ran.
+        config: every setting in effect, with the software version.
+        start: how the start was found.
+        notes: what was repaired or noticed in the scan.
+        seconds: by part.
+        model_hash: content hash of the model.
+    """
+
+    scan_name: str
+    status: Status
+    reason: str
+    T_scan_model: Similarity
+    mm_per_scan_unit: float
+    b: FloatArray
+    b_stddev: FloatArray
+    z: FloatArray
+    stages: Mapping[str, Stage]
+    history: Sequence[IcpState]
+    method: str
+    config: Mapping[str, Any]
+    start: str
+    notes: Sequence[str]
+    seconds: Mapping[str, float]
+    model_hash: str
+
+    @property
+    def iterations(self) -> dict[str, int]:
+        """Iterations done, by phase."""
+        return {
+            f"phase_{phase}": max((s.iteration for s in self.history if s.phase == phase), default=0)
+            for phase in (1, 2)
+        }
+
+    @property
+    def distances(self) -> SurfaceDistances:
+        """Distances of the final surface."""
+        return self.stages["final"].distances
+
+    def surface(self, model: ShapeModel, stage: str = "final") -> Mesh:
+        """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order."""
+        at = self.stages[stage]
+        mesh = model.mesh(at.b)
+        landmarks = {name: at.T_scan_model.apply(point) for name, point in mesh.landmarks.items()}
+        return Mesh(at.T_scan_model.apply(mesh.vertices), mesh.faces, landmarks, name=self.scan_name)
+
+
+def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
+    """Return the standard deviation (K,), mm, of the coefficients given a complete surface.
+
+    Probabilistic PCA with orthonormal modes: var_k = lam_k v / (lam_k + v) (Tipping and Bishop, 1999). It takes the
+    residuals of the coordinates for independent, which they are not, so it is too small.
+
+    Args:
+        model: gives lam_k = stddev_k^2.
+        residual_variance: v, mm^2 per coordinate.
+    """
+    variance = model.stddev**2
+    return np.sqrt(variance * residual_variance / (variance + residual_variance))
+
+
+def doubts(model: ShapeModel, stages: Mapping[str, Stage]) -> list[str]:
+    """Return reasons not to trust the final stage, most serious first; none where nothing speaks against it."""
+    final, initial = stages["final"], stages["initial"]
+    forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
+    centred = model.mean_vertices - model.mean_vertices.mean(axis=0)
+    size_mm = float(np.sqrt((centred**2).sum(axis=1).mean()))
+    found: list[str] = []
+    shrunk = final.T_scan_model.scale / initial.T_scan_model.scale
+    if shrunk < _SHRUNK:
+        found.append(
+            f"the model shrank by {100 * (1 - shrunk):.0f} % while it was fitted, as it does when scans have holes"
+        )
+    if forward.rms > _FAR_SHARE * size_mm:
+        found.append(f"the model stays {forward.rms:.1f} mm (RMS) away from the scan")
+    if backward.fraction < _SEEN_SHARE:
+        found.append(f"the model covers only {100 * backward.fraction:.0f} % of the scan")
+    elif backward.mean > _GAP_RATIO * forward.mean and backward.mean > _GAP_SHARE * size_mm:
+        found.append(
+            f"the scan lies {backward.mean:.1f} mm from the model where the model lies {forward.mean:.1f} mm from the scan"
+        )
+    return found

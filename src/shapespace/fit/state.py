@@ -1,0 +1,65 @@
+"""What an iteration knows, and when to stop: shared by both phases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray, Similarity
+
+PHASES = ("phase 1", "phase 2")
+
+
+@dataclass(frozen=True, eq=False)
+class IcpState:
+    """The state after one iteration, in the scan's mm frame.
+
+    Args:
+        phase: 1 or 2.
+        iteration: from 0, the start, counted by phase.
+        T_scan_model: similarity from the model's frame to the scan's mm frame.
+        b: (K,) coefficients, mm; zero throughout phase 1.
+        rms_mm: RMS distance of the model's vertices from their closest scan points, mm of the model's frame.
+        motion_mm: largest movement of a model vertex in this iteration, mm of the model's frame.
+        stopped: None while running, else why: `rate`, or `cap`.
+    """
+
+    phase: int
+    iteration: int
+    T_scan_model: Similarity
+    b: FloatArray
+    rms_mm: float
+    motion_mm: float
+    stopped: str | None = None
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """The paper's rule on the rate of change of the RMS (step 4), with a cap.
+
+    Args:
+        rate: stop when |e_k - e_(k-1)| is at most this share of e_(k-1).
+        motion_mm: and no vertex moves more than this; the RMS alone is blind to sliding (erratum to step 4).
+            Infinity gives the rule as printed.
+        max_iterations: cap of each phase.
+
+    Raises:
+        InputError: a rate or a motion that is not positive, or no iterations.
+    """
+
+    rate: float = 1e-4
+    motion_mm: float = float("inf")
+    max_iterations: int = 200
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and self.motion_mm > 0 and self.max_iterations >= 1):
+            raise InputError("A stopping rule needs a positive rate and motion and at least one iteration.")
+
+    def why(self, rms_mm: Sequence[float], motion_mm: float) -> str | None:
+        """Return `rate` or `cap` when the history of `rms_mm` says stop, else None."""
+        if len(rms_mm) >= 2:
+            change = abs(rms_mm[-1] - rms_mm[-2])
+            if change <= self.rate * max(rms_mm[-2], 1e-12) and motion_mm <= self.motion_mm:
+                return "rate"
+        return "cap" if len(rms_mm) > self.max_iterations else None
