@@ -6,11 +6,11 @@ frame of the given mesh must have y up and the face looking along +z, as all fac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias, cast
 
-import igl
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -127,10 +127,15 @@ def random_similarity(
     if not 0 < low <= high:
         raise InputError(f"The range of scales must be positive and in order, not {scale_range}.")
     axis = rng.standard_normal(3)
-    angle = np.deg2rad(rng.uniform(0.0, max_angle_deg))
-    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-    scale = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    angle = math.radians(rng.uniform(0.0, max_angle_deg))
+    rotation = _rotation(angle * axis / np.linalg.norm(axis))
+    scale = math.exp(rng.uniform(math.log(low), math.log(high)))
     return Similarity(scale, rotation, rng.uniform(-translation_mm, translation_mm, 3))
+
+
+def _rotation(vector: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) about `vector` (3,) by its length in radians."""
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix(), dtype=np.float64)
 
 
 def simulate_scan(
@@ -217,10 +222,10 @@ def retriangulate(mesh: Mesh, rng: np.random.Generator, triangles: int) -> tuple
     faces = faces_of(mesh).astype(np.int64)
     fine_vertices, fine_faces = original, faces
     while len(fine_faces) < 1.5 * triangles or fine_faces is faces:
-        fine_vertices, fine_faces = igl.upsample(fine_vertices, fine_faces, 1)
-    fine_vertices = _slide(original, faces, fine_vertices, fine_faces, 0.3, rng)
+        fine_vertices, fine_faces = _split(fine_vertices, fine_faces)
+    fine_vertices = _slide(original, faces, fine_vertices, fine_faces, 0.2, rng)
     try:
-        coarse_vertices, coarse_faces, _, _ = igl.decimate(fine_vertices, fine_faces, triangles)
+        coarse_vertices, coarse_faces = _collapse(fine_vertices, fine_faces, triangles)
     except (RuntimeError, ValueError) as error:
         raise MeshError(
             f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
@@ -229,8 +234,8 @@ def retriangulate(mesh: Mesh, rng: np.random.Generator, triangles: int) -> tuple
         raise MeshError(
             f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
         )
-    coarse_vertices = _slide(original, faces, coarse_vertices, coarse_faces, 0.15, rng)
-    return coarse_vertices, coarse_faces.astype(np.int64)
+    coarse_vertices = _slide(original, faces, coarse_vertices, coarse_faces, 0.1, rng)
+    return coarse_vertices, coarse_faces
 
 
 def _slide(
@@ -251,7 +256,24 @@ def _slide(
     step = rng.uniform(-1.0, 1.0, vertices.shape)
     step -= normals * (step * normals).sum(axis=1, keepdims=True)
     moved = vertices + share * shortest[:, None] * step
-    return igl.point_mesh_squared_distance(moved, np.ascontiguousarray(surface_vertices), surface_faces)[2]
+    _, _, nearest = _igl().point_mesh_squared_distance(moved, np.ascontiguousarray(surface_vertices), surface_faces)
+    return np.asarray(nearest, dtype=np.float64)
+
+
+def _igl() -> Any:
+    import igl  # pyright: ignore[reportMissingTypeStubs]  # half of the import time of the package
+
+    return cast(Any, igl)
+
+
+def _split(vertices: FloatArray, faces: LongArray) -> tuple[FloatArray, LongArray]:
+    fine, triangles = _igl().upsample(vertices, faces, 1)
+    return np.asarray(fine, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
+
+
+def _collapse(vertices: FloatArray, faces: LongArray, triangles: int) -> tuple[FloatArray, LongArray]:
+    coarse, left, _, _ = _igl().decimate(vertices, faces, triangles)
+    return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64)
 
 
 def _kept(
@@ -302,8 +324,8 @@ class _Head:
         height = vertices @ _UP
         low, top = np.quantile(height, [0.0, 1.0])
         upper = vertices[height > low + 0.6 * (top - low)]
-        A = np.c_[2 * upper, np.ones(len(upper))]
-        solution = np.linalg.lstsq(A, (upper**2).sum(axis=1), rcond=None)[0]
+        A = np.column_stack([2 * upper, np.ones(len(upper))])
+        solution = np.asarray(np.linalg.lstsq(A, (upper**2).sum(axis=1), rcond=None)[0], dtype=np.float64)
         center = solution[:3]
         radius = float(np.sqrt(solution[3] + center @ center))
         ray = vertices - center
@@ -314,7 +336,8 @@ class _Head:
 
     def surface(self, directions: FloatArray) -> FloatArray:
         """Return the distance (M,) from the centre to the head along unit `directions` (M, 3)."""
-        gap, nearest = self.directions.query(directions, k=6)
+        answer = cast("tuple[FloatArray, LongArray]", self.directions.query(directions, k=6))
+        gap, nearest = answer
         near = np.exp(-((gap * self.radius / 12.0) ** 2))
         # Fading to the sphere away from the face keeps the scalp round where there is no surface at all.
         return self.radius + (near * self.excess[nearest]).sum(axis=1) / np.maximum(near.sum(axis=1), 1.0)
@@ -331,15 +354,17 @@ def _hair(mesh: Mesh, hair: Hair, rng: np.random.Generator) -> list[tuple[FloatA
 def _hairline(directions: FloatArray, head: _Head, hair: Hair) -> FloatArray:
     """Return the height (M,) above which there is hair: lower at the temples, low at the back."""
     azimuth = np.abs(np.arctan2(directions[:, 0], directions[:, 2]))
-    side = np.clip((azimuth - np.deg2rad(35)) / np.deg2rad(40), 0.0, 1.0)
+    side = np.clip((azimuth - math.radians(35)) / math.radians(40), 0.0, 1.0)
     return head.top_mm - hair.fringe_mm - hair.sideburns_mm * side * side * (3 - 2 * side)
 
 
 def _hair_sheet(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
-    reach = np.deg2rad(115.0)
+    reach = math.radians(115.0)
     count = int(2 * reach * head.radius / hair.spacing_mm)
-    u, v = np.meshgrid(np.linspace(-reach, reach, count), np.linspace(-reach, reach, count))
-    u, v = (w.ravel() + rng.uniform(-0.3, 0.3, w.size) * 2 * reach / count for w in (u, v))
+    steps = np.linspace(-reach, reach, count)
+    u, v = np.tile(steps, count), np.repeat(steps, count)
+    u = u + rng.uniform(-0.3, 0.3, len(u)) * 2 * reach / count
+    v = v + rng.uniform(-0.3, 0.3, len(v)) * 2 * reach / count
     angle = np.hypot(u, v)
     ring = np.where(angle > 0, np.sin(angle) / np.maximum(angle, 1e-9), 1.0)
     # An azimuthal map about the crown has no seam and no pole within the hair.
@@ -386,12 +411,13 @@ def _shred(head: _Head, hair: Hair, rng: np.random.Generator) -> tuple[FloatArra
     direction[1] = abs(direction[1]) * 1.2 - 0.2
     direction /= np.linalg.norm(direction)
     center = head.center + direction * (head.radius + hair.thickness_mm[1] + rng.uniform(2.0, 25.0))
-    rows, columns = rng.integers(3, 6, 2)
-    frame = Rotation.random(random_state=rng).as_matrix()
-    u, v = np.meshgrid(np.arange(columns), np.arange(rows))
-    flat = 1.8 * np.c_[u.ravel() - u.mean(), v.ravel() - v.mean(), np.zeros(u.size)]
+    rows, columns = int(rng.integers(3, 6)), int(rng.integers(3, 6))
+    axis = rng.standard_normal(3)
+    frame = _rotation(rng.uniform(0.0, np.pi) * axis / np.linalg.norm(axis))
+    u, v = np.tile(np.arange(columns), rows), np.repeat(np.arange(rows), columns)
+    flat = 1.8 * np.stack([u - u.mean(), v - v.mean(), np.zeros(len(u))], axis=1)
     crumpled = flat + 0.6 * rng.standard_normal(flat.shape)
-    return center + crumpled @ frame.T, _grid(int(rows), int(columns))
+    return center + crumpled @ frame.T, _grid(rows, columns)
 
 
 def _collar(mesh: Mesh, collar: Collar, rng: np.random.Generator) -> tuple[FloatArray, LongArray]:
@@ -405,8 +431,8 @@ def _collar(mesh: Mesh, collar: Collar, rng: np.random.Generator) -> tuple[Float
     center_z = np.quantile(chin[:, 2], 0.9) - 1.1 * radius_z
     rows = max(3, int(collar.height_mm / collar.spacing_mm))
     columns = max(8, int(np.pi * (radius_x + radius_z) * 0.8 / collar.spacing_mm))
-    around, down = np.meshgrid(np.linspace(-0.8 * np.pi, 0.8 * np.pi, columns), np.linspace(0.0, 1.0, rows))
-    around, down = around.ravel(), down.ravel()
+    around = np.tile(np.linspace(-0.8 * np.pi, 0.8 * np.pi, columns), rows)
+    down = np.repeat(np.linspace(0.0, 1.0, rows), columns)
     flare = 1.0 + 0.25 * down
     vertices = np.stack(
         [
