@@ -1,0 +1,333 @@
+"""glTF 2.0, as `.gltf` with its buffers and as one `.glb` file; after the Khronos specification.
+
+trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileError, InputError
+from shapespace.io.files import read_bytes
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    json_value,
+    mesh_of,
+    strip_triangles,
+)
+from shapespace.types import FloatArray, Mesh
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_UNREADABLE = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+# Far from the origin float32 is too coarse, so the centre goes into the node, which holds doubles.
+_FAR = 16.0
+
+Values = npt.NDArray[Any]
+
+
+@dataclass
+class _Gltf:
+    """The JSON of a file and the buffers it names."""
+
+    path: Path
+    tree: dict[str, Any]
+    binary: bytes | None
+    buffers: dict[int, bytes] = field(default_factory=lambda: dict[int, bytes]())
+
+    def buffer(self, index: int) -> bytes:
+        if index not in self.buffers:
+            entry = self.tree["buffers"][index]
+            uri = entry.get("uri")
+            data = self.binary if uri is None else _fetch(uri, self.path)
+            if data is None or len(data) < entry["byteLength"]:
+                raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
+            self.buffers[index] = data
+        return self.buffers[index]
+
+    def view(self, index: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> Values:
+        """Return (count, width) numbers from a buffer view."""
+        view = self.tree["bufferViews"][index]
+        data = self.buffer(view["buffer"])
+        row = kind.itemsize * width
+        stride = view.get("byteStride", row)
+        start = view.get("byteOffset", 0) + offset
+        end = view.get("byteOffset", 0) + view["byteLength"]
+        if min(start, stride, offset, count) < 0 or stride < row or end > len(data):
+            raise ValueError("buffer view")
+        if count == 0:
+            return np.zeros((0, width), dtype=kind)
+        if start + (count - 1) * stride + row > end:
+            check_count(count, stride, end - start, "numbers in an accessor", self.path)
+            raise ValueError("buffer view")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+    def accessor(self, index: int) -> Values:
+        """Return the (count, width) values of an accessor; normalised whole numbers become float64."""
+        if index < 0:
+            raise IndexError(index)
+        entry = self.tree["accessors"][index]
+        kind = np.dtype(_COMPONENTS[entry["componentType"]])
+        width, count = _WIDTHS[entry["type"]], int(entry["count"])
+        if "bufferView" in entry:
+            values = self.view(entry["bufferView"], entry.get("byteOffset", 0), kind, count, width).copy()
+        else:
+            known = sum(b["byteLength"] for b in self.tree["buffers"])
+            check_count(count, 1, known, "values without data", self.path)
+            values = np.zeros((count, width), dtype=kind)
+        if "sparse" in entry:
+            sparse = entry["sparse"]
+            where, what = sparse["indices"], sparse["values"]
+            index_kind = np.dtype(_COMPONENTS[where["componentType"]])
+            n = int(sparse["count"])
+            at = self.view(where["bufferView"], where.get("byteOffset", 0), index_kind, n, 1)[:, 0]
+            values[at] = self.view(what["bufferView"], what.get("byteOffset", 0), kind, n, width)
+        if entry.get("normalized") and kind.kind in "iu":
+            return np.maximum(values / np.iinfo(kind).max, -1.0)
+        return values
+
+
+def _fetch(uri: str, path: Path) -> bytes:
+    if uri.startswith("data:"):
+        head, _, body = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise damaged(path, "it has a buffer that is not base64; export it again")
+        return base64.b64decode(body, validate=True)
+    folder = path.parent.resolve()
+    target = (folder / unquote(uri)).resolve()
+    if "://" in uri or not target.is_relative_to(folder):
+        raise damaged(path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+    try:
+        return read_bytes(target)
+    except FileError as error:
+        raise damaged(path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too") from error
+
+
+def read_gltf(data: bytes, path: Path) -> Mesh:
+    """Read glTF or GLB: all meshes of the scene in the order of its nodes, moved by the nodes' transforms.
+
+    Primitives that share their positions share their vertices here too. Morph targets are applied with the
+    weights of the node or mesh; skins, lines, textures and animations are passed over. glTF means metres.
+
+    Args:
+        data: the whole file.
+        path: its name; buffers beside it are read from its folder and from nowhere else.
+
+    Raises:
+        FileFormatError: it is not glTF 2.0, is cut short, is compressed, or holds no points.
+        MeshError: faces that point past the end of the vertices.
+    """
+    binary: bytes | None = None
+    if data[:4] == b"glTF":
+        text, binary = _chunks(data, path)
+    else:
+        text = data
+    tree = json_value(text, path)
+    # Any part of the JSON may be missing or of the wrong type, so that is met in this one place.
+    try:
+        if not str(tree["asset"]["version"]).startswith("2"):
+            raise damaged(path, "it is not glTF of version 2")
+        for extension in tree.get("extensionsRequired", []):
+            if extension in _UNREADABLE:
+                raise damaged(path, f"it is compressed ({extension}), so export it again without compression")
+        return _scene(_Gltf(path, tree, binary))
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
+        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+    except ValueError as error:
+        if isinstance(error, (FileError, InputError)):
+            raise
+        raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+
+
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
+    version, length = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
+    if version != 2:
+        raise damaged(path, f"it is GLB of version {version}, not 2")
+    if length > len(data):
+        raise damaged(path, f"it declares {length} bytes, but has {len(data)}; {CUT_SHORT}")
+    at = 12
+    found: dict[bytes, bytes] = {}
+    while at + 8 <= length:
+        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > length:
+            raise damaged(path, f"it ends inside a chunk; {CUT_SHORT}")
+        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    if b"JSON" not in found:
+        raise damaged(path, f"it has no JSON chunk; {CUT_SHORT}")
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def _scene(gltf: _Gltf) -> Mesh:
+    tree = gltf.tree
+    nodes: list[dict[str, Any]] = tree.get("nodes", [])
+    scenes: list[dict[str, Any]] = tree.get("scenes", [])
+    if scenes:
+        chosen: dict[str, Any] = scenes[tree.get("scene", 0)]
+        roots: list[int] = list(chosen.get("nodes", []))
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [i for i in range(len(nodes)) if i not in children]
+    if not nodes and tree.get("meshes"):
+        nodes, roots = [{"mesh": i} for i in range(len(tree["meshes"]))], list(range(len(tree["meshes"])))
+    points: list[FloatArray] = []
+    faces: list[IndexArray] = []
+    before = 0
+    seen: set[int] = set()
+    stack: list[tuple[int, FloatArray]] = [(int(root), np.eye(4)) for root in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        if index in seen or index < 0:
+            raise damaged(gltf.path, "its nodes do not form a tree; export it again")
+        seen.add(index)
+        node = nodes[index]
+        matrix = parent @ _local(node)
+        stack += [(int(child), matrix) for child in reversed(node.get("children", []))]
+        if "mesh" not in node:
+            continue
+        for vertices, triangles in _primitives(gltf, node):
+            points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+            if triangles is not None:
+                # A mirroring transform turns triangles inside out.
+                mirrored = np.linalg.det(matrix[:3, :3]) < 0
+                faces.append((triangles[:, ::-1] if mirrored else triangles) + before)
+            before += len(vertices)
+    if not points:
+        raise damaged(gltf.path, "its scene holds no points and no triangles")
+    joined = np.concatenate(faces) if faces else None
+    return mesh_of(np.concatenate(points), joined, gltf.path)
+
+
+def _local(node: dict[str, Any]) -> FloatArray:
+    """Return the (4, 4) transform of a node, from its matrix or its translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+    out = np.eye(4)
+    out[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    out[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), dtype=np.float64).reshape(1, 3)
+    out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), dtype=np.float64).reshape(3)
+    return out
+
+
+def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, IndexArray | None]]:
+    """Return the points and triangles of a node's mesh; primitives that share their positions come as one."""
+    mesh = gltf.tree["meshes"][node["mesh"]]
+    weights = node.get("weights", mesh.get("weights", []))
+    vertices: dict[int, FloatArray] = {}
+    triangles: dict[int, list[IndexArray]] = {}
+    for primitive in mesh["primitives"]:
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
+            continue
+        key = primitive["attributes"]["POSITION"]
+        if key not in vertices:
+            position = gltf.accessor(key).astype(np.float64)
+            if position.shape[1] != 3:
+                raise ValueError("POSITION")
+            for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+                if weight and "POSITION" in target:
+                    position = position + float(weight) * gltf.accessor(target["POSITION"])
+            vertices[key] = position
+        if mode == _POINTS:
+            continue
+        if "indices" in primitive:
+            corners = gltf.accessor(primitive["indices"])[:, 0].astype(np.int64)
+        else:
+            corners = np.arange(len(vertices[key]), dtype=np.int64)
+        if mode == _TRIANGLES:
+            if len(corners) % 3:
+                raise damaged(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")
+            found = corners.reshape(-1, 3)
+        else:
+            found = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)
+        # Checked here: joined, an index past this primitive would point into the next.
+        mesh_of(vertices[key], found, gltf.path)
+        triangles.setdefault(key, []).append(found)
+    return [(v, np.concatenate(triangles[k]) if k in triangles else None) for k, v in vertices.items()]
+
+
+def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
+    if not len(mesh.vertices):
+        raise InputError(f"{mesh.name} has no points, so it cannot be written as glTF.")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot hold; write it as PLY.")
+    far = np.abs([low, high]).max() > _FAR * max(float((high - low).max()), np.finfo(np.float64).tiny)
+    centre = (low + high) / 2 if far else np.zeros(3)
+    with np.errstate(over="ignore"):
+        positions = (mesh.vertices - centre).astype("<f4")
+    if not np.isfinite(positions).all():
+        raise InputError(f"{mesh.name} has coordinates too large for glTF; write it as PLY instead.")
+    binary = positions.tobytes()
+    views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": 0, "byteLength": len(binary), "target": 34962}]
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3", **bounds}
+    ]
+    primitive: dict[str, Any] = {"attributes": {"POSITION": 0}, "mode": _POINTS}
+    if mesh.faces is not None:
+        indices = mesh.faces.astype("<u4").tobytes()
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(indices), "target": 34963})
+        count = mesh.faces.size
+        accessors.append({"bufferView": 1, "componentType": 5125, "count": count, "type": "SCALAR"})
+        primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": _TRIANGLES}
+        binary += indices
+    node: dict[str, Any] = {"mesh": 0, "name": mesh.name}
+    if far:
+        node["translation"] = centre.tolist()
+    tree: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "shapespace"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
+    return tree, binary
+
+
+def write_gltf(mesh: Mesh) -> bytes:
+    """Return `mesh` as one glTF JSON file with its buffer inside, in float32; numbers stay as they are.
+
+    Raises:
+        InputError: no points, or coordinates that are not finite or too large for float32.
+    """
+    tree, binary = _content(mesh)
+    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    return json.dumps(tree).encode("utf-8")
+
+
+def write_glb(mesh: Mesh) -> bytes:
+    """Return `mesh` as binary glTF, in float32; numbers are written as they are, though glTF means metres.
+
+    Raises:
+        InputError: no points, or coordinates that are not finite or too large for float32.
+    """
+    tree, binary = _content(mesh)
+    text = json.dumps(tree).encode("utf-8")
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    out = b"glTF" + (2).to_bytes(4, "little") + length.to_bytes(4, "little")
+    out += len(text).to_bytes(4, "little") + b"JSON" + text
+    return out + len(binary).to_bytes(4, "little") + b"BIN\0" + binary

@@ -1,0 +1,110 @@
+"""Meshes and point clouds in and out: one plain dict says which file name ending means which format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from shapespace.errors import FileFormatError
+from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.gltf import read_gltf, write_glb, write_gltf
+from shapespace.io.obj import read_obj, write_obj
+from shapespace.io.off import read_off, write_off
+from shapespace.io.ply import read_ply, write_ply
+from shapespace.io.stl import read_stl, write_stl
+from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
+from shapespace.types import Mesh
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A file format for surfaces.
+
+    Args:
+        name: what people call it.
+        read: (content, path) -> mesh; the path is for messages and for files beside it.
+        write: mesh -> content.
+        exact: whether float64 coordinates survive writing and reading.
+        point_clouds: whether it can hold points without triangles.
+        keeps_vertices: whether order and number of the vertices survive.
+    """
+
+    name: str
+    read: Callable[[bytes, Path], Mesh]
+    write: Callable[[Mesh], bytes]
+    exact: bool = True
+    point_clouds: bool = True
+    keeps_vertices: bool = True
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """Read a surface or point cloud; its name is the file's name.
+
+    Vertices keep the order and number of the file, its frame and its unit (STL has no vertices, only corners:
+    equal ones are merged in the order of first appearance). Polygons become fans of triangles.
+
+    Args:
+        path: a file with one of the endings in `MESH_FORMATS`, in any case.
+
+    Returns:
+        The mesh as the file has it, with whatever is wrong with it.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: the ending is unknown, or the content is not in that format, cut short or damaged.
+        MeshError: faces that point past the end of the vertices.
+    """
+    path = Path(path)
+    mesh_format = _format(path, "read")
+    data = read_bytes(path)
+    if not data.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    return mesh_format.read(data, path)
+
+
+def write_mesh(path: Path | str, mesh: Mesh) -> None:
+    """Write `mesh` in the format of the ending of `path`, whole or not at all; landmarks are not written.
+
+    Args:
+        path: the file, with one of the endings in `MESH_FORMATS`.
+        mesh: vertices in whatever unit they are in; PLY, OBJ, OFF, VTK and VTP keep float64 exactly.
+
+    Raises:
+        FileFormatError: the ending is unknown.
+        FileError: the folder cannot be written, or the disk is full.
+        InputError: the format cannot hold this mesh (STL without triangles, float32 overflow).
+    """
+    path = Path(path)
+    write_bytes(path, _format(path, "write").write(mesh))
+
+
+def _format(path: Path, verb: str) -> MeshFormat:
+    found = MESH_FORMATS.get(path.suffix.lower())
+    if found is None:
+        raise FileFormatError(
+            f"Cannot {verb} {path}: the ending '{path.suffix}' is not a mesh format; use one of "
+            f"{', '.join(MESH_FORMATS)}."
+        )
+    return found
+
+
+def _read_any_vtk(data: bytes, path: Path) -> Mesh:
+    # Both endings are used for both formats, so the content decides.
+    return read_vtp(data, path) if data.lstrip()[:1] == b"<" else read_vtk(data, path)
+
+
+MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
+    {
+        ".ply": MeshFormat("PLY", read_ply, write_ply),
+        ".obj": MeshFormat("Wavefront OBJ", read_obj, write_obj),
+        ".stl": MeshFormat("STL", read_stl, write_stl, exact=False, point_clouds=False, keeps_vertices=False),
+        ".off": MeshFormat("OFF", read_off, write_off),
+        ".vtk": MeshFormat("legacy VTK", _read_any_vtk, write_vtk),
+        ".vtp": MeshFormat("XML VTK", _read_any_vtk, write_vtp),
+        ".glb": MeshFormat("binary glTF", read_gltf, write_glb, exact=False),
+        ".gltf": MeshFormat("glTF", read_gltf, write_gltf, exact=False),
+    }
+)
+"""File name ending -> format: the one place where formats are listed."""

@@ -1,0 +1,90 @@
+"""Wavefront OBJ: its `v` and `f` lines; texture seams, normals, groups and materials change nothing."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    damaged,
+    equal_lengths,
+    fan_triangles,
+    floats,
+    ints,
+    mesh_of,
+    number_lines,
+)
+from shapespace.types import Mesh
+
+
+def read_obj(data: bytes, path: Path) -> Mesh:
+    """Read OBJ: one vertex for each `v` line, in the file's order, and polygons as fans.
+
+    Negative indices count back from the last `v` line above; colours and weights after `x y z` are ignored.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
+        MeshError: faces that point past the end of the vertices.
+    """
+    if b"\\" in data:
+        data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    lines = data.splitlines()
+    points: list[list[bytes]] = []
+    polygons: list[list[bytes]] = []
+    above: list[int] = []
+    for line in lines:
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            points.append(words)
+        elif words[0] == b"f":
+            polygons.append(words)
+            above.append(len(points))
+    if not points:
+        raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
+    if min(map(len, points)) < 4:
+        at = next(i for i, words in enumerate(points) if len(words) < 4)
+        raise damaged(path, f"vertex {at + 1} has fewer than three numbers; {CUT_SHORT}")
+    if equal_lengths(points):
+        width = len(points[0])
+        flat = list(chain.from_iterable(points))
+        vertices = np.stack([floats(flat[axis::width], path) for axis in (1, 2, 3)], axis=1)
+    else:
+        vertices = floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
+    faces = _faces(polygons, above, path) if polygons else None
+    return mesh_of(vertices, faces, path)
+
+
+def _faces(polygons: list[list[bytes]], above: list[int], path: Path) -> IndexArray:
+    # A comment after the corners is rare, and is looked for only where there is a mark.
+    if any(b"#" in word for words in polygons for word in (words[-1], *words[4:])):
+        polygons = [b" ".join(words).partition(b"#")[0].split() for words in polygons]
+    counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
+    if counts.min() < 3:
+        raise damaged(path, f"face {int(np.argmin(counts)) + 1} has fewer than three corners; {CUT_SHORT}")
+    tokens = chain.from_iterable(words[1:] for words in polygons)
+    corners = ints((token.partition(b"/")[0] for token in tokens), path)
+    if (corners == 0).any():
+        raise damaged(path, "a face points at vertex 0, but OBJ counts from 1; export it again")
+    behind = np.repeat(np.array(above, dtype=np.int64), counts)
+    absolute = np.where(corners > 0, corners - 1, corners + behind)
+    if absolute.min() < 0:
+        raise damaged(path, f"a face points back past the first vertex; {CUT_SHORT}")
+    return fan_triangles(counts, absolute)
+
+
+def write_obj(mesh: Mesh) -> bytes:
+    """Return `mesh` as OBJ text with 17 significant digits, so that reading it back is exact."""
+    text = number_lines(mesh.vertices, "v %.17g %.17g %.17g")
+    if mesh.faces is not None:
+        text += number_lines(mesh.faces.astype(np.int64) + 1, "f %d %d %d")
+    return text.encode("ascii")

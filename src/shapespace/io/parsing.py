@@ -1,0 +1,172 @@
+"""What the readers share: numbers from text, polygons to triangles, and XML and JSON from strangers."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileFormatError
+from shapespace.types import FloatArray, Mesh
+
+IndexArray = npt.NDArray[np.int64]
+
+CUT_SHORT = "the file is damaged or cut short, so export it again"
+
+
+def damaged(path: Path, what: str) -> FileFormatError:
+    """Return the one-sentence error that `path` cannot be read because of `what`."""
+    return FileFormatError(f"Cannot read {path}: {what}.")
+
+
+def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
+    """Return `tokens` as a flat float64 array.
+
+    Raises:
+        FileFormatError: one of them is not a number.
+    """
+    try:
+        return np.array(list(map(float, tokens)), dtype=np.float64)
+    except ValueError as error:
+        raise damaged(path, f"it has text where a number should be ({_short(error)})") from error
+
+
+def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
+    """Return `tokens` as a flat int64 array.
+
+    Raises:
+        FileFormatError: one of them is not a whole number, or is too large for 64 bits.
+    """
+    try:
+        return np.array(list(map(int, tokens)), dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise damaged(path, f"it has no whole number where one should be ({_short(error)})") from error
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).rstrip(".").split())[:80]
+
+
+def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
+    """Cut polygons into fans of triangles around their first corners, in order.
+
+    Args:
+        counts: (P,) number of corners of each polygon; those below 3 give no triangle.
+        corners: (sum of counts,) the corners of all polygons, one after another.
+
+    Returns:
+        (F, 3) int64, F = sum of (count - 2).
+    """
+    sizes = np.asarray(counts, dtype=np.int64).reshape(-1)
+    flat = np.asarray(corners, dtype=np.int64).reshape(-1)
+    if len(sizes) and (sizes == sizes[0]).all():
+        polygons = flat.reshape(len(sizes), sizes[0])
+        width = max(int(sizes[0]) - 2, 0)
+        out = np.empty((len(sizes), width, 3), dtype=np.int64)
+        out[:, :, 0] = polygons[:, :1]
+        out[:, :, 1] = polygons[:, 1 : 1 + width]
+        out[:, :, 2] = polygons[:, 2 : 2 + width]
+        return out.reshape(-1, 3)
+    starts = np.cumsum(sizes) - sizes
+    fans = np.maximum(sizes - 2, 0)
+    first = np.repeat(starts, fans)
+    step = np.arange(int(fans.sum()), dtype=np.int64) - np.repeat(np.cumsum(fans) - fans, fans)
+    return np.stack([flat[first], flat[first + step + 1], flat[first + step + 2]], axis=1)
+
+
+def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
+    """Cut triangle strips into triangles, (F, 3) int64; every second one is turned so that all wind alike.
+
+    Args:
+        counts: (P,) number of corners of each strip.
+        corners: (sum of counts,) the corners of all strips, one after another.
+    """
+    sizes = np.asarray(counts, dtype=np.int64).reshape(-1)
+    flat = np.asarray(corners, dtype=np.int64).reshape(-1)
+    starts = np.cumsum(sizes) - sizes
+    each = np.maximum(sizes - 2, 0)
+    step = np.arange(int(each.sum()), dtype=np.int64) - np.repeat(np.cumsum(each) - each, each)
+    at = np.repeat(starts, each) + step
+    odd = step % 2
+    return np.stack([flat[at], flat[at + 1 + odd], flat[at + 2 - odd]], axis=1)
+
+
+def mesh_of(vertices: FloatArray, faces: IndexArray | None, path: Path) -> Mesh:
+    """Return the mesh read from `path`: (V, 3) float64 and (F, 3) int64, which `Mesh` checks and narrows.
+
+    Raises:
+        MeshError: faces that point past the end of the vertices.
+    """
+    return Mesh(vertices, faces, name=path.name)  # pyright: ignore[reportArgumentType]  # checked, then narrowed
+
+
+def number_lines(values: npt.NDArray[Any], pattern: str) -> str:
+    """Return the rows of `values` (N, C) as text, each formatted with the %-`pattern`, ending in newlines."""
+    if not len(values):
+        return ""
+    return (pattern + "\n") * len(values) % tuple(values.ravel().tolist())
+
+
+class _NoDoctype(ET.TreeBuilder):
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("it declares a document type, which is not allowed in such a file")
+
+
+def xml_root(data: bytes, path: Path) -> ET.Element:
+    """Parse XML from a stranger: document types, and with them entities, are refused.
+
+    Raises:
+        FileFormatError: it is not well-formed XML, or it declares a document type.
+    """
+    parser = ET.XMLParser(target=_NoDoctype())
+    try:
+        parser.feed(data)
+        return parser.close()
+    except ET.ParseError as error:
+        raise damaged(path, f"it is not well-formed XML ({_short(error)})") from error
+    except (ValueError, LookupError) as error:
+        raise damaged(path, _short(error)) from error
+
+
+def json_value(data: bytes, path: Path) -> Any:
+    """Parse JSON from a stranger.
+
+    Raises:
+        FileFormatError: it is not JSON, or is nested too deep.
+    """
+    try:
+        return json.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise damaged(path, f"it is not valid JSON ({_short(error)})") from error
+
+
+def check_count(declared: int, bytes_each: int, available: int, what: str, path: Path) -> None:
+    """Refuse a header that declares more than the file can hold, before anything is allocated for it.
+
+    Args:
+        declared: how many the header declares.
+        bytes_each: the least that each takes in the file.
+        available: the bytes that are there.
+        what: "vertices", "faces": used in the sentence.
+        path: the file.
+
+    Raises:
+        FileFormatError: there are too many of them, or fewer than none.
+    """
+    if declared < 0:
+        raise damaged(path, f"its header declares {declared} {what}")
+    if declared * bytes_each > available:
+        raise damaged(
+            path,
+            f"its header declares {declared} {what}, but only {max(available, 0)} bytes follow; {CUT_SHORT}",
+        )
+
+
+def equal_lengths(rows: Sequence[Sequence[bytes]]) -> bool:
+    """Return whether all `rows` hold the same number of tokens."""
+    return len(set(map(len, rows))) <= 1

@@ -1,0 +1,95 @@
+"""STL, ascii and binary: a soup of triangles whose equal corners become one vertex."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, floats, mesh_of
+from shapespace.types import FloatArray, Mesh
+
+_ROW = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def read_stl(data: bytes, path: Path) -> Mesh:
+    """Read STL; corners that are exactly equal become one vertex, numbered in the order of first appearance.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is not STL, holds no triangles, or is cut short.
+    """
+    declared = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
+    # Many binary files start with "solid" too, so the length decides.
+    if declared >= 0 and len(data) == 84 + 50 * declared:
+        binary = True
+    else:
+        binary = not (data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096].lower())
+    if not binary:
+        corners = _ascii_corners(data, path)
+    elif declared < 0:
+        raise damaged(path, "it is too short to be an STL file")
+    else:
+        check_count(declared, 50, len(data) - 84, "triangles", path)
+        table = np.frombuffer(data, dtype=_ROW, count=declared, offset=84)
+        corners = table["corners"].reshape(-1, 3).astype(np.float64)
+    if not len(corners):
+        raise damaged(path, "it holds no triangles")
+    vertices, index = merge_equal(corners)
+    return mesh_of(vertices, index.reshape(-1, 3), path)
+
+
+def _ascii_corners(data: bytes, path: Path) -> FloatArray:
+    lines = [words for words in map(bytes.split, data.lower().splitlines()) if words]
+    rows = [words for words in lines if words[0] == b"vertex"]
+    facets = sum(words[0] == b"facet" for words in lines)
+    if lines[-1][0] != b"endsolid" or len(rows) != 3 * facets or any(len(words) != 4 for words in rows):
+        raise damaged(path, f"it holds {len(rows)} corners for {facets} triangles, or has no end; {CUT_SHORT}")
+    return floats(chain.from_iterable(words[1:] for words in rows), path).reshape(-1, 3)
+
+
+def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Merge exactly equal rows of `points` (N, 3).
+
+    Returns:
+        (M, 3) the different rows in the order of first appearance, and (N,) which of them each row is.
+    """
+    points = points + 0.0  # -0.0 equals 0.0
+    bits: npt.NDArray[np.uint64] = np.ascontiguousarray(points).view(np.uint64)
+    order = np.lexsort((bits[:, 2], bits[:, 1], bits[:, 0]))
+    ranked = bits[order]
+    new = np.ones(len(points), dtype=np.bool_)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    # lexsort is stable, so the first of each group is the one that appears first.
+    first = order[new]
+    by_appearance = np.argsort(first)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[by_appearance] = np.arange(len(first))
+    index = np.empty(len(points), dtype=np.int64)
+    index[order] = rank[np.cumsum(new) - 1]
+    return points[first[by_appearance]], index
+
+
+def write_stl(mesh: Mesh) -> bytes:
+    """Return `mesh` as binary STL: float32, its triangles only, without their numbering of vertices.
+
+    Raises:
+        InputError: it has no triangles, or coordinates too large for float32.
+    """
+    if mesh.faces is None:
+        raise InputError(f"{mesh.name} has no triangles, and STL holds nothing else; write it as PLY instead.")
+    corners = mesh.vertices[mesh.faces]
+    if (np.abs(corners) > np.finfo(np.float32).max).any():
+        raise InputError(f"{mesh.name} has coordinates too large for STL; write it as PLY instead.")
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    table = np.zeros(len(corners), dtype=_ROW)
+    table["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    table["corners"] = corners
+    return b"binary STL".ljust(80) + len(corners).to_bytes(4, "little") + table.tobytes()

@@ -1,0 +1,434 @@
+"""VTK poly data: the legacy `.vtk` text and binary files and the XML `.vtp` files.
+
+After "VTK File Formats" of the VTK documentation: https://docs.vtk.org/en/latest/vtk_file_formats/index.html.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+import xml.etree.ElementTree as ET
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    floats,
+    ints,
+    mesh_of,
+    strip_triangles,
+    xml_root,
+)
+from shapespace.types import FloatArray, Mesh
+
+_LEGACY = {
+    "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2",
+    "unsigned_int": "u4", "int": "i4", "unsigned_long": "u8", "long": "i8",
+    "vtktypeint64": "i8", "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
+    "vtkidtype": "i4", "float": "f4", "double": "f8",
+}  # fmt: skip
+_XML = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
+    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+_SECTIONS = {b"POINTS", b"VERTICES", b"LINES", b"POLYGONS", b"TRIANGLE_STRIPS", b"POINT_DATA", b"CELL_DATA"}
+# zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
+_MAX_INFLATION = 1040
+
+Values = npt.NDArray[Any]
+
+
+class _Cursor(Protocol):
+    def word(self) -> bytes:
+        """Return the next word, or nothing at the end."""
+        ...
+
+    def array(self, count: int, kind: str) -> Values:
+        """Return the next `count` numbers of the numpy `kind`."""
+        ...
+
+    def skip_metadata(self) -> None:
+        """Move past a METADATA section."""
+        ...
+
+    def skip_if_offsets(self) -> bool:
+        """Move past the word OFFSETS if it comes next, and return whether it did."""
+        ...
+
+
+class _TextCursor:
+    def __init__(self, data: bytes, path: Path) -> None:
+        self.tokens, self.at, self.path = data.split(), 0, path
+
+    def word(self) -> bytes:
+        self.at += 1
+        return self.tokens[self.at - 1] if self.at <= len(self.tokens) else b""
+
+    def array(self, count: int, kind: str) -> Values:
+        check_count(count, 2, 2 * (len(self.tokens) - self.at), "numbers", self.path)
+        block = self.tokens[self.at : self.at + count]
+        self.at += count
+        return floats(block, self.path) if kind[0] == "f" else ints(block, self.path)
+
+    def skip_metadata(self) -> None:
+        while self.at < len(self.tokens) and self.tokens[self.at] not in _SECTIONS:
+            self.at += 1
+
+    def skip_if_offsets(self) -> bool:
+        found = self.tokens[self.at : self.at + 1] == [b"OFFSETS"]
+        self.at += found
+        return found
+
+
+class _BinaryCursor:
+    def __init__(self, data: bytes, path: Path) -> None:
+        self.data, self.at, self.path = data, 0, path
+        self.pattern = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
+
+    def word(self) -> bytes:
+        match = self.pattern.match(self.data, self.at)
+        if match is None:
+            return b""
+        self.at = match.end()
+        return match[1]
+
+    def array(self, count: int, kind: str) -> Values:
+        big = np.dtype(">" + kind)
+        check_count(count, big.itemsize, len(self.data) - self.at, "numbers", self.path)
+        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.at)
+        self.at += count * big.itemsize
+        return values.astype(np.float64 if kind[0] == "f" else np.int64)
+
+    def skip_metadata(self) -> None:
+        blank = re.compile(rb"\n[ \t\r]*\n").search(self.data, self.at)
+        self.at = blank.end() if blank else len(self.data)
+
+    def skip_if_offsets(self) -> bool:
+        # As a number, 'OFFS' would be a polygon of a thousand million corners.
+        found = self.data.startswith(b"OFFSETS ", self.at)
+        self.at += 8 * found
+        return found
+
+
+def read_vtk(data: bytes, path: Path) -> Mesh:
+    """Read legacy VTK poly data, ascii or binary, with the cells of VTK before and after 5.1.
+
+    Polygons become fans and triangle strips triangles; vertex and line cells are passed over.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is not legacy VTK poly data, or it is cut short.
+        MeshError: faces that point past the end of the vertices.
+    """
+    head = data[:1024].split(b"\n", 3)
+    if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
+        raise damaged(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
+    encoding = head[2].strip().upper()
+    body = data[sum(len(line) + 1 for line in head[:3]) :]
+    cursor: _Cursor
+    if encoding == b"ASCII":
+        cursor = _TextCursor(body, path)
+    elif encoding == b"BINARY":
+        cursor = _BinaryCursor(body, path)
+    else:
+        raise damaged(path, "its third line says neither ASCII nor BINARY")
+    dataset = cursor.word() + b" " + cursor.word()
+    if dataset != b"DATASET POLYDATA":
+        kind = dataset.decode("ascii", "replace")[:40]
+        raise damaged(path, f"it has '{kind}', not DATASET POLYDATA; extract its surface first")
+    vertices: FloatArray | None = None
+    faces: list[IndexArray] = []
+    while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
+        if word == b"POINTS":
+            count = _count(cursor, path)
+            vertices = cursor.array(3 * count, _kind(cursor, path)).astype(np.float64).reshape(-1, 3)
+        elif word in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
+            counts, corners = _legacy_cells(cursor, path)
+            if word == b"POLYGONS":
+                faces.append(fan_triangles(counts, corners))
+            elif word == b"TRIANGLE_STRIPS":
+                faces.append(strip_triangles(counts, corners))
+        elif word == b"FIELD":
+            cursor.word()
+            for _ in range(_bounded(_count(cursor, path), path)):
+                cursor.word()
+                components, tuples = _count(cursor, path), _count(cursor, path)
+                cursor.array(components * tuples, _kind(cursor, path))
+        elif word == b"METADATA":
+            cursor.skip_metadata()
+        else:
+            name = word.decode("ascii", "replace")[:40]
+            raise damaged(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
+    if vertices is None:
+        raise damaged(path, f"it has no POINTS; {CUT_SHORT}")
+    return mesh_of(vertices, _joined(faces), path)
+
+
+def _joined(faces: list[IndexArray]) -> IndexArray | None:
+    return np.concatenate(faces) if faces else None
+
+
+def _bounded(count: int, path: Path) -> int:
+    if not 0 <= count <= 10_000:
+        raise damaged(path, f"it declares {count} field arrays; {CUT_SHORT}")
+    return count
+
+
+def _count(cursor: _Cursor, path: Path) -> int:
+    return int(ints([cursor.word()], path)[0])
+
+
+def _kind(cursor: _Cursor, path: Path) -> str:
+    name = cursor.word().decode("ascii", "replace").lower()
+    if name not in _LEGACY:
+        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'; {CUT_SHORT}")
+    return _LEGACY[name]
+
+
+def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
+    first, second = _count(cursor, path), _count(cursor, path)
+    if cursor.skip_if_offsets():
+        offsets = cursor.array(first, _kind(cursor, path)).astype(np.int64)
+        if cursor.word() != b"CONNECTIVITY":
+            raise damaged(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
+        corners = cursor.array(second, _kind(cursor, path)).astype(np.int64)
+        return _from_offsets(offsets, corners, path)
+    packed = cursor.array(second, "i4").astype(np.int64)
+    if first > 0 and second and second % first == 0:
+        table = packed.reshape(first, -1)
+        if (table[:, 0] == table.shape[1] - 1).all():
+            return table[:, 0], table[:, 1:].ravel()
+    sizes: list[int] = []
+    at, values = 0, packed.tolist()
+    while at < second and len(sizes) < first and values[at] >= 0:
+        sizes.append(values[at])
+        at += values[at] + 1
+    if at != second or len(sizes) != first:
+        raise damaged(path, f"its cells do not add up to the size that they declare; {CUT_SHORT}")
+    counts = np.array(sizes, dtype=np.int64)
+    keep = np.ones(second, dtype=np.bool_)
+    keep[np.cumsum(counts + 1) - counts - 1] = False
+    return counts, packed[keep]
+
+
+def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> tuple[IndexArray, IndexArray]:
+    """Return sizes of cells and their corners, from offsets that run from 0 to the number of corners."""
+    if not len(offsets):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    counts = np.diff(offsets)
+    if offsets[0] != 0 or offsets[-1] != len(corners) or (counts < 0).any():
+        raise damaged(path, f"the offsets of its cells do not match their corners; {CUT_SHORT}")
+    return counts, corners
+
+
+def write_vtk(mesh: Mesh) -> bytes:
+    """Return `mesh` as binary legacy VTK poly data (version 3.0, known to all readers), with doubles."""
+    n = len(mesh.vertices)
+    head = f"# vtk DataFile Version 3.0\nshapespace\nBINARY\nDATASET POLYDATA\nPOINTS {n} double\n"
+    cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
+    packed = np.empty((len(cells), cells.shape[1] + 1), dtype=">i4")
+    packed[:, 0], packed[:, 1:] = cells.shape[1], cells
+    section = f"\n{'VERTICES' if mesh.faces is None else 'POLYGONS'} {len(cells)} {packed.size}\n"
+    points = mesh.vertices.astype(">f8").tobytes()
+    return head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
+
+
+@dataclass(frozen=True)
+class _Xml:
+    """What the arrays of one XML file have in common."""
+
+    path: Path
+    order: str
+    header: str
+    compressed: bool
+    appended: bytes
+    appended_base64: bool
+
+
+def read_vtp(data: bytes, path: Path) -> Mesh:
+    """Read XML VTK poly data: ascii, inline base64 or appended, plain or zlib; pieces are joined.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: it is not XML poly data, is cut short, or is compressed otherwise than by zlib.
+        MeshError: faces that point past the end of the vertices.
+    """
+    head, mark, tail = data.partition(b"<AppendedData")
+    appended = b""
+    if mark:
+        # Raw data are not XML, so the XML parser sees only what comes before them.
+        tag, _, rest = tail.partition(b">")
+        head += mark + tag + b"/></VTKFile>"
+        appended = rest.partition(b"_")[2]
+    root = xml_root(head, path)
+    if root.tag != "VTKFile" or root.get("type") != "PolyData":
+        raise damaged(path, "it is not a VTK file of type PolyData; extract its surface first")
+    compressor = root.get("compressor", "")
+    if compressor not in ("", "vtkZLibDataCompressor"):
+        raise damaged(path, f"it is compressed by {compressor[:40]}, so save it with zlib or uncompressed")
+    block = root.find("AppendedData")
+    base = block is not None and block.get("encoding", "base64") == "base64"
+    order = ">" if root.get("byte_order") == "BigEndian" else "<"
+    header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
+    xml = _Xml(path, order, header, compressor != "", appended, base)
+    points: list[FloatArray] = []
+    faces: list[IndexArray] = []
+    before = 0
+    for piece in root.iterfind("PolyData/Piece"):
+        vertices = _piece_points(piece, xml)
+        for section, cut in (("Polys", fan_triangles), ("Strips", strip_triangles)):
+            arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
+            if not {"connectivity", "offsets"} <= arrays.keys():
+                continue
+            ends = _data_array(arrays["offsets"], xml).astype(np.int64)
+            corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
+            if not len(ends):
+                continue
+            triangles = cut(*_from_offsets(np.concatenate([[0], ends]), corners, path))
+            # Checked piece by piece: joined, an index past one piece would point into the next.
+            faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
+        points.append(vertices)
+        before += len(vertices)
+    if not points:
+        raise damaged(path, f"it holds no points; {CUT_SHORT}")
+    return mesh_of(np.concatenate(points), _joined(faces), path)
+
+
+def _faces_of(mesh: Mesh) -> IndexArray:
+    return np.zeros((0, 3), dtype=np.int64) if mesh.faces is None else mesh.faces.astype(np.int64)
+
+
+def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
+    declared = int(ints([piece.get("NumberOfPoints", "").encode()], xml.path)[0])
+    array = piece.find("Points/DataArray")
+    if declared == 0:
+        return np.zeros((0, 3))
+    if array is None:
+        raise damaged(xml.path, f"it has a piece without points; {CUT_SHORT}")
+    values = _data_array(array, xml).astype(np.float64)
+    if len(values) != 3 * declared:
+        raise damaged(xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}")
+    return values.reshape(-1, 3)
+
+
+def _data_array(array: ET.Element, xml: _Xml) -> Values:
+    """Return one DataArray as a flat array of its own type."""
+    path = xml.path
+    name = array.get("type", "")
+    if name not in _XML:
+        raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'")
+    kind = np.dtype(xml.order + _XML[name])
+    form = array.get("format", "ascii")
+    text = (array.text or "").encode("ascii", "replace")
+    if form == "ascii":
+        return floats(text.split(), path) if kind.kind == "f" else ints(text.split(), path)
+    if form == "binary":
+        raw = _decoded(b"".join(text.split()), True, xml)
+    elif form == "appended":
+        offset = int(ints([array.get("offset", "").encode()], path)[0])
+        if not 0 <= offset < len(xml.appended):
+            raise damaged(path, f"it has data that start past its end; {CUT_SHORT}")
+        raw = _decoded(xml.appended[offset:], xml.appended_base64, xml)
+    else:
+        raise damaged(path, f"it has data of an unknown form '{form[:40]}'")
+    if len(raw) % kind.itemsize:
+        raise damaged(path, f"it has data that end inside a number; {CUT_SHORT}")
+    return np.frombuffer(raw, dtype=kind)
+
+
+def _decoded(data: bytes, is_base64: bool, xml: _Xml) -> bytes:
+    """Return the bytes of one array that starts at the start of `data`."""
+    width = np.dtype(xml.header).itemsize
+    if not xml.compressed:
+        (length,) = _words(data, 1, is_base64, xml)
+        chars = 4 * -(-width // 3)
+        # Some writers encode the length by itself, which leaves padding, and others together with the data.
+        if is_base64 and data[:chars].endswith(b"="):
+            return _stream(data[chars:], 0, length, True, xml)
+        return _stream(data, width, length, is_base64, xml)
+    (blocks,) = _words(data, 1, is_base64, xml)
+    check_count(blocks, width, len(data), "compressed blocks", xml.path)
+    _, size, last, *packed = _words(data, 3 + blocks, is_base64, xml)
+    header = (3 + blocks) * width
+    stream = _stream(data[4 * -(-header // 3) if is_base64 else header :], 0, sum(packed), is_base64, xml)
+    out: list[bytes] = []
+    at = 0
+    for i, length in enumerate(packed):
+        want = last if i == len(packed) - 1 and last else size
+        if want > _MAX_INFLATION * (length + 16):
+            raise damaged(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
+        try:
+            piece = zlib.decompressobj().decompress(stream[at : at + length], max_length=want or 1)
+        except zlib.error as error:
+            raise damaged(xml.path, f"it has a block that cannot be unpacked; {CUT_SHORT}") from error
+        if len(piece) != want:
+            raise damaged(xml.path, f"it has a compressed block of the wrong length; {CUT_SHORT}")
+        out.append(piece)
+        at += length
+    return b"".join(out)
+
+
+def _words(data: bytes, count: int, is_base64: bool, xml: _Xml) -> list[int]:
+    """Return the `count` whole numbers at the start of an array."""
+    kind = np.dtype(xml.header)
+    return np.frombuffer(_stream(data, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
+
+
+def _stream(data: bytes, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return `length` bytes from byte `start` of what `data` encodes."""
+    end = start + length
+    check_count(end, 1, len(data), "bytes of data", xml.path)
+    try:
+        raw = base64.b64decode(data[: 4 * -(-end // 3)], validate=True) if is_base64 else data
+    except ValueError as error:
+        raise damaged(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
+    if len(raw) < end:
+        raise damaged(xml.path, f"it ends inside its data; {CUT_SHORT}")
+    return raw[start:end]
+
+
+def write_vtp(mesh: Mesh) -> bytes:
+    """Return `mesh` as XML VTK poly data with inline base64, Float64 points, uncompressed."""
+    n = len(mesh.vertices)
+    cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
+    ends = np.arange(1, len(cells) + 1, dtype="<i8") * cells.shape[1]
+    section, verts, polys = ("Verts", n, 0) if mesh.faces is None else ("Polys", 0, len(cells))
+
+    def array(name: str, kind: str, values: Values, components: str = "") -> str:
+        raw = values.tobytes()
+        packed = base64.b64encode(len(raw).to_bytes(8, "little") + raw).decode("ascii")
+        return f'<DataArray type="{kind}" Name="{name}"{components} format="binary">{packed}</DataArray>'
+
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
+        "<PolyData>",
+        f'<Piece NumberOfPoints="{n}" NumberOfVerts="{verts}" NumberOfLines="0" NumberOfStrips="0"'
+        f' NumberOfPolys="{polys}">',
+        "<Points>",
+        array("Points", "Float64", mesh.vertices.astype("<f8"), ' NumberOfComponents="3"'),
+        "</Points>",
+        f"<{section}>",
+        array("connectivity", "Int64", cells.astype("<i8").ravel()),
+        array("offsets", "Int64", ends),
+        f"</{section}>",
+        "</Piece>",
+        "</PolyData>",
+        "</VTKFile>",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
