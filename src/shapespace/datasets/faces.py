@@ -1,0 +1,410 @@
+"""The bundled simulated faces: a generator of people and expressions on one topology, made from CC0 MakeHuman assets.
+
+The surface is head, face, ears and neck of an adult in millimetres: y up, the face looks along +z, x to the subject's
+left, the pupils of the average adult 62 mm apart. A face is linear in its weights; only the weights are random.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import importlib.resources
+import io
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.datasets.loop import loop_operator
+from shapespace.errors import DataError, InputError
+from shapespace.io.files import make_folder, write_text
+from shapespace.io.meshes import write_mesh
+from shapespace.types import FloatArray, IntArray, Mesh, read_only
+
+LICENSE = "CC0-1.0"
+"""Licence of the bundled faces and of everything the generator draws."""
+
+EXPRESSIONS: Mapping[str, Mapping[str, float]] = MappingProxyType(
+    {
+        "neutral": {},
+        "anger": {
+            "browDown": 1.0, "eyeSquint": 0.7, "noseSneer": 0.6, "mouthPress": 0.6, "mouthFrown": 0.35,
+            "mouthRollUpper": 0.25, "jawForward": 0.3, "cheekSquint": 0.2,
+        },
+        "disgust": {
+            "noseSneer": 1.0, "mouthUpperUp": 0.9, "browDown": 0.5, "eyeSquint": 0.6, "cheekSquint": 0.7,
+            "mouthFrown": 0.4, "mouthLowerDown": 0.25, "mouthShrugLower": 0.2,
+        },
+        "fear": {
+            "browInnerUp": 1.0, "browOuterUp": 0.35, "eyeWide": 1.0, "mouthStretch": 0.9, "mouthLowerDown": 0.5,
+            "jawOpen": 0.32,
+        },
+        "smile": {
+            "mouthSmile": 0.9, "cheekSquint": 0.6, "eyeSquint": 0.4, "mouthDimple": 0.1, "mouthUpperUp": 0.3,
+            "jawOpen": 0.06,
+        },
+        "sadness": {
+            "browInnerUp": 1.0, "mouthFrown": 0.9, "mouthShrugLower": 0.5, "eyeLookDown": 0.35, "eyeSquint": 0.2,
+            "mouthPucker": 0.1,
+        },
+        "surprise": {
+            "browInnerUp": 0.9, "browOuterUp": 1.0, "eyeWide": 1.0, "jawOpen": 0.65, "mouthFunnel": 0.1,
+        },
+    }
+)  # fmt: skip
+"""Name -> {unit: weight at full intensity}; a unit without its side stands for both sides."""
+
+# How far each kind of detail may stray: the standard deviation of its weight, whose bound is 2.5 of them.
+_SPREAD = {
+    "asym": 0.05, "cheek": 0.22, "chin": 0.18, "ear": 0.20, "eyebrows": 0.18, "eye": 0.22, "forehead": 0.06,
+    "head": 0.10, "mouth": 0.20, "neck": 0.08, "nose": 0.19,
+}  # fmt: skip
+_SIDE_SPREAD = 0.03
+_OPPOSITES = {
+    "decr": "incr", "down": "up", "in": "out", "backward": "forward", "concave": "convex", "compress": "uncompress",
+}  # fmt: skip
+_ETHNICITIES, _GENDERS = ("african", "asian", "caucasian"), ("female", "male")
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Who a face is.
+
+    Args:
+        weights: (I,) float64 in [0, 1], one for each of the generator's `identity_names`.
+        name: used in the names of meshes.
+    """
+
+    weights: FloatArray
+    name: str = "person"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weights", _checked_weights(self.weights, "person"))
+
+
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """What a face does.
+
+    Args:
+        weights: (U,) float64 in [0, 1], one for each of the generator's `unit_names`.
+        name: one of `EXPRESSIONS`, or "mixed".
+        intensity: number in [0, 1].
+    """
+
+    weights: FloatArray
+    name: str = "mixed"
+    intensity: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weights", _checked_weights(self.weights, "expression"))
+
+
+def _checked_weights(weights: npt.ArrayLike, what: str) -> FloatArray:
+    out = read_only(weights)
+    if out.ndim != 1 or not np.isfinite(out).all() or (out < 0).any() or (out > 1).any():
+        raise InputError(f"The weights of a simulated {what} must be a list of numbers from 0 to 1.")
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class FaceGenerator:
+    """Draws simulated people and expressions, all in one topology; see `load_faces`.
+
+    Args:
+        template: the average young adult, V vertices in mm, with all landmarks.
+        mirror: (V,) int32, the vertex on the other side of the face; its own inverse.
+        landmarks: name -> vertex.
+        regions: name -> (n,) int32 vertices; semi_rigid, eyes, mouth, ears, nose, boundary, eyeballs, mouth_interior.
+        identity_names: the I shapes that make a person.
+        unit_names: the U = 52 units that make an expression; mouthClose only makes sense against an open jaw, and
+            tongueOut moves nothing, since the surface has no tongue.
+    """
+
+    template: Mesh
+    mirror: IntArray
+    landmarks: Mapping[str, int]
+    regions: Mapping[str, IntArray]
+    identity_names: tuple[str, ...]
+    unit_names: tuple[str, ...]
+    _coarse: FloatArray = field(repr=False)
+    _identity: npt.NDArray[np.float32] = field(repr=False)
+    _units: npt.NDArray[np.float32] = field(repr=False)
+    _generic: FloatArray = field(repr=False)
+    _loop: Any = field(repr=False)
+
+    def generic_person(self) -> Person:
+        """Return the average young adult, whose neutral face is the template."""
+        return Person(self._generic, "generic")
+
+    def draw_person(self, rng: np.random.Generator, name: str = "person") -> Person:
+        """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.
+
+        Args:
+            rng: the only source of chance.
+            name: used in the names of the person's meshes.
+        """
+        weights = dict.fromkeys(self.identity_names, 0.0)
+        ethnicity = rng.dirichlet([0.6] * len(_ETHNICITIES))
+        male, old, heavy = rng.beta(0.6, 0.6), 0.7 * rng.beta(0.9, 1.6), rng.beta(2.0, 2.0)
+        gender, age = (1 - male, male), {"young": 1 - old, "old": old}
+        build = {"min": max(0.0, 1 - 2 * heavy), "max": max(0.0, 2 * heavy - 1)}
+        for g, w_gender in zip(_GENDERS, gender, strict=True):
+            for a, w_age in age.items():
+                for e, w_ethnicity in zip(_ETHNICITIES, ethnicity, strict=True):
+                    weights[f"{e}_{g}_{a}"] = float(w_ethnicity * w_gender * w_age)
+                for b, w_build in build.items():
+                    key = f"universal_{g}_{a}_{b}weight"
+                    if key in weights:
+                        weights[key] = float(w_build * w_gender * w_age)
+        for decrease, increase in self._pairs():
+            spread = _SPREAD[decrease.removeprefix("left_").split("_")[0]]
+            shared = _bounded(rng, spread)
+            sides = ("left_", "right_") if decrease.startswith("left_") else ("",)
+            lopsided = decrease.startswith("left_asym")
+            for side in sides:
+                # An asymmetry target is drawn for each side by itself; every other pair of sides shares its weight.
+                x = _bounded(rng, spread) if lopsided else shared
+                if side and not lopsided:
+                    x = float(np.clip(x + _bounded(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
+                down, up = (side + n.removeprefix("left_") for n in (decrease, increase))
+                if x < 0 and down != up:
+                    weights[down] = -x
+                elif x > 0:
+                    weights[up] = x
+        return Person(np.array([weights[n] for n in self.identity_names]), name)
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Return (towards less, towards more) for each detail on the left or in the middle; (x, x) without a pair."""
+        known = set(self.identity_names)
+        out: list[tuple[str, str]] = []
+        for name in self.identity_names:
+            stem, _, last = name.rpartition("_")
+            if name.startswith(("right_", "universal_", *_ETHNICITIES)):
+                continue
+            if last in _OPPOSITES and f"{stem}_{_OPPOSITES[last]}" in known:
+                out.append((name, f"{stem}_{_OPPOSITES[last]}"))
+            elif not (last in _OPPOSITES.values() and any(f"{stem}_{k}" in known for k in _OPPOSITES)):
+                out.append((name, name))
+        return out
+
+    def draw_expression(
+        self, name: str, intensity: float, rng: np.random.Generator, variation: float = 0.12
+    ) -> Expression:
+        """Draw one way of showing an expression.
+
+        Args:
+            name: one of `EXPRESSIONS`.
+            intensity: from 0 (neutral) to 1.
+            rng: the only source of chance.
+            variation: how much each unit varies from one drawing to the next, as a share of its weight.
+
+        Raises:
+            InputError: unknown name, or an intensity outside [0, 1].
+        """
+        if not 0 <= intensity <= 1:
+            raise InputError(f"The intensity of an expression must lie between 0 and 1, not at {intensity!r}.")
+        return Expression(np.clip(intensity * self._recipe(name, rng, variation), 0, 1), name, float(intensity))
+
+    def mixed_expression(self, rng: np.random.Generator, variation: float = 0.03) -> Expression:
+        """Draw a mixture of the six expressions, each at its own intensity, for a training set of one person.
+
+        Args:
+            rng: the only source of chance.
+            variation: how much each unit varies, as a share of its weight.
+        """
+        names = [n for n in EXPRESSIONS if n != "neutral"]
+        intensity = float(np.sqrt(rng.uniform()))
+        shares = intensity * rng.dirichlet([0.5] * len(names))
+        total = sum(
+            (s * self._recipe(n, rng, variation) for n, s in zip(names, shares, strict=True)),
+            np.zeros(len(self.unit_names)),
+        )
+        return Expression(np.clip(total, 0, 1), "mixed", intensity)
+
+    def _recipe(self, name: str, rng: np.random.Generator, variation: float) -> FloatArray:
+        if name not in EXPRESSIONS:
+            raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(EXPRESSIONS)}.")
+        out = np.zeros(len(self.unit_names))
+        for unit, weight in EXPRESSIONS[name].items():
+            both = weight * (1 + _bounded(rng, variation))
+            for side in ("Left", "Right") if unit not in self.unit_names else ("",):
+                lean = 1 + (_bounded(rng, 0.3 * variation) if side else 0.0)
+                out[self.unit_names.index(unit + side)] = min(1.0, both * lean)
+        return out
+
+    def face(self, person: Person, expression: Expression | None = None, name: str | None = None) -> Mesh:
+        """Return the surface of a person with an expression, in mm, with all landmarks.
+
+        Args:
+            person: from this generator.
+            expression: from this generator; neutral when left out.
+            name: of the mesh; made from the two when left out.
+
+        Raises:
+            InputError: weights of the wrong number.
+        """
+        for weights, shapes, what in (
+            (person.weights, self._identity, "person"),
+            (expression.weights if expression else np.zeros(len(self._units)), self._units, "expression"),
+        ):
+            if len(weights) != len(shapes):
+                raise InputError(
+                    f"This {what} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw it from "
+                    "the same generator."
+                )
+        change = _combine(person.weights - self._generic, self._identity)
+        if expression is not None:
+            change = change + _combine(expression.weights, self._units)
+        vertices = np.asarray(self._loop @ (self._coarse + change), dtype=np.float64)
+        title = name or (person.name if expression is None else f"{person.name} {expression.name}")
+        points = {k: vertices[v] for k, v in self.landmarks.items()}
+        return Mesh(vertices, self.template.faces, points, title)
+
+
+def _combine(weights: FloatArray, shapes: npt.NDArray[np.float32]) -> FloatArray:
+    used = np.flatnonzero(weights)
+    return np.tensordot(weights[used].astype(np.float32), shapes[used], axes=1).astype(np.float64)
+
+
+def _bounded(rng: np.random.Generator, spread: float) -> float:
+    """Draw from a normal distribution cut off at 2.5 standard deviations."""
+    while True:
+        x = float(rng.normal())
+        if abs(x) <= 2.5:
+            return spread * x
+
+
+@functools.cache
+def load_faces() -> FaceGenerator:
+    """Return the generator of the bundled simulated faces; read once, then kept.
+
+    Raises:
+        DataError: the bundled file is missing or damaged.
+
+    Source: MakeHuman system assets and the Face Units pack, CC0 1.0; see datasets/data/faces.md.
+    """
+    source = importlib.resources.files("shapespace.datasets") / "data" / "faces.npz"
+    try:
+        with np.load(io.BytesIO(source.read_bytes()), allow_pickle=False) as packed:
+            data: dict[str, npt.NDArray[Any]] = {k: packed[k] for k in packed.files}
+        return _generator(data)
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError("The bundled file faces.npz is missing or damaged; install shapespace again.") from error
+
+
+def _generator(data: Mapping[str, npt.NDArray[Any]]) -> FaceGenerator:
+    step = float(data["step_mm"])
+    coarse = np.asarray(data["template"], dtype=np.float64) * step
+    coarse_mirror = data["mirror"].astype(np.int64)
+    faces = data["faces"].astype(np.int64)
+    operator, refined = loop_operator(len(coarse), faces)
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    swapped = np.sort(coarse_mirror[edges], axis=1)
+    keys, wanted = edges @ [len(coarse), 1], swapped @ [len(coarse), 1]
+    mirror = np.concatenate([coarse_mirror, len(coarse) + np.searchsorted(keys, wanted)]).astype(np.int32)
+
+    all_names, kinds = [str(n) for n in data["names"]], [str(k) for k in data["kinds"]]
+    shapes = data["shapes"].astype(np.float32) * np.float32(step)
+    flip = np.array([-1, 1, 1], dtype=np.float32)
+    people: dict[str, npt.NDArray[np.float32]] = {}
+    units: dict[str, npt.NDArray[np.float32]] = {}
+    for name, kind, shape in zip(all_names, kinds, shapes, strict=True):
+        into = units if kind == "unit" else people
+        into[name] = shape
+        other = name.removesuffix("Left") + "Right" if kind == "unit" else "right_" + name.removeprefix("left_")
+        if name.endswith("Left") or name.startswith("left_"):
+            into[other] = shape[coarse_mirror] * flip
+    generic = np.zeros(len(people))
+    for k, name in enumerate(people):
+        if name.startswith(_ETHNICITIES) and name.endswith("_young"):
+            generic[k] = 1 / (len(_ETHNICITIES) * len(_GENDERS))
+
+    landmarks = {str(n): int(v) for n, v in zip(data["landmark_names"], data["landmark_vertices"], strict=True)}
+    ends = np.cumsum(data["region_sizes"])[:-1]
+    groups = np.split(data["region_vertices"].astype(np.int32), ends)
+    regions = {str(n): g for n, g in zip(data["region_names"], groups, strict=True)}
+    for array in (mirror, *regions.values()):
+        array.setflags(write=False)
+    vertices = np.asarray(operator @ coarse, dtype=np.float64)
+    template = Mesh(vertices, refined, {k: vertices[v] for k, v in landmarks.items()}, "simulated face template")
+    return FaceGenerator(
+        template=template,
+        mirror=mirror,
+        landmarks=MappingProxyType(landmarks),
+        regions=MappingProxyType(regions),
+        identity_names=tuple(people),
+        unit_names=tuple(units),
+        _coarse=coarse,
+        _identity=np.stack(list(people.values())),
+        _units=np.stack(list(units.values())),
+        _generic=read_only(generic),
+        _loop=operator,
+    )
+
+
+def write_faces(
+    folder: Path,
+    *,
+    subjects: int,
+    expressions: Sequence[str] = ("neutral",),
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
+
+    Subject k is the same person whatever the number of subjects, and looks the same whatever the other expressions.
+
+    Args:
+        folder: created when missing.
+        subjects: how many people, 1 to 100,000.
+        expressions: names out of `EXPRESSIONS`, each drawn once per person at full intensity.
+        seed: a number of 0 or more.
+        progress: called with (files written, files in all).
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: no subjects, too many, a negative seed, or an unknown or repeated expression.
+        FileError: the folder cannot be written.
+    """
+    known = list(EXPRESSIONS)
+    if not 1 <= subjects <= 100_000:
+        raise InputError(f"The number of subjects must lie between 1 and 100000, not at {subjects}.")
+    if seed < 0:
+        raise InputError(f"The seed must be 0 or more, not {seed}.")
+    if not expressions or len(set(expressions)) != len(expressions):
+        raise InputError("Give at least one expression, and each one once.")
+    for name in expressions:
+        if name not in known:
+            raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
+    folder = make_folder(Path(folder))
+    faces = load_faces()
+    labels: list[tuple[str, str, str, str]] = []
+    for k in range(subjects):
+        person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}")
+        for name in expressions:
+            expression = faces.draw_expression(name, 1.0, np.random.default_rng([seed, k, 1 + known.index(name)]))
+            file = f"{person.name}_{name}.ply"
+            write_mesh(folder / file, faces.face(person, expression))
+            labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
+            if progress is not None:
+                progress(len(labels), subjects * len(expressions))
+    _write_csv(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
+    _write_csv(folder / "landmarks.csv", ("name", "vertex"), list(faces.landmarks.items()))
+    return folder
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
