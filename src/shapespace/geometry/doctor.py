@@ -1,0 +1,491 @@
+"""The mesh doctor: what is in a scan, what is wrong with it, and the repairs that cannot do harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, csgraph
+
+from shapespace.errors import MeshError
+from shapespace.types import BoolArray, FloatArray, Mesh
+
+_Ints: TypeAlias = npt.NDArray[np.int64]
+
+# Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
+_DEGENERATE = 1e-12
+# Smallest over largest spread below which points lie on a plane, and second over largest for a line.
+_FLAT = 1e-6
+# Distance from the origin, over the size, from which coordinates stored as float32 get coarse.
+_FAR = 100.0
+# How far the normals of an open surface must point to its inside before it is turned: a convex cap gives
+# +0.3 or more, and a surface that is as much bowl as cap gives 0.
+_REVERSED = -0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing the doctor found.
+
+    Args:
+        level: "fixed" (repaired), "note" (left as it is) or "refused" (cannot be fitted).
+        what: a sentence on what is there.
+        action: a sentence on what fitting does about it, or for "refused", what the user can do.
+    """
+
+    level: Literal["fixed", "note", "refused"]
+    what: str
+    action: str
+
+
+@dataclass(frozen=True, eq=False)
+class MeshReport:
+    """What is in a mesh, as it is in its file.
+
+    Args:
+        name: the mesh's name.
+        vertices: number of vertices.
+        triangles: number of triangles; 0 for a point cloud.
+        bounds: (2, 3) float64 lowest and highest finite coordinates, in the mesh's unit; NaN if there are none.
+        extent: (3,) float64 size along the axes, in the mesh's unit.
+        components: number of connected pieces of surface; 0 for a point cloud.
+        largest_component_share: the share of the area that the largest piece has, 0 to 1.
+        boundary_edges: edges with one triangle; 0 means the surface is closed.
+        non_manifold_edges: edges with more than two triangles.
+        duplicate_vertices: vertices that lie exactly on an earlier one.
+        unreferenced_vertices: vertices that no triangle uses; 0 for a point cloud.
+        degenerate_triangles: triangles without area.
+        duplicate_triangles: triangles on the same three points as an earlier one.
+        non_finite_vertices: vertices with a coordinate that is NaN or infinite.
+        inconsistent_edges: edges whose two triangles wind against each other.
+        reversed_triangles: triangles that the repair turns round.
+        planarity: smallest over largest singular value of the centred points: 0 on a plane.
+        origin_distance: distance of the centroid from the origin over the diagonal of the bounds.
+        findings: everything worth saying, in the order in which it was found.
+    """
+
+    name: str
+    vertices: int
+    triangles: int
+    bounds: FloatArray
+    extent: FloatArray
+    components: int
+    largest_component_share: float
+    boundary_edges: int
+    non_manifold_edges: int
+    duplicate_vertices: int
+    unreferenced_vertices: int
+    degenerate_triangles: int
+    duplicate_triangles: int
+    non_finite_vertices: int
+    inconsistent_edges: int
+    reversed_triangles: int
+    planarity: float
+    origin_distance: float
+    findings: tuple[Finding, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether fitting takes the mesh."""
+        return all(finding.level != "refused" for finding in self.findings)
+
+
+def examine(mesh: Mesh) -> MeshReport:
+    """Return what is in `mesh`, what is wrong with it and what fitting does about it; nothing is refused here.
+
+    Edges, pieces and winding are those of the repaired mesh, since without merging equal vertices a soup of
+    triangles has as many pieces as triangles.
+
+    Args:
+        mesh: any mesh, also one without points or with NaN in it.
+    """
+    return _Doctor(mesh).report()
+
+
+def repair(mesh: Mesh) -> tuple[Mesh, tuple[Finding, ...]]:
+    """Fix what can be fixed safely and refuse what cannot be fitted.
+
+    Exactly equal vertices are merged; triangles without area and repeated triangles are dropped; vertices that
+    no triangle uses, and missing points (NaN) of a point cloud, are dropped; winding is made consistent and
+    turned outward. Several pieces, non-manifold edges and a far origin are kept and noted.
+
+    Args:
+        mesh: a scan as read. The numbering of its vertices does not survive; its landmarks and name do.
+
+    Returns:
+        The repaired mesh (`mesh` itself where there was nothing to do), and the findings.
+
+    Raises:
+        MeshError: it cannot be fitted; the one sentence names it and says what to do.
+    """
+    doctor = _Doctor(mesh)
+    for finding in doctor.findings:
+        if finding.level == "refused":
+            raise MeshError(f"{mesh.name}: {finding.what[0].lower()}{finding.what[1:-1]}; {finding.action}")
+    return doctor.repaired(), tuple(doctor.findings)
+
+
+class _Doctor:
+    """One pass over a mesh that repairs as it goes and counts what it met."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.findings: list[Finding] = []
+        self.vertices = mesh.vertices
+        self.faces: _Ints | None = None if mesh.faces is None else mesh.faces.astype(np.int64)
+        self.in_file = self.faces
+        """The triangles in the numbering of the file, in step with `faces`."""
+        self.changed = False
+        self.non_finite = self.duplicates = self.unreferenced = self.degenerate = self.repeated = 0
+        self.components = self.boundary = self.non_manifold = self.inconsistent = self.turned = 0
+        self.share = 1.0 if self.faces is not None else 0.0
+        self.planarity = self.origin_distance = float("nan")
+        finite: BoolArray = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
+        self.finite = finite
+        if self._drop_non_finite(finite):
+            self._run()
+
+    def _run(self) -> None:
+        if not len(self.vertices):
+            return self._refuse("There are no points in it.", "export the scan again.")
+        self._merge_vertices()
+        if self.faces is not None:
+            self._drop_triangles()
+            self._drop_unreferenced()
+        self._measure_spread()
+        if self.faces is not None and len(self.faces):
+            self._inspect_surface()
+        return None
+
+    def _refuse(self, what: str, action: str) -> None:
+        self.findings.append(Finding("refused", what, action))
+
+    def _fixed(self, what: str, action: str) -> None:
+        self.changed = True
+        self.findings.append(Finding("fixed", what, action))
+
+    def _note(self, what: str, action: str) -> None:
+        self.findings.append(Finding("note", what, action))
+
+    def _drop_non_finite(self, finite: BoolArray) -> bool:
+        """Drop points that are not finite if no triangle needs them; return whether the rest can go on."""
+        bad = int((~finite).sum())
+        self.non_finite = bad
+        if not bad:
+            return True
+        what = f"{_some(bad, 'vertex', 'vertices')} with coordinates that are NaN or infinite"
+        if self.faces is not None and not finite[self.faces].all():
+            self._refuse(f"It has {what}, and triangles that use them.", "export the scan again without them.")
+            return False
+        self._keep_vertices(finite)
+        self._fixed(f"It has {what}.", "They are missing points that no triangle uses, and are dropped.")
+        return True
+
+    def _keep_vertices(self, keep: BoolArray) -> None:
+        if self.faces is not None:
+            self.faces = (np.cumsum(keep) - 1)[self.faces]
+        self.vertices = self.vertices[keep]
+
+    def _keep_triangles(self, keep: BoolArray | _Ints) -> None:
+        assert self.faces is not None and self.in_file is not None
+        self.faces, self.in_file = self.faces[keep], self.in_file[keep]
+
+    def _merge_vertices(self) -> None:
+        first, index = _equal_rows(self.vertices)
+        self.duplicates = len(self.vertices) - len(first)
+        if self.duplicates:
+            self.vertices = self.vertices[first]
+            self.faces = None if self.faces is None else index[self.faces]
+            self._fixed(
+                f"{_some(self.duplicates, 'vertex lies', 'vertices lie')} exactly on another.",
+                "Equal vertices are merged into one.",
+            )
+
+    def _drop_triangles(self) -> None:
+        assert self.faces is not None
+        # Near the origin, so that far coordinates do not eat the digits of the areas.
+        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces]
+        edges = corners - np.roll(corners, 1, axis=1)
+        longest = np.einsum("fij,fij->fi", edges, edges).max(axis=1)
+        doubled = np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1)
+        flat = doubled <= _DEGENERATE * longest
+        self.degenerate = int(flat.sum())
+        if self.degenerate:
+            self._keep_triangles(~flat)
+            self._fixed(f"{_some(self.degenerate, 'triangle has', 'triangles have')} no area.", "They are dropped.")
+        if len(self.faces):
+            ranked = np.sort(self.faces, axis=1)
+            first, _ = _equal_rows(ranked)
+            self.repeated = len(self.faces) - len(first)
+            if self.repeated:
+                self._keep_triangles(first)
+                self._fixed(
+                    f"{_some(self.repeated, 'triangle repeats', 'triangles repeat')} an earlier one.",
+                    "Only the first of each is kept.",
+                )
+
+    def _drop_unreferenced(self) -> None:
+        assert self.faces is not None
+        if not len(self.faces):
+            return
+        used = np.zeros(len(self.vertices), dtype=np.bool_)
+        used[self.faces] = True
+        self.unreferenced = int((~used).sum())
+        if self.unreferenced:
+            self._keep_vertices(used)
+            self._fixed(
+                f"{_some(self.unreferenced, 'vertex belongs', 'vertices belong')} to no triangle.",
+                "They are not part of the surface, and are dropped.",
+            )
+
+    def _measure_spread(self) -> None:
+        """Refuse what spans no space; note what lies far from the origin."""
+        vertices = self.vertices
+        centre = vertices.mean(axis=0)
+        centred = vertices - centre
+        # The eigenvalues of the 3 x 3 covariance would lose half of the digits; R of QR keeps them.
+        spread = np.linalg.svd(np.linalg.qr(centred, mode="r"), compute_uv=False)
+        spread = np.concatenate([spread, np.zeros(3 - len(spread))])
+        largest = float(spread[0])
+        self.planarity = float(spread[2]) / largest if largest > 0 else 0.0
+        diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        far = float(np.linalg.norm(centre))
+        self.origin_distance = far / diagonal if diagonal > 0 else float("inf")
+        tolerance = _FLAT
+        coarse = float(np.abs(vertices).max()) * float(np.finfo(np.float32).eps)
+        stored_single = bool((np.abs(vertices) <= np.finfo(np.float32).max).all()) and np.array_equal(
+            vertices.astype(np.float32), vertices
+        )
+        if stored_single and largest > 0:
+            # Rounding to float32 lifts a plane off itself by up to this much.
+            tolerance = max(tolerance, coarse * float(np.sqrt(len(vertices))) / largest)
+        if len(vertices) == 1:
+            self._refuse("All its points are equal.", "give a scan of a surface.")
+        elif spread[1] <= tolerance * largest:
+            self._refuse("All its points lie on a line.", "give a scan of a surface.")
+        elif self.faces is not None and len(self.faces) <= 1:
+            count = "only one triangle" if len(self.faces) else "no triangle that has an area"
+            self._refuse(f"It has {count}.", "give a scan of a whole surface.")
+        elif len(vertices) < 4:
+            self._refuse(f"It has only {len(vertices)} different points.", "give at least 4, not on a plane.")
+        elif spread[2] <= tolerance * largest:
+            self._refuse("All its points lie on a plane.", "give a scan of a surface with some depth.")
+        if diagonal > 0 and self.origin_distance > _FAR:
+            grid = f", on a grid of about {coarse:.2g}" if stored_single else ""
+            self._note(
+                f"It lies {far:.3g} units from the origin, {self.origin_distance:.0f} times its own size{grid}.",
+                "It is moved to its centroid in double precision before fitting, and back after.",
+            )
+        if self.faces is None:
+            self._note("It has no triangles: a point cloud.", "Distances are measured to its points.")
+
+    def _inspect_surface(self) -> None:
+        assert self.faces is not None
+        edges = _Edges(self.faces, len(self.vertices))
+        self.boundary, self.non_manifold = edges.boundary, edges.non_manifold
+        if self.non_manifold:
+            self._note(
+                f"{_some(self.non_manifold, 'edge has', 'edges have')} more than two triangles.",
+                "They are kept; winding is not carried across them.",
+            )
+        self.inconsistent = int(edges.same_way.sum())
+        self._orient(edges)
+        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        self._turn_outward(edges, corners.mean(axis=1), normals)
+        areas = np.linalg.norm(normals, axis=1)
+        self.components, pieces = _components(len(self.vertices), self.faces[:, [0, 1]], self.faces[:, [1, 2]])
+        by_piece = np.bincount(pieces[self.faces[:, 0]], weights=areas)
+        self.share = float(by_piece.max() / areas.sum())
+        if self.components > 1:
+            self._note(
+                f"It has {self.components} separate pieces; the largest has {100 * self.share:.1f} % of the area.",
+                "All are kept.",
+            )
+
+    def _orient(self, edges: _Edges) -> None:
+        """Make winding consistent in each patch, turning the smaller side."""
+        assert self.faces is not None and self.in_file is not None
+        if not self.inconsistent:
+            return
+        # Where merging glued two pieces that touch, their winding says nothing about each other; in a soup of
+        # triangles every edge is glued, and winding is all there is.
+        meet = (self.in_file[edges.pairs[:, 0], :, None] == self.in_file[edges.pairs[:, 1], None, :]).sum(axis=(1, 2))
+        glued = meet < 2
+        if glued.mean() < 0.5 and (glued & edges.same_way).any():
+            count = int((glued & edges.same_way).sum())
+            edges.cut(glued & edges.same_way)
+            self._note(
+                f"At {_some(count, 'edge', 'edges')}, pieces that wind against each other touch.",
+                "They are kept; winding is not carried across.",
+            )
+        n = len(self.faces)
+        # Each triangle is there twice, as it is (i) and turned (i + n); an edge ties the states that agree.
+        # A patch that can be oriented falls into two mirrored halves; a Moebius strip stays in one.
+        a, b = edges.pairs.T
+        shift = np.where(edges.same_way, n, 0)
+        _, label = _components(2 * n, np.stack([a, b + shift], axis=1), np.stack([a + n, b + n - shift], axis=1))
+        as_is, turned = label[:n], label[n:]
+        size = np.bincount(as_is, minlength=int(label.max()) + 1)
+        smaller = (size[as_is] < size[turned]) | ((size[as_is] == size[turned]) & (as_is > turned))
+        stuck = int((as_is == turned).sum())
+        flip = smaller & (as_is != turned)
+        if flip.any():
+            self._turn(flip)
+            self._fixed(
+                f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours.",
+                "They are turned round.",
+            )
+        if stuck:
+            self._note(
+                f"{_some(stuck, 'triangle is', 'triangles are')} on a one-sided surface (a Moebius strip).",
+                "They are kept as they are; their normals cannot be trusted.",
+            )
+
+    def _turn(self, flip: BoolArray) -> None:
+        assert self.faces is not None
+        self.faces = np.where(flip[:, None], self.faces[:, ::-1], self.faces)
+        self.turned += int(flip.sum())
+
+    def _turn_outward(self, edges: _Edges, middles: FloatArray, normals: FloatArray) -> None:
+        """Turn closed patches with negative volume, and the open surface if its normals point inward."""
+        assert self.faces is not None
+        count, patch = edges.patches()
+        closed = np.ones(count, dtype=np.bool_)
+        closed[patch[edges.loose]] = False
+        areas = np.linalg.norm(normals, axis=1)
+        area = np.bincount(patch, weights=areas, minlength=count)
+        centre = np.stack(
+            [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
+        )
+        outward = np.einsum("fi,fi->f", normals, middles - centre[patch])
+        volume = np.bincount(patch, weights=outward, minlength=count) / 3
+        inside_out = closed & (volume < 0)
+        biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
+        for k in np.flatnonzero(inside_out):
+            # The wall of a cavity rightly looks inward.
+            if k != biggest and _within(middles[patch == k], middles[patch == biggest]):
+                inside_out[k] = False
+        if inside_out.any():
+            self._turn(inside_out[patch])
+            normals[inside_out[patch]] *= -1
+            self._fixed(
+                f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out.",
+                "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed.",
+            )
+        # Patches of one scan come from one scanner, so the open ones are judged and turned together.
+        is_open = ~closed[patch]
+        if not is_open.any():
+            return
+        weight = areas[is_open]
+        arm = middles[is_open] - np.average(middles[is_open], axis=0, weights=weight)
+        reach = float((weight * np.linalg.norm(arm, axis=1)).sum())
+        score = float(np.einsum("fi,fi->", normals[is_open], arm)) / reach if reach > 0 else 0.0
+        if score < _REVERSED:
+            self._turn(is_open)
+            normals[is_open] *= -1
+            self._fixed(
+                "The normals of the open surface point to its inside, so its winding looks reversed.",
+                "Its winding is reversed.",
+            )
+
+    def repaired(self) -> Mesh:
+        """Return the mesh after the repairs."""
+        if not self.changed:
+            return self.mesh
+        faces = None if self.faces is None else self.faces.astype(np.int32)
+        return Mesh(self.vertices, faces, self.mesh.landmarks, self.mesh.name)
+
+    def report(self) -> MeshReport:
+        """Return what was found."""
+        finite = self.mesh.vertices[self.finite]
+        bounds = np.stack([finite.min(axis=0), finite.max(axis=0)]) if len(finite) else np.full((2, 3), np.nan)
+        return MeshReport(
+            name=self.mesh.name,
+            vertices=len(self.mesh.vertices),
+            triangles=0 if self.mesh.faces is None else len(self.mesh.faces),
+            bounds=bounds,
+            extent=bounds[1] - bounds[0],
+            components=self.components,
+            largest_component_share=self.share,
+            boundary_edges=self.boundary,
+            non_manifold_edges=self.non_manifold,
+            duplicate_vertices=self.duplicates,
+            unreferenced_vertices=self.unreferenced,
+            degenerate_triangles=self.degenerate,
+            duplicate_triangles=self.repeated,
+            non_finite_vertices=self.non_finite,
+            inconsistent_edges=self.inconsistent,
+            reversed_triangles=self.turned,
+            planarity=self.planarity,
+            origin_distance=self.origin_distance,
+            findings=tuple(self.findings),
+        )
+
+
+class _Edges:
+    """The edges of triangles (F, 3): how many are boundary or non-manifold, and who meets across the others."""
+
+    def __init__(self, faces: _Ints, vertices: int) -> None:
+        start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        key = np.minimum(start, end) * vertices + np.maximum(start, end)
+        order = np.argsort(key, kind="stable")
+        new = np.ones(len(key) + 1, dtype=np.bool_)
+        new[1:-1] = key[order[1:]] != key[order[:-1]]
+        first = np.flatnonzero(new[:-1])
+        uses = np.diff(np.flatnonzero(new))
+        owner = order // 3
+        self.faces = len(faces)
+        self.boundary = int((uses == 1).sum())
+        self.non_manifold = int((uses > 2).sum())
+        two = first[uses == 2]
+        self.pairs: _Ints = np.stack([owner[two], owner[two + 1]], axis=1)
+        """(E, 2) the triangles that meet across each manifold edge."""
+        self.same_way: BoolArray = start[order[two]] == start[order[two + 1]]
+        """(E,) whether they run along it in the same direction, so that one of them is turned."""
+        self.loose: _Ints = owner[np.repeat(uses != 2, uses)]
+        """Triangles with an edge that is boundary or non-manifold."""
+
+    def cut(self, seam: BoolArray) -> None:
+        """Take the pairs where `seam` (E,) as not joined."""
+        self.loose = np.concatenate([self.loose, self.pairs[seam].ravel()])
+        self.pairs, self.same_way = self.pairs[~seam], self.same_way[~seam]
+
+    def patches(self) -> tuple[int, _Ints]:
+        """Return the number of patches joined by manifold edges, and (F,) the patch of each triangle."""
+        return _components(self.faces, self.pairs)
+
+
+def _components(nodes: int, *links: npt.NDArray[Any]) -> tuple[int, _Ints]:
+    """Return the number of connected components and (nodes,) the component of each; `links` are (E, 2)."""
+    ties = np.concatenate(links)
+    graph = coo_array((np.ones(len(ties), dtype=np.int8), (ties[:, 0], ties[:, 1])), shape=(nodes, nodes))
+    # SciPy has no types here.
+    label: Any = cast(Any, csgraph).connected_components(graph.tocsr(), directed=False)[1]
+    return int(label.max()) + 1 if nodes else 0, np.asarray(label, dtype=np.int64)
+
+
+def _equal_rows(rows: npt.NDArray[Any]) -> tuple[_Ints, _Ints]:
+    """Return where each different row of `rows` (N, 3) first appears, in that order, and (N,) which one each is."""
+    order = np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))
+    ranked = rows[order]
+    new = np.ones(len(rows), dtype=np.bool_)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    first = order[new]
+    by_appearance = np.argsort(first)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[by_appearance] = np.arange(len(first))
+    index = np.empty(len(rows), dtype=np.int64)
+    index[order] = rank[np.cumsum(new) - 1]
+    return first[by_appearance], index
+
+
+def _within(inner: FloatArray, outer: FloatArray) -> bool:
+    """Whether the box around `inner` lies inside the box around `outer`."""
+    return bool((inner.min(axis=0) > outer.min(axis=0)).all() and (inner.max(axis=0) < outer.max(axis=0)).all())
+
+
+def _some(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
