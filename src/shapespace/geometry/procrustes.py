@@ -71,9 +71,10 @@ def align_in_place(
     if alignment_vertices is not None and len(alignment_vertices) < 3:
         raise InputError("Alignment needs at least three vertices; give more of them, or none to use all.")
     with_scale = gauge == "shape"
-    size = float(np.mean([centroid_size(shape[chosen]) for shape in shapes]))
-    if size <= 0:
-        raise InputError("All vertices of the training shapes coincide, so they cannot be aligned.")
+    sizes = [centroid_size(shape[chosen]) for shape in shapes]
+    size = float(np.mean(sizes))
+    if min(sizes) <= 0:
+        raise InputError("All vertices of a training shape coincide, so it cannot be aligned; leave it out.")
 
     mean = shapes[0] - shapes[0][chosen].mean(axis=0)
     if with_scale:
