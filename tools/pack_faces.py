@@ -47,6 +47,7 @@ LIP_CORNER, TRAGION, GONION = 7250, 12067, 7459
 FOLDERS = ("head", "forehead", "eyebrows", "eyes", "nose", "mouth", "cheek", "chin", "ears", "neck", "asym")
 LEFT_OUT = (
     "head-trans-", "head-angle-", "measure-", "neck-trans-", "asymm-", "ear-shape-pointed", "ear-shape-triangle",
+    "mouth-trans-in", "mouth-trans-out", "nose-trans-in", "nose-trans-out",
 )  # fmt: skip
 
 
@@ -674,8 +675,8 @@ def find_regions(
 
     x, y, z = np.abs(V[:, 0]), V[:, 1], V[:, 2]
     sellion, tip = at("sellion"), at("pronasale")
-    forehead = (y > sellion[1] + 26) & (y < sellion[1] + 75) & (x < 55) & (z > 0)
-    bridge = (y <= sellion[1] + 26) & (y > sellion[1] - 4) & (x < 9) & (z > 0)
+    forehead = (y > sellion[1] + 40) & (y < sellion[1] + 88) & (x < 55) & (z > 0)
+    bridge = (y <= sellion[1] + 7) & (y > sellion[1] - 4) & (x < 9) & (z > 0)
     nose_top = (y <= sellion[1] - 4) & (y > tip[1] + 12) & (x < 11) & (z > sellion[2] - 12)
     nose = (y <= sellion[1]) & (y > at("subnasale")[1] - 1) & (z > at("left_alare")[2] - 10)
     nose &= x < np.interp(y, [tip[1] - 12, tip[1], sellion[1]], [at("left_alare")[0] + 2] * 2 + [10.0])

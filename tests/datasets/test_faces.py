@@ -27,11 +27,6 @@ def directed_edges(triangles):
     return triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
-def area(mesh):
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 def moved(faces, expression):
     neutral = faces.face(faces.generic_person()).vertices
     return np.linalg.norm(faces.face(faces.generic_person(), expression).vertices - neutral, axis=1)
@@ -114,10 +109,10 @@ def test_regions_are_where_their_names_say(faces):
     assert faces.landmarks["left_tragion"] in faces.regions["ears"]
 
 
-def test_the_semi_rigid_region_moves_less_than_the_face(faces):
-    for name in ("smile", "surprise", "disgust"):
-        d = moved(faces, faces.draw_expression(name, 1.0, np.random.default_rng(0)))
-        assert d[faces.regions["semi_rigid"]].mean() < 0.5 * d[faces.regions["mouth"]].mean()
+@pytest.mark.parametrize(("name", "share"), [("smile", 0.1), ("surprise", 0.1), ("fear", 0.1), ("anger", 0.7)])
+def test_the_semi_rigid_region_moves_less_than_the_mouth(faces, name, share):
+    d = moved(faces, faces.draw_expression(name, 1.0, np.random.default_rng(0)))
+    assert d[faces.regions["semi_rigid"]].mean() < share * d[faces.regions["mouth"]].mean()
 
 
 def test_the_generic_person_is_the_template(faces):
@@ -155,14 +150,25 @@ def test_people_are_bounded_differ_and_are_almost_symmetric(faces, people):
             assert np.linalg.norm(a - b, axis=1).mean() > 1.0
 
 
-def test_no_face_turns_inside_out(faces, people):
+def test_no_face_turns_inside_out_or_grows_shards(faces, people):
+    triangles = faces.template.faces
+    patch = np.concatenate([faces.regions["mouth_interior"], faces.regions["eyeballs"]])
+    skin = ~np.isin(triangles, patch).any(axis=1)
+
+    def normals(V):
+        return np.cross(V[triangles[:, 1]] - V[triangles[:, 0]], V[triangles[:, 2]] - V[triangles[:, 0]])
+
+    def lengths(V):
+        return np.linalg.norm(V[triangles] - V[np.roll(triangles, 1, axis=1)], axis=2)
+
     for k, person in enumerate(people[:10]):
+        neutral = faces.face(person).vertices
         for name in EXPRESSIONS:
-            mesh = faces.face(person, faces.draw_expression(name, 1.0, np.random.default_rng(k)))
-            assert np.isfinite(mesh.vertices).all()
-            assert area(mesh).max() < 60
-            a, b, c = (mesh.vertices[mesh.faces[:, j]] for j in range(3))
-            assert max(np.linalg.norm(p - q, axis=1).max() for p, q in ((a, b), (b, c), (c, a))) < 20
+            V = faces.face(person, faces.draw_expression(name, 1.0, np.random.default_rng(k))).vertices
+            turned = (normals(V) * normals(neutral)).sum(axis=1) < 0
+            # A lid or a lip that closes turns the triangles of its edge; nothing else may turn over.
+            assert turned[skin].mean() < 0.015, name
+            assert (lengths(V) / np.maximum(lengths(neutral), 1.0))[skin].max() < 8, name
 
 
 @pytest.mark.parametrize("name", [n for n in EXPRESSIONS if n != "neutral"])

@@ -1,1 +1,1 @@
-"""datasets."""
+"""Faces to build models from and scans to fit: the bundled simulated faces, and loaders of open data sets."""
