@@ -22,6 +22,9 @@ from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
+_VANISHED = 0.05
+"""Share of the start's scale below which nothing is left to fit."""
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -132,6 +135,11 @@ def fit(
             ended[state.phase] = (state, time.perf_counter())
             if on_state is not None:
                 on_state(state)
+            if state.T_scan_model.scale < _VANISHED * start.T_scan_model.scale:
+                raise FitError(
+                    f"{scan.name}: the model shrank to a point, as the plain method does when a large part of the "
+                    "scan is missing; hold the scale (scale fixed), or crop the model to what the scan shows."
+                )
     except InputError as error:
         raise FitError(f"{scan.name}: the fit diverged ({error}); give landmarks, or crop the scan.") from error
 
@@ -147,7 +155,8 @@ def fit(
         name: _stage(model, scan_mm, surface_engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
     }
     clock.append(time.perf_counter())
-    status, reason = _verdict(model, stages, ended[1][0], final, config)
+    start_scale = start.T_scan_model.scale / mm
+    status, reason = _verdict(model, stages, start_scale, ended[1][0], final, config)
     residual_variance = float((final.rms_mm**2) / 3.0)
     return FitResult(
         scan_name=scan.name,
@@ -203,9 +212,14 @@ def _stage(
 
 
 def _verdict(
-    model: ShapeModel, stages: Mapping[str, Stage], phase_1: IcpState, phase_2: IcpState, config: FitConfig
+    model: ShapeModel,
+    stages: Mapping[str, Stage],
+    start_scale: float,
+    phase_1: IcpState,
+    phase_2: IcpState,
+    config: FitConfig,
 ) -> tuple[Status, str]:
-    against = doubts(model, stages)
+    against = doubts(model, stages, start_scale)
     if against:
         return "doubtful", f"Do not trust this fit: {'; '.join(against)}."
     if "cap" in (phase_1.stopped, phase_2.stopped):

@@ -10,6 +10,7 @@ import numpy as np
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
+from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -17,7 +18,11 @@ Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
 """Stages whose distances are kept: centroids aligned, after phase 1, after phase 2."""
 
-_SHRUNK = 0.85
+# Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
+_SHRUNK_BY_SHAPE = 0.85
+_SHRUNK_IN_ALL = 0.7
+_LEADING_SHARE = 0.9
+_PLAUSIBLE_Z2 = 9.0
 _FAR_SHARE = 0.05
 _GAP_RATIO = 4.0
 _GAP_SHARE = 0.02
@@ -114,24 +119,36 @@ def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
     return np.sqrt(variance * residual_variance / (variance + residual_variance))
 
 
-def doubts(model: ShapeModel, stages: Mapping[str, Stage]) -> list[str]:
-    """Return reasons not to trust the final stage, most serious first; none where nothing speaks against it."""
+def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -> list[str]:
+    """Return reasons not to trust the final stage, most serious first; none where nothing speaks against it.
+
+    Args:
+        model: the shape space.
+        stages: as in `FitResult`.
+        start_scale: scale of the start, in the scan's unit per mm.
+    """
     final, initial = stages["final"], stages["initial"]
     forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
     centred = model.mean_vertices - model.mean_vertices.mean(axis=0)
     size_mm = float(np.sqrt((centred**2).sum(axis=1).mean()))
     found: list[str] = []
-    shrunk = final.T_scan_model.scale / initial.T_scan_model.scale
-    if shrunk < _SHRUNK:
-        found.append(
-            f"the model shrank by {100 * (1 - shrunk):.0f} % while it was fitted, as it does when scans have holes"
-        )
+    shrunk = min(
+        final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,
+        final.T_scan_model.scale / start_scale / _SHRUNK_IN_ALL,
+    )
+    if shrunk < 1.0:
+        found.append("the model shrank while it was fitted, as it does when parts of the scan are missing")
     if forward.rms > _FAR_SHARE * size_mm:
         found.append(f"the model stays {forward.rms:.1f} mm (RMS) away from the scan")
     if backward.fraction < _SEEN_SHARE:
         found.append(f"the model covers only {100 * backward.fraction:.0f} % of the scan")
-    elif backward.mean > _GAP_RATIO * forward.mean and backward.mean > _GAP_SHARE * size_mm:
+    elif backward.median > _GAP_RATIO * forward.median and backward.median > _GAP_SHARE * size_mm:
         found.append(
-            f"the scan lies {backward.mean:.1f} mm from the model where the model lies {forward.mean:.1f} mm from the scan"
+            f"half of the scan lies over {backward.median:.1f} mm from the model, while half of the model lies within "
+            f"{forward.median:.1f} mm of the scan"
         )
+    leading = modes_for_variance(model.stddev**2, _LEADING_SHARE)
+    z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
+    if z2 > _PLAUSIBLE_Z2:
+        found.append(f"the shape is implausible: its main coefficients lie {np.sqrt(z2):.1f} standard deviations out")
     return found

@@ -17,10 +17,12 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
 _BLOCK = 1024
-_CANCELLATION = 1e6
+_CANCELLATION = 1e4
 """Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
 _NO_VARIANCE = 1e-10
 """Modes with less than this share of the first mode's variance are rounding, not shape (erratum to eq 4)."""
+_TIED = 1.0 - 1e-6
+"""Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,8 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
     n, d = data.shape
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
+    if isinstance(modes, np.integer):
+        modes = int(modes)
     if isinstance(modes, int) and not 1 <= modes <= n - 1:
         raise InputError(
             f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "
@@ -75,8 +79,6 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
         )
     data = np.ascontiguousarray(data)
     gram = _centred_gram(data)
-    if not np.isfinite(np.diag(gram)).all():
-        raise InputError("The training shapes hold values that are not finite.")
     total = float(gram.trace())
     if total <= n * d * (64 * np.finfo(float).eps * float(np.abs(data[0]).max())) ** 2:
         raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
@@ -105,13 +107,15 @@ def _centred_gram(data: FloatArray) -> FloatArray:
     """Return the lower triangle of X^T X (N, N), X the centred shapes (eqs 1-3)."""
     n = len(data)
     raw = _syrk(data)
+    if not np.isfinite(raw.diagonal()).all():
+        raise InputError("The training shapes hold values that are not finite.")
     raw_trace = raw.trace()
     lower = np.tril(raw, -1)
     row_mean = (raw.diagonal() + lower.sum(axis=0) + lower.sum(axis=1)) / n
     raw -= row_mean[:, None]
     raw -= row_mean[None, :]
     raw += row_mean.mean()
-    if np.isfinite(raw_trace) and raw.trace() * _CANCELLATION < raw_trace:
+    if raw.trace() * _CANCELLATION < raw_trace:
         return _centred_gram_by_blocks(data)
     return raw
 
@@ -135,7 +139,8 @@ def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, 
     column_sums = weights.sum(axis=0)
     for row, column_sum in zip(rows, column_sums, strict=True):
         row -= column_sum * mean
-        if -row.min() > row.max():
+        size = np.abs(row)
+        if row[np.argmax(size >= _TIED * size.max())] < 0:
             row *= -1.0
     # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
     overlap = rows @ rows.T

@@ -23,6 +23,9 @@ from shapespace.model.pca import principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
+_PROJECTION_ITERATIONS = 200
+_PROJECTION_TOLERANCE = 1e-10
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
@@ -198,7 +201,7 @@ class ShapeModel:
 
         Args:
             shape: a mesh or (V, 3) vertices, mm, in the model's vertex order.
-            align: bring it to the model's mean first, by the model's gauge; False if it is in the model's frame.
+            align: find its pose along with b, by the model's gauge; False if it is in the model's frame already.
 
         Raises:
             CorrespondenceError: another number of vertices than the model's.
@@ -213,10 +216,19 @@ class ShapeModel:
             )
         if not np.isfinite(vertices).all():
             raise InputError("A shape to be projected must be finite.")
-        if align:
-            T_model_shape = fit_similarity(vertices, self.mean_vertices, with_scale=self.gauge == "shape")
-            vertices = T_model_shape.apply(vertices)
-        return self.basis.T @ (self._coder.encode(vertices) - self.mean)
+        b = np.zeros(self.n_modes)
+        if not align:
+            return self.basis.T @ (self._coder.encode(vertices) - self.mean)
+        Q = self.mean_vertices
+        for _ in range(_PROJECTION_ITERATIONS):
+            # Phase 2 with known matches: pose and coefficients in turn, since modes may hold a little pose.
+            T_shape_model = fit_similarity(Q, vertices, with_scale=self.gauge == "shape")
+            Q_matched = T_shape_model.inverse().apply(vertices)
+            before, b = b, self.basis.T @ (self._coder.encode(Q_matched) - self.mean)
+            if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
+                break
+            Q = self.reconstruct(b)
+        return b
 
     def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return coefficients (count, K), mm, drawn from the normal distribution of the model."""

@@ -1,0 +1,402 @@
+"""The command line: parsing, printing and exit codes; what the commands do stands in `commands.py`.
+
+Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doubtful); 2 wrong arguments or unusable
+input; 130 stopped by Ctrl-C, files valid.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from shapespace import __version__
+from shapespace.errors import ShapespaceError
+
+_UNITS = ("auto", "um", "mm", "cm", "inch", "m")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = parser().parse_args(argv)
+    try:
+        return int(arguments.run(arguments))
+    except ShapespaceError as error:
+        _say(f"shapespace: {error}")
+        return 2
+    except KeyboardInterrupt:
+        _say("shapespace: stopped; the files written so far are whole.")
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away; python must not complain when it flushes at exit.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    top = argparse.ArgumentParser(
+        prog="shapespace", description="Turn any raw 3-D surface into a short vector that means something."
+    )
+    top.add_argument("--version", action="version", version=f"shapespace {__version__}")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    _add_demo(commands)
+    _add_data(commands)
+    _add_check(commands)
+    _add_build(commands)
+    _add_info(commands)
+    _add_fit(commands)
+    return top
+
+
+def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool = True) -> argparse.ArgumentParser:
+    sub = cast(
+        argparse.ArgumentParser,
+        commands.add_parser(
+            name,
+            help=what,
+            description=what[0].upper() + what[1:] + ".",
+            epilog=f"example: {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        ),
+    )
+    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+    if json_facts:
+        sub.add_argument("--json", action="store_true", help="print facts as JSON")
+    return sub
+
+
+def _add_demo(commands: Any) -> None:
+    sub = _add(commands, "demo", "both experiments of the paper, ending in a report", "shapespace demo --quick")
+    sub.add_argument("--out", type=Path, default=Path("shapespace-demo"), metavar="DIR", help="where to write")
+    sub.add_argument("--quick", action="store_true", help="coarser scans and fewer of them, under a minute")
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=_demo)
+
+
+def _add_data(commands: Any) -> None:
+    sub = commands.add_parser("data", help="open data sets and simulated faces").add_subparsers(
+        required=True, metavar="list|get|faces"
+    )
+    listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
+    listing.set_defaults(run=_data_list)
+    get = _add(sub, "get", "download and verify an open data set", "shapespace data get ict-facekit")
+    get.add_argument("name", metavar="NAME")
+    get.add_argument("--to", type=Path, metavar="DIR", help="also copy it there")
+    get.set_defaults(run=_data_get)
+    faces = _add(
+        sub, "faces", "write simulated corresponded faces (PLY) with labels.csv",
+        "shapespace data faces -o faces --subjects 100 --expressions neutral",
+    )  # fmt: skip
+    faces.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    faces.add_argument("--subjects", type=_positive, default=100, metavar="N")
+    faces.add_argument("--expressions", default="neutral", metavar="LIST", help="names with commas between them")
+    faces.add_argument("--seed", type=_natural, default=0, metavar="S")
+    faces.add_argument("--source", choices=("bundled", "ict-facekit"), default="bundled")
+    faces.add_argument("--area", choices=("face", "face_and_head"), default="face", help="of ict-facekit")
+    faces.set_defaults(run=_data_faces)
+
+
+def _add_check(commands: Any) -> None:
+    sub = _add(commands, "check", "mesh doctor: what is in it, what is wrong, what fitting will do about it",
+               "shapespace check scan.obj")  # fmt: skip
+    sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    sub.set_defaults(run=_check)
+
+
+def _add_build(commands: Any) -> None:
+    sub = _add(commands, "build", "build a shape model from corresponding meshes: Procrustes and PCA",
+               "shapespace build faces/*.ply -o model.h5 --modes auto")  # fmt: skip
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="mesh files or folders of them")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL.h5")
+    how_many = sub.add_mutually_exclusive_group()
+    how_many.add_argument("--variance", type=_share, metavar="SHARE", help="modes that hold this share, such as 0.98")
+    how_many.add_argument("--modes", type=_modes, default="auto", metavar="K|auto|all",
+                          help="a number; auto for cross-validation on held-out vertices (default); all")  # fmt: skip
+    sub.add_argument("--gauge", choices=("form", "shape"), default="shape",
+                     help="form: size lives in the modes; shape: size is divided out (default)")  # fmt: skip
+    sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
+    sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE",
+                     help="CSV of name,vertex, or points on the first mesh")  # fmt: skip
+    sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
+    sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=_build)
+
+
+def _add_info(commands: Any) -> None:
+    sub = _add(commands, "info", "facts of a model, a mesh or a fit", "shapespace info model.h5")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.set_defaults(run=_info)
+
+
+def _add_fit(commands: Any) -> None:
+    sub = _add(commands, "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
+               "shapespace fit model.h5 scan.obj -o out")  # fmt: skip
+    sub.add_argument("model", type=Path, metavar="MODEL.h5")
+    sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    sub.add_argument("--method", default="paper", metavar="NAME", help="paper: the paper's modified ICP (default)")
+    sub.add_argument("--unit", choices=_UNITS, default="auto", help="of the scans (default: found)")
+    sub.add_argument("--search", choices=("vertices", "surface"), default="vertices",
+                     help="closest points among the scan's vertices (the paper) or on its triangles")  # fmt: skip
+    sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
+                     help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
+    sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
+    sub.add_argument("--jobs", type=_natural, default=1, metavar="N", help="scans at a time; 0 for all cores")
+    sub.add_argument("--resume", action="store_true", help="keep results of an earlier run that still hold")
+    sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
+    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=_fit)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from shapespace.demo import run_demo
+
+    report = run_demo(arguments.out, quick=arguments.quick, quiet=arguments.quiet)
+    if arguments.json:
+        print(json.dumps({"report": str(report)}))
+    else:
+        print(f"The report is {report}")
+    if not arguments.no_open:
+        import webbrowser
+
+        webbrowser.open(report.absolute().as_uri())
+    return 0
+
+
+def _data_list(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    rows = commands.data_list()
+    if arguments.json:
+        print(json.dumps(rows, indent=1, default=str))
+    else:
+        for row in rows:
+            print("\n  ".join(f"{key}: {value}" for key, value in row.items()))
+    return 0
+
+
+def _data_get(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    folder = commands.data_get(arguments.name, arguments.to, quiet=arguments.quiet)
+    print(json.dumps({"folder": str(folder)}) if arguments.json else folder)
+    return 0
+
+
+def _data_faces(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    names = [name.strip() for name in arguments.expressions.split(",") if name.strip()]
+    count = commands.write_simulated_faces(
+        arguments.output,
+        source=arguments.source,
+        subjects=arguments.subjects,
+        expressions=names,
+        seed=arguments.seed,
+        area=arguments.area,
+        quiet=arguments.quiet,
+    )
+    facts = {"folder": str(arguments.output), "faces": count}
+    print(json.dumps(facts) if arguments.json else f"{count} faces in {arguments.output}")
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    reports = commands.check(arguments.files)
+    if arguments.json:
+        print(json.dumps(_plain(reports), indent=1))
+    else:
+        for report in reports:
+            _print_check(report)
+    bad = sum(not report["usable"] for report in reports)
+    for report in reports:
+        if "error" in report:
+            _say(f"shapespace: {report['error']}")
+    if not bad:
+        return 0
+    return 2 if bad == len(reports) else 1
+
+
+def _print_check(report: Mapping[str, Any]) -> None:
+    print(report["file"])
+    if "error" in report:
+        print(f"  unusable: {report['error']}")
+        return
+    for key, value in report.items():
+        if key not in ("file", "usable", "findings", "name"):
+            print(f"  {key}: {_short(value)}")
+    for finding in report["findings"]:
+        print(f"  {finding['level']}: {finding['what']} {finding['action']}")
+    print("  usable" if report["usable"] else "  not usable for fitting")
+
+
+def _build(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    modes = arguments.variance if arguments.variance is not None else arguments.modes
+    model, notes = commands.build(
+        arguments.meshes,
+        arguments.output,
+        modes=None if modes == "all" else modes,
+        gauge=arguments.gauge,
+        align=not arguments.no_align,
+        unit=arguments.unit,
+        landmarks=arguments.landmarks,
+        provenance=arguments.provenance,
+        licence=arguments.licence,
+        seed=arguments.seed,
+        quiet=arguments.quiet,
+    )
+    for note in notes:
+        _say(note)
+    facts = commands.model_facts(model)
+    if arguments.json:
+        print(json.dumps({"model": str(arguments.output), **facts}, indent=1))
+    else:
+        print(
+            f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
+            f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of their variance, "
+            f"gauge {facts['gauge']}"
+        )
+    return 0
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    facts = commands.info(arguments.file)
+    if arguments.json:
+        print(json.dumps(_plain(facts), indent=1))
+    else:
+        for key, value in facts.items():
+            print(f"{key}: {_short(value)}")
+    return 0
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+    from shapespace.fit.fit import FitConfig
+
+    config = FitConfig(
+        method=arguments.method,
+        unit=arguments.unit,
+        search=arguments.search,
+        scale=arguments.scale,
+        max_iterations=arguments.max_iterations,
+        seed=arguments.seed,
+    )
+    records = commands.fit_scans(
+        arguments.model,
+        arguments.scans,
+        arguments.output,
+        config,
+        landmarks=arguments.landmarks,
+        jobs=arguments.jobs,
+        resume=arguments.resume,
+        stages=arguments.stages,
+        quiet=arguments.quiet,
+        say=lambda sentence: _say(f"shapespace: {sentence}"),
+    )
+    counts = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
+    for record in records:
+        counts[record["status"]] += 1
+    if arguments.json:
+        print(json.dumps({"folder": str(arguments.output), "scans": len(records), **counts}))
+    elif counts["failed"] < len(records):
+        for record in records[:10]:
+            _print_fit(record)
+        print(
+            f"{len(records)} scans: "
+            + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+            + f"; results in {arguments.output}"
+        )
+    if counts["failed"] == len(records):
+        return 2
+    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _print_fit(record: Mapping[str, Any]) -> None:
+    if record["status"] == "failed":
+        return
+    final = record["distances_mm"]["final"]
+    print(
+        f"{record['scan']['name']}: {record['status']}; model to scan {final['model_to_scan']['mean']:.2f} mm mean, "
+        f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
+        f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
+    )
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
+
+
+def _short(value: Any) -> str:
+    plain = _plain(value)
+    if isinstance(plain, list):
+        items = cast(list[Any], plain)
+        shown = ", ".join(_short(item) for item in items[:8])
+        return f"[{shown}{', ...' if len(items) > 8 else ''}]" + (f" ({len(items)})" if len(items) > 8 else "")
+    if isinstance(plain, dict):
+        return ", ".join(f"{key} {_short(item)}" for key, item in cast(dict[str, Any], plain).items())
+    return f"{plain:.6g}" if isinstance(plain, float) else str(plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in cast(Sequence[Any], value)]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _positive(text: str) -> int:
+    value = _natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def _natural(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if value < 0:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
+    return value
+
+
+def _modes(text: str) -> int | str:
+    return text if text in ("auto", "all") else _positive(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,273 @@
+"""What each command of the command line does, as plain functions; `cli.py` only parses and prints."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from shapespace.batch.results import read_record
+from shapespace.batch.run import fit_files, make_executor, make_jobs
+from shapespace.datasets import faces as bundled
+from shapespace.datasets import fetch, ict
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.fit.fit import FitConfig
+from shapespace.fit.state import IcpState
+from shapespace.geometry.doctor import examine
+from shapespace.geometry.procrustes import Gauge
+from shapespace.io.files import make_folder, write_bytes
+from shapespace.io.landmarks import read_landmark_indices, read_landmarks
+from shapespace.io.meshes import MESH_FORMATS, read_mesh
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import MM_PER_UNIT, Mesh
+
+
+def progress_bar(total: int | None, what: str, unit: str, *, quiet: bool) -> tqdm[Any]:
+    """Return a progress bar on standard error that is silent with `quiet` or without a terminal."""
+    # disable=None is tqdm's way to ask whether there is a terminal.
+    return tqdm(total=total, desc=what, unit=unit, leave=False, disable=True if quiet else None)
+
+
+def expand(paths: Sequence[Path]) -> list[Path]:
+    """Return `paths` with each folder replaced by the meshes in it, in the order of their names.
+
+    Raises:
+        InputError: a folder without meshes.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = sorted(p for p in path.iterdir() if p.suffix.lower() in MESH_FORMATS and not p.name.startswith("."))
+        if not inside:
+            raise InputError(f"{path} holds no meshes; shapespace reads {', '.join(MESH_FORMATS)}.")
+        found += inside
+    return found
+
+
+def check(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return what is in each mesh file, what is wrong with it, and what fitting will do about it."""
+    reports: list[dict[str, Any]] = []
+    for path in expand(paths):
+        try:
+            report = examine(read_mesh(path))
+        except ShapespaceError as error:
+            reports.append({"file": str(path), "usable": False, "error": str(error)})
+            continue
+        facts = asdict(report)
+        usable = not any(finding["level"] == "refused" for finding in facts["findings"])
+        reports.append({"file": str(path), "usable": usable, **facts})
+    return reports
+
+
+def build(
+    meshes: Sequence[Path],
+    output: Path,
+    *,
+    modes: int | float | Literal["auto"] | None,
+    gauge: Gauge,
+    align: bool,
+    unit: str,
+    landmarks: Path | None,
+    provenance: str,
+    licence: str,
+    seed: int,
+    quiet: bool,
+) -> tuple[ShapeModel, list[str]]:
+    """Build a model from mesh files and save it; return it and what the user should know.
+
+    Raises:
+        FileError: a mesh cannot be read, or the model not written.
+        CorrespondenceError: the meshes differ in vertices or triangles.
+        InputError: too few meshes, no variation, too many modes asked for.
+    """
+    files = expand(meshes)
+    notes: list[str] = []
+    if output.suffix.lower() not in (".h5", ".hdf5"):
+        raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
+    make_folder(output.absolute().parent)
+    loaded: list[Mesh] = []
+    with progress_bar(len(files), "reading", "mesh", quiet=quiet) as bar:
+        for file in files:
+            mesh = read_mesh(file)
+            loaded.append(mesh if unit == "mm" else mesh.with_vertices(mesh.vertices * MM_PER_UNIT[unit]))
+            bar.update()
+    beside = files[0].parent / "landmarks.csv"
+    if landmarks is None and beside.is_file():
+        landmarks = beside
+        notes.append(f"Landmarks are taken from {beside}.")
+    marks = _landmark_indices(landmarks, loaded[0], MM_PER_UNIT[unit]) if landmarks else {}
+    if modes == "auto" and len(files) < 4:
+        modes = None
+        notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+    model = ShapeModel.fit(
+        loaded,
+        modes=modes,
+        gauge=gauge,
+        align=align,
+        landmarks=marks,
+        provenance=provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}",
+        licence=licence,
+        seed=seed,
+    )
+    model.save(output)
+    return model, notes
+
+
+def _landmark_indices(path: Path, first: Mesh, mm: float) -> dict[str, int]:
+    """Return name -> vertex from a file of indices, or of points on the first mesh in the meshes' own unit."""
+    if path.suffix.lower() == ".csv":
+        try:
+            return read_landmark_indices(path)
+        except FileFormatError:
+            pass  # a CSV of points, not of indices
+    points = read_landmarks(path)
+    return {name: int(np.linalg.norm(first.vertices - mm * point, axis=1).argmin()) for name, point in points.items()}
+
+
+def info(path: Path) -> dict[str, Any]:
+    """Return the facts of a model, a mesh or the record of a fit.
+
+    Raises:
+        FileError: it cannot be read, or is none of these.
+    """
+    if path.name.endswith(".json"):
+        record = read_record(path)
+        return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        return {"kind": "model", **model_facts(ShapeModel.load(path))}
+    mesh = read_mesh(path)
+    return {"kind": "mesh", "file": str(path), **asdict(examine(mesh))}
+
+
+def model_facts(model: ShapeModel) -> dict[str, Any]:
+    """Return the facts of a model as plain values."""
+    share = model.cumulative_variance
+    return {
+        "vertices": model.n_vertices,
+        "triangles": 0 if model.faces is None else len(model.faces),
+        "modes": model.n_modes,
+        "training_shapes": model.n_training,
+        "gauge": model.gauge,
+        "units": "mm",
+        "extent_mm": np.ptp(model.mean_vertices, axis=0).tolist(),
+        "variance_held": float(share[-1]),
+        "modes_for_variance": {
+            f"{level:g}": int(np.searchsorted(share, level - 1e-12)) + 1
+            for level in (0.9, 0.95, 0.98, 0.985, 0.99)
+            if share[-1] >= level
+        },
+        "stddev_mm": model.stddev.tolist(),
+        "noise_variance_mm2": model.noise_variance,
+        "landmarks": list(model.landmarks),
+        "representation": model.representation,
+        "provenance": model.provenance,
+        "licence": model.licence,
+        "hash": model.content_hash,
+    }
+
+
+def fit_scans(
+    model_path: Path,
+    scans: Sequence[Path],
+    folder: Path,
+    config: FitConfig,
+    *,
+    landmarks: Path | None,
+    jobs: int,
+    resume: bool,
+    stages: bool,
+    quiet: bool,
+    say: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """Fit scans from files into `folder`, and return their records in order.
+
+    Raises:
+        FileError: the model cannot be read, or the results not written.
+        InputError: landmarks for more than one scan.
+    """
+    files = expand(scans)
+    if landmarks is not None and len(files) > 1:
+        raise InputError("--landmarks belongs to one scan, but several were given; fit them one at a time.")
+    model = ShapeModel.load(model_path)
+    make_folder(folder)
+    write_bytes(folder / ".writable", b"")
+    (folder / ".writable").unlink(missing_ok=True)
+    work = make_jobs(files, landmarks)
+    workers = min(jobs or os.cpu_count() or 1, len(work))
+    bar = progress_bar(len(work), "fitting", "scan", quiet=quiet)
+
+    def show_state(state: IcpState) -> None:
+        bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
+
+    def done(job: Any, record: Mapping[str, Any]) -> None:
+        bar.update()
+        if record["status"] != "converged":
+            say(f"{job.scan}: {record['status']}: {record['reason']}")
+
+    with bar:
+        if workers <= 1:
+            return fit_files(
+                work, model, model_path.name, folder, config,
+                resume=resume, stages=stages, on_done=done, on_state=show_state,
+            )  # fmt: skip
+        with make_executor(model_path, workers) as executor:
+            return fit_files(
+                work, model, model_path.name, folder, config,
+                executor=executor, resume=resume, stages=stages, on_done=done,
+            )  # fmt: skip
+
+
+def write_simulated_faces(
+    folder: Path, *, source: str, subjects: int, expressions: Sequence[str], seed: int, area: str, quiet: bool
+) -> int:
+    """Write corresponded faces of the bundled or of the ICT generator, and return how many.
+
+    Raises:
+        InputError: an unknown expression or area.
+        DataError: ICT-FaceKit is asked for and absent.
+        FileError: the folder cannot be written.
+    """
+    make_folder(folder)
+    total = subjects * len(expressions)
+    with progress_bar(total, "writing", "face", quiet=quiet) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        if source == "ict-facekit":
+            if area not in ("face", "face_and_head"):
+                raise InputError(f"The area must be face or face_and_head, not {area!r}.")
+            ict.write_people(
+                folder, subjects=subjects, seed=seed, area=area, expressions=expressions, progress=progress
+            )
+        else:
+            bundled.write_faces(folder, subjects=subjects, expressions=expressions, seed=seed, progress=progress)
+    return total
+
+
+def data_list() -> list[dict[str, object]]:
+    """Return the open data sets with licence, size, hash, and whether they are here already."""
+    return fetch.data_list()
+
+
+def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
+    """Return the folder of a data set, downloaded and verified if it is not here yet.
+
+    Raises:
+        DataError: no such data set, no network, or content that does not match its hash.
+    """
+    return fetch.data_get(name, to=to, progress=False if quiet else None)
+
+
+def machine() -> str:
+    """Return the machine in words, for records."""
+    return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
