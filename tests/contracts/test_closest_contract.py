@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic_shapes import sphere
 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import ENGINES, build_engine, on_boundary
 from shapespace.geometry.surface import boundary_vertices
 from shapespace.types import FloatArray, Mesh
+from synthetic_shapes import sphere
 
 EXACT_MM = 1e-9
 SEARCHES_VERTICES = {"vertices"}
@@ -116,7 +116,7 @@ def test_answers_are_those_of_brute_force(name: str, shape: str) -> None:
 @pytest.mark.parametrize("name", ENGINES)
 def test_a_million_millimetres_from_the_origin_costs_only_rounding(name: str) -> None:
     mesh = ball()
-    far = mesh.with_vertices(mesh.vertices + [1e6, -1e6, 1e6])
+    far = mesh.with_vertices(mesh.vertices + np.array([1e6, -1e6, 1e6]))
     asked = queries(far)
     found = ENGINES[name](far).query(asked)
     # Coordinates there are 1e-10 mm apart.

@@ -2,10 +2,10 @@ import math
 
 import numpy as np
 import pytest
-from synthetic_shapes import similarity, sphere
 
 from shapespace.geometry.distance import DistanceSummary, surface_distances
 from shapespace.types import Mesh
+from synthetic_shapes import similarity, sphere
 
 
 def sheet(n: int, size: float = 10.0, z: float = 0.0, *, reach: float = 1.0) -> Mesh:

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from synthetic_shapes import angle_deg, similarity, training_meshes
 
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place, centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray
+from synthetic_shapes import angle_deg, similarity, training_meshes
 
 
 def shapes(n: int = 8) -> FloatArray:
@@ -97,5 +97,5 @@ def test_what_cannot_be_aligned_is_refused() -> None:
         for index in (0, 2):
             data = shapes(4)
             data[index] = 1.0
-            with pytest.raises(InputError, match="line|coincide"):
+            with pytest.raises(InputError, match=r"line|coincide"):
                 align_in_place(data, gauge)

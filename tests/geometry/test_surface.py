@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from synthetic_shapes import sphere
 
 from shapespace.errors import MeshError
 from shapespace.geometry.surface import (
@@ -13,6 +12,7 @@ from shapespace.geometry.surface import (
     vertex_normals,
 )
 from shapespace.types import Mesh
+from synthetic_shapes import sphere
 
 # Two triangles of areas 0.5 and 1.5 in the plane z = 2, seen from above, and a vertex that nothing uses.
 KITE = Mesh(
