@@ -1,3 +1,58 @@
 """Turn any raw 3-D surface into a short vector that means something."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from shapespace.datasets.faces import load_faces
+    from shapespace.datasets.simulated_scan import simulate_scan
+    from shapespace.errors import ShapespaceError
+    from shapespace.fit.fit import FitConfig, fit_scan
+    from shapespace.fit.result import FitResult
+    from shapespace.geometry.distance import surface_distances
+    from shapespace.io.landmarks import read_landmarks
+    from shapespace.io.meshes import read_mesh, write_mesh
+    from shapespace.model.shape_model import ShapeModel
+    from shapespace.types import Mesh, Similarity
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "FitConfig",
+    "FitResult",
+    "Mesh",
+    "ShapeModel",
+    "ShapespaceError",
+    "Similarity",
+    "__version__",
+    "fit_scan",
+    "load_faces",
+    "read_landmarks",
+    "read_mesh",
+    "simulate_scan",
+    "surface_distances",
+    "write_mesh",
+]
+
+_HOMES = {
+    "FitConfig": "fit.fit",
+    "FitResult": "fit.result",
+    "Mesh": "types",
+    "ShapeModel": "model.shape_model",
+    "ShapespaceError": "errors",
+    "Similarity": "types",
+    "fit_scan": "fit.fit",
+    "load_faces": "datasets.faces",
+    "read_landmarks": "io.landmarks",
+    "read_mesh": "io.meshes",
+    "simulate_scan": "datasets.simulated_scan",
+    "surface_distances": "geometry.distance",
+    "write_mesh": "io.meshes",
+}
+
+
+def __getattr__(name: str) -> object:
+    # SciPy takes most of a second to import, and `shapespace --help` needs none of it.
+    if name not in _HOMES:
+        raise AttributeError(f"module 'shapespace' has no attribute {name!r}")
+    return getattr(import_module(f"shapespace.{_HOMES[name]}"), name)

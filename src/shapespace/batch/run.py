@@ -24,7 +24,7 @@ from shapespace.batch.results import (
     write_stages,
 )
 from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit
+from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder, sha256_of_file
 from shapespace.io.landmarks import read_landmarks
@@ -89,7 +89,7 @@ def fit_file(
         scan_source = Source(job.scan.name, sha256_of_file(job.scan))
         scan = read_mesh(job.scan)
         landmarks: Mapping[str, FloatArray] | None = read_landmarks(job.landmarks) if job.landmarks else None
-        result = fit(model, scan, config, landmarks=landmarks, on_state=on_state)
+        result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
         record = failed_record(
             scan_source, model_source, f"{job.scan}: not enough memory to fit it; thin the scan first.", asdict(config)

@@ -91,7 +91,7 @@ def fits_scale(model: ShapeModel, config: FitConfig) -> bool:
     return model.gauge == "shape" if config.scale == "auto" else config.scale == "free"
 
 
-def fit(
+def fit_scan(
     model: ShapeModel,
     scan: Mesh,
     config: FitConfig | None = None,
