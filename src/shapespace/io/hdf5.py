@@ -53,9 +53,12 @@ def write_hdf5(path: Path, arrays: Mapping[str, npt.NDArray[Any]], attributes: M
         for name, value in {**attributes, _HASH_NAME: digest}.items():
             file.attrs[name] = value
     data = memory.getvalue()[_USER_BLOCK:]
-    block = (_MAGIC + hashlib.sha256(data).hexdigest().encode() + b"\n").ljust(_USER_BLOCK, b"\0")
-    write_bytes(path, block + data)
+    write_bytes(path, _user_block(data) + data)
     return digest
+
+
+def _user_block(data: bytes) -> bytes:
+    return (_MAGIC + hashlib.sha256(data).hexdigest().encode() + b"\n").ljust(_USER_BLOCK, b"\0")
 
 
 def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
@@ -70,8 +73,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
         f"{path} is damaged: its content does not match its checksum; copy it again or rebuild the model."
     )
     if data.startswith(_MAGIC):
-        stated = data[len(_MAGIC) : len(_MAGIC) + 64]
-        if hashlib.sha256(data[_USER_BLOCK:]).hexdigest().encode() != stated:
+        if data[:_USER_BLOCK] != _user_block(data[_USER_BLOCK:]):
             raise damaged
     elif not data.startswith(_HDF5_SIGNATURE):
         if _HDF5_SIGNATURE in data[: 2 * _USER_BLOCK]:
@@ -83,9 +85,18 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
         with h5py.File(io.BytesIO(data), "r") as file:
             for name, item in cast(Any, file).items():
                 if isinstance(item, h5py.Dataset):
+                    # We write uncompressed; a declared size beyond the file's would be memory for nothing.
+                    declared = int(cast(Any, item).nbytes)
+                    if declared > len(data):
+                        raise FileFormatError(
+                            f"{path} declares {declared} bytes in {name!r} but is only {len(data)} bytes long; "
+                            "give a model written by shapespace build."
+                        )
                     arrays[str(name)] = np.asarray(item[()])
             for name, value in cast(Any, file.attrs).items():
                 attributes[str(name)] = value.item() if isinstance(value, np.generic) else value
+    except FileFormatError:
+        raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise damaged from error
     if _HASH_NAME in attributes and attributes[_HASH_NAME] != content_hash(arrays, attributes):

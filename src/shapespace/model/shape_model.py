@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import CorrespondenceError, InputError
+from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import content_hash
@@ -70,12 +70,20 @@ class ShapeModel:
                 f"A shape model needs mean (D,), basis (D, K) and stddev (K,), not {mean.shape}, {basis.shape} "
                 f"and {stddev.shape}."
             )
+        if not (
+            np.isfinite(mean).all() and np.isfinite(basis).all() and np.isfinite(stddev).all() and stddev.min() > 0
+        ):
+            raise InputError("The arrays of a shape model must be finite and its standard deviations positive.")
+        if self.gauge not in ("form", "shape"):
+            raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
         if self.representation not in REPRESENTATIONS:
             raise InputError(f"There is no representation {self.representation!r} in this version of shapespace.")
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "basis", basis)
         object.__setattr__(self, "stddev", stddev)
-        object.__setattr__(self, "landmarks", MappingProxyType(dict(self.landmarks)))
+        object.__setattr__(self, "landmarks", MappingProxyType({str(k): int(v) for k, v in self.landmarks.items()}))
+        object.__setattr__(self, "total_variance", float(self.total_variance))
+        object.__setattr__(self, "n_training", int(self.n_training))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         object.__setattr__(self, "faces", checked.faces)
         for name, vertex in self.landmarks.items():
@@ -126,6 +134,7 @@ class ShapeModel:
             raise InputError(f"{name} holds vertices that are not finite; repair it or leave it out.")
         _refuse_equal(shapes)
         if align:
+            _refuse_without_extent(meshes)
             align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
         data = REPRESENTATIONS["vertices"]().encode(shapes)
         wanted = choose_modes(data, seed=seed).modes if modes == "auto" else modes
@@ -260,7 +269,11 @@ class ShapeModel:
             FileError: it cannot be read.
             ModelFileError: it is damaged, of another version, or not a model.
         """
-        return cls(**model_file.load(Path(path)))
+        fields = model_file.load(Path(path))
+        try:
+            return cls(**fields)
+        except InputError as error:
+            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
 
     def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
         array = np.atleast_1d(np.asarray(b, dtype=np.float64))
@@ -276,3 +289,13 @@ def _refuse_equal(shapes: FloatArray) -> None:
     spread = float(np.ptp(shapes, axis=0).max())
     if spread <= 64 * np.finfo(float).eps * float(np.abs(shapes).max()):
         raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
+
+
+def _refuse_without_extent(meshes: Sequence[Mesh]) -> None:
+    for mesh in meshes:
+        centred = mesh.vertices - mesh.vertices.mean(axis=0)
+        extent = np.linalg.eigvalsh(centred.T @ centred)
+        if extent[1] <= 1e-9 * extent[2]:
+            raise InputError(
+                f"{mesh.name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out."
+            )
