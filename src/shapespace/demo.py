@@ -114,7 +114,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False) -> Path:
         clock.lap("experiment1")
         second = _experiment_2(folder, faces, scale, clock)
         clock.lap("experiment2")
-        summary = {
+        summary: dict[str, Any] = {
             "version": __version__,
             "quick": quick,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),

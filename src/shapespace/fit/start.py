@@ -125,7 +125,8 @@ def _trimmed_rigid_icp(points: FloatArray, tree: cKDTree, T: Similarity, iterati
     for _ in range(iterations):
         distance, index = tree.query(T.apply(points))
         near = np.argpartition(distance, keep - 1)[:keep]
-        T = fit_similarity(points[near], np.asarray(tree.data)[index[near]], with_scale=False)
+        matched = np.asarray(tree.data)[np.asarray(index)[near]]
+        T = fit_similarity(points[near], matched, with_scale=False)
     return T
 
 

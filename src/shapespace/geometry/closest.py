@@ -65,8 +65,8 @@ class VertexEngine:
     def query(self, points: FloatArray) -> ClosestPoints:
         """Return the nearest vertex of each of `points` (M, 3)."""
         distance, index = self._tree.query(_checked(points), workers=-1)
-        vertex = index.astype(np.int32)
-        return ClosestPoints(self._vertices[vertex], distance, None, None, vertex)
+        vertex = np.asarray(index, dtype=np.int32)
+        return ClosestPoints(self._vertices[vertex], np.asarray(distance), None, None, vertex)
 
 
 class SurfaceEngine:
@@ -137,7 +137,8 @@ def on_boundary(matches: ClosestPoints, mesh: Mesh, boundary: BoolArray) -> Bool
         return boundary[matches.vertex]
     corners = boundary[faces_of(mesh)[matches.triangle]]
     # A point is on the rim when the corners that carry it all are.
-    return ~(~corners & (matches.barycentric > 1e-9)).any(axis=1)
+    inside = ~corners & (matches.barycentric > 1e-9)
+    return np.asarray(~inside.any(axis=1))
 
 
 ENGINES: Mapping[str, Callable[[Mesh], ClosestPointEngine]] = {

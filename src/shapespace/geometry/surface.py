@@ -43,7 +43,7 @@ def vertex_normals(mesh: Mesh) -> FloatArray:
 def vertex_areas(mesh: Mesh) -> FloatArray:
     """Return the area that belongs to each vertex, (V,): a third of each triangle around it."""
     areas = np.repeat(face_areas(mesh) / 3.0, 3)
-    return np.bincount(faces_of(mesh).ravel(), areas, len(mesh.vertices))
+    return np.asarray(np.bincount(faces_of(mesh).ravel(), areas, len(mesh.vertices)), dtype=np.float64)
 
 
 def boundary_edges(faces: IntArray) -> IntArray:

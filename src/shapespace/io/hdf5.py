@@ -34,7 +34,7 @@ def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str
         array = np.ascontiguousarray(arrays[name])
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
         digest.update(json.dumps([name, little.dtype.str, list(array.shape)]).encode())
-        digest.update(memoryview(little).cast("B") if little.size else b"")
+        digest.update(little.tobytes())
     digest.update(json.dumps({k: attributes[k] for k in sorted(attributes) if k != _HASH_NAME}).encode())
     return digest.hexdigest()
 
@@ -94,7 +94,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
                         )
                     arrays[str(name)] = np.asarray(item[()])
             for name, value in cast(Any, file.attrs).items():
-                attributes[str(name)] = value.item() if isinstance(value, np.generic) else value
+                attributes[str(name)] = cast(Attribute, value.item() if isinstance(value, np.generic) else value)
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:

@@ -57,12 +57,11 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoi
     rng = np.random.default_rng(seed)
     parts = np.array_split(rng.permutation(n), folds)
     most = n - max(len(part) for part in parts) - 1
-    spaced = np.exp(np.linspace(0.0, np.log(most), 24))
-    candidates: IntArray = np.unique(np.rint(spaced)).astype(np.int32)
+    spaced = {round(most ** (step / 23)) for step in range(24)}
+    candidates: IntArray = np.array(sorted(spaced), dtype=np.int32)
     errors = np.zeros((n, len(candidates)))
     for held_out in parts:
-        training = np.setdiff1d(np.arange(n), held_out)
-        pc = principal_components(data[training])
+        pc = principal_components(np.delete(data, held_out, axis=0))
         shown = np.zeros(d // 3, dtype=np.bool_)
         shown[rng.permutation(d // 3)[: d // 6]] = True
         shown_coordinates = np.repeat(shown, 3)
@@ -74,8 +73,8 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoi
             kept = min(int(k), len(pc.variance))
             noise = max((pc.total_variance - pc.variance[:kept].sum()) / (d - kept), _LEAST_NOISE * pc.variance[0] / d)
             system = overlap[:kept, :kept] + noise * np.diag(1.0 / pc.variance[:kept])
-            b: FloatArray = np.linalg.solve(system, evidence[:, :kept].T)
-            wrong = residual[:, ~shown_coordinates] - (hidden[:, :kept] @ b).T
+            b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :kept].T), dtype=np.float64)
+            wrong: FloatArray = residual[:, ~shown_coordinates] - (hidden[:, :kept] @ b).T
             errors[held_out, column] = np.linalg.norm(wrong.reshape(len(held_out), -1, 3), axis=2).mean(axis=1)
     mean = errors.mean(axis=0)
     standard_error = errors.std(axis=0, ddof=1) / np.sqrt(n)
