@@ -18,6 +18,8 @@ _Ints: TypeAlias = npt.NDArray[np.int64]
 _DEGENERATE = 1e-12
 # Smallest over largest spread below which points lie on a plane, and second over largest for a line.
 _FLAT = 1e-6
+# Squares and cubes of coordinates must stay within float64.
+_ABSURD = 1e80
 # Distance from the origin, over the size, from which coordinates stored as float32 get coarse.
 _FAR = 100.0
 # How far the normals of an open surface must point to its inside before it is turned: a convex cap gives
@@ -150,6 +152,8 @@ class _Doctor:
     def _run(self) -> None:
         if not len(self.vertices):
             return self._refuse("There are no points in it.", "export the scan again.")
+        if np.abs(self.vertices).max() > _ABSURD:
+            return self._refuse("Its coordinates are too large to be lengths.", "export the scan again.")
         self._merge_vertices()
         if self.faces is not None:
             self._drop_triangles()

@@ -174,11 +174,11 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
 
 def _scene(gltf: _Gltf) -> Mesh:
     tree = gltf.tree
-    nodes: list[dict[str, Any]] = tree.get("nodes", [])
-    scenes: list[dict[str, Any]] = tree.get("scenes", [])
+    nodes: list[Any] = tree.get("nodes", [])
+    scenes: list[Any] = tree.get("scenes", [])
     if scenes:
-        chosen: dict[str, Any] = scenes[tree.get("scene", 0)]
-        roots: list[int] = list(chosen.get("nodes", []))
+        scene: Any = scenes[tree.get("scene", 0)]
+        roots: list[int] = list(scene.get("nodes", []))
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in children]

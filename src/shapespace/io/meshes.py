@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
@@ -61,7 +63,9 @@ def read_mesh(path: Path | str) -> Mesh:
     data = read_bytes(path)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
-    return mesh_format.read(data, path)
+    # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
+    with np.errstate(invalid="ignore", over="ignore"):
+        return mesh_format.read(data, path)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -112,17 +113,22 @@ def number_lines(values: npt.NDArray[Any], pattern: str) -> str:
     return (pattern + "\n") * len(values) % tuple(values.ravel().tolist())
 
 
+_BARE_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[\w:.-]{1,80}\s*>")
+
+
 class _NoDoctype(ET.TreeBuilder):
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ValueError("it declares a document type, which is not allowed in such a file")
 
 
 def xml_root(data: bytes, path: Path) -> ET.Element:
-    """Parse XML from a stranger: document types, and with them entities, are refused.
+    """Parse XML from a stranger: document types that declare anything, and with them entities, are refused.
 
     Raises:
-        FileFormatError: it is not well-formed XML, or it declares a document type.
+        FileFormatError: it is not well-formed XML, or its document type is more than a name.
     """
+    # MeshLab starts its files with a bare <!DOCTYPE name>, which declares nothing.
+    data = _BARE_DOCTYPE.sub(b"", data, count=1)
     parser = ET.XMLParser(target=_NoDoctype())
     try:
         parser.feed(data)

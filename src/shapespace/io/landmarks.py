@@ -1,0 +1,371 @@
+"""Landmarks in and out: named points from the programs that people pick them with."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.files import read_bytes, write_text
+from shapespace.io.parsing import damaged, json_value, xml_root
+from shapespace.types import FloatArray
+
+Pairs = list[tuple[str, FloatArray]]
+
+
+@dataclass(frozen=True)
+class LandmarkFormat:
+    """A file format for named points.
+
+    Args:
+        name: what people call it.
+        read: (content, path) -> names and points, in the file's order, names not yet checked.
+        write: names and points -> text.
+    """
+
+    name: str
+    read: Callable[[bytes, Path], Pairs]
+    write: Callable[[Mapping[str, FloatArray]], str]
+
+
+def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
+    """Read named points, in the file's own frame and unit; those marked as absent are left out.
+
+    menpo `.ljson` names groups of points, not points: the points of a label with several are called `label_0`,
+    `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the
+    label, points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes
+    before. 3D Slicer files are returned in LPS, the frame in which Slicer saves meshes: RAS is turned by
+    changing the sign of x and y. CSV is `name,x,y,z`, with or without that header, `#` for comments.
+
+    Args:
+        path: a file with one of the endings in `LANDMARK_FORMATS`; `.json` is told apart by its content.
+
+    Returns:
+        name -> (3,) float64, in the file's order.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: it is not in that format, or has a name twice, numbers that are not finite, or no
+            landmarks at all.
+    """
+    path = Path(path)
+    pairs = _format(path, "read").read(_content(path), path)
+    if not pairs:
+        raise damaged(path, "it holds no landmarks")
+    landmarks: dict[str, FloatArray] = {}
+    for name, point in pairs:
+        if not name:
+            raise damaged(path, "it has a landmark without a name, so name them all")
+        if name in landmarks:
+            raise damaged(path, f"it has two landmarks named '{name[:60]}', so rename one")
+        if not np.isfinite(point).all():
+            raise damaged(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
+        landmarks[name] = point
+    return landmarks
+
+
+def write_landmarks(path: Path | str, landmarks: Mapping[str, FloatArray]) -> None:
+    """Write named points in the format of the ending of `path`, whole or not at all, exactly.
+
+    3D Slicer files say LPS and mm; a `.json` without `.mrk` is scalismo's; in `.ljson` each point is a label.
+
+    Args:
+        path: the file, with one of the endings in `LANDMARK_FORMATS`.
+        landmarks: name -> (3,) float64; for Slicer in LPS and millimetres.
+
+    Raises:
+        InputError: a point that is not three finite numbers, or a name that is empty.
+        FileFormatError: the ending is unknown.
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    path = Path(path)
+    for name, point in landmarks.items():
+        if not name.strip() or name != name.strip():
+            raise InputError(f"Cannot write {path}: a landmark's name ('{name}') is empty or has outer spaces.")
+        if np.shape(point) != (3,) or not np.isfinite(point).all():
+            raise InputError(f"Cannot write {path}: landmark '{name}' is not three finite numbers.")
+    write_text(path, _format(path, "write").write(landmarks))
+
+
+def read_landmark_indices(path: Path | str) -> dict[str, int]:
+    """Read landmarks given as vertex numbers, from CSV with the header `name,vertex`; `#` for comments.
+
+    Args:
+        path: the file; vertices count from 0.
+
+    Returns:
+        name -> vertex, in the file's order.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: another header, a name twice, or a vertex that is not a whole number from 0.
+    """
+    path = Path(path)
+    rows = _csv_rows(_content(path), path)
+    if not rows or [cell.lower() for cell in rows[0][:2]] != ["name", "vertex"]:
+        raise damaged(path, "it does not start with the header 'name,vertex'")
+    indices: dict[str, int] = {}
+    for row in rows[1:]:
+        if len(row) < 2 or not row[1].isascii() or not row[1].isdecimal() or len(row[1]) > 18:
+            raise damaged(path, f"landmark '{row[0][:60]}' has no vertex number (a whole number from 0)")
+        if not row[0] or row[0] in indices:
+            raise damaged(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
+        indices[row[0]] = int(row[1])
+    return indices
+
+
+def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None:
+    """Write landmarks given as vertex numbers, as CSV with the header `name,vertex`, whole or not at all.
+
+    Args:
+        path: the file.
+        indices: name -> vertex, counting from 0.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    write_text(Path(path), _csv_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
+
+
+def _format(path: Path, verb: str) -> LandmarkFormat:
+    # The longest ending first, so that .mrk.json is not taken for .json.
+    for ending in sorted(LANDMARK_FORMATS, key=len, reverse=True):
+        if path.name.lower().endswith(ending):
+            return LANDMARK_FORMATS[ending]
+    raise FileFormatError(
+        f"Cannot {verb} {path}: the ending '{path.suffix}' is not a landmark format; use one of "
+        f"{', '.join(LANDMARK_FORMATS)}."
+    )
+
+
+def _content(path: Path) -> bytes:
+    data = read_bytes(path)
+    if not data.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    return data
+
+
+def _point(values: Iterable[Any], what: str, path: Path) -> FloatArray:
+    try:
+        numbers = [float(value) for value in values]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise damaged(path, f"{what} has a coordinate that is not a number") from error
+    if len(numbers) != 3:
+        raise damaged(path, f"{what} has {len(numbers)} coordinates, not 3")
+    return np.array(numbers, dtype=np.float64)
+
+
+def _from_json(read: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+    """Wrap a reader of parsed JSON: what is missing or of the wrong type there is one clear error here."""
+
+    def wrapped(data: bytes, path: Path) -> Pairs:
+        value = json_value(data, path)
+        try:
+            return read(value, path)
+        except FileError:
+            raise
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            raise damaged(path, "it is JSON, but not laid out as a landmark file, so export it again") from error
+
+    return wrapped
+
+
+def _ljson(value: Any, path: Path) -> Pairs:
+    version = value["version"]
+    if version == 1:
+        return _ljson_1(value, path)
+    if version == 2:
+        return _ljson_group(value, "", path)
+    if version != 3:
+        raise damaged(path, f"it is LJSON of version {str(version)[:20]}, but only 1 to 3 are known")
+    groups = value["groups"]
+    out: Pairs = []
+    for name, group in groups.items():
+        out += _ljson_group(group, f"{name}_" if len(groups) > 1 else "", path)
+    return out
+
+
+def _ljson_1(value: Any, path: Path) -> Pairs:
+    out: Pairs = []
+    for group in value["groups"]:
+        points = [entry["point"] for entry in group["landmarks"]]
+        label = str(group["label"])
+        for i, point in enumerate(points):
+            if not _absent(point):
+                name = label if len(points) == 1 else f"{label}_{i}"
+                out.append((name, _point(point, f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
+    points = group["landmarks"]["points"]
+    names: dict[int, str] = {}
+    for entry in group.get("labels", []):
+        mask = entry["mask"]
+        for position, index in enumerate(mask):
+            if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(points):
+                raise damaged(path, f"label '{str(entry['label'])[:60]}' names a point that is not there")
+            name = str(entry["label"]) if len(mask) == 1 else f"{entry['label']}_{position}"
+            names.setdefault(index, prefix + name)
+    ordered = [*names, *(i for i in range(len(points)) if i not in names)]
+    out: Pairs = []
+    for i in ordered:
+        name = names.get(i, f"{prefix}point_{i}")
+        if not _absent(points[i]):
+            out.append((name, _point(points[i], f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _absent(point: Any) -> bool:
+    """Whether LJSON has no point here: null, or null coordinates."""
+    return point is None or all(value is None for value in point)
+
+
+def _write_ljson(landmarks: Mapping[str, FloatArray]) -> str:
+    group = {
+        "labels": [{"label": name, "mask": [i]} for i, name in enumerate(landmarks)],
+        "landmarks": {"connectivity": [], "points": [_numbers(point) for point in landmarks.values()]},
+    }
+    return json.dumps({"groups": {"LJSON": group}, "version": 3}, indent=1) + "\n"
+
+
+def _slicer(value: Any, path: Path) -> Pairs:
+    out: Pairs = []
+    for markup in value["markups"]:
+        system = str(markup.get("coordinateSystem", "LPS")).upper()
+        if system not in ("LPS", "RAS"):
+            raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+        sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
+        for entry in markup["controlPoints"]:
+            if entry.get("positionStatus", "defined") != "defined":
+                continue
+            name = str(entry.get("label") or entry.get("id") or "").strip()
+            out.append((name, sign * _point(entry["position"], f"landmark '{name[:60]}'", path) + 0.0))
+    return out
+
+
+def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
+    points = [
+        {"id": str(i), "label": name, "position": _numbers(point), "positionStatus": "defined"}
+        for i, (name, point) in enumerate(landmarks.items(), start=1)
+    ]
+    schema = (
+        "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+        "markups-schema-v1.0.3.json#"
+    )
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    return json.dumps({"@schema": schema, "markups": [markup]}, indent=1) + "\n"
+
+
+def _scalismo(value: Any, path: Path) -> Pairs:
+    return [
+        (str(entry["id"]), _point(entry["coordinates"], f"landmark '{str(entry['id'])[:60]}'", path)) for entry in value
+    ]
+
+
+def _write_scalismo(landmarks: Mapping[str, FloatArray]) -> str:
+    entries = [{"id": name, "coordinates": _numbers(point)} for name, point in landmarks.items()]
+    return json.dumps(entries, indent=1) + "\n"
+
+
+def _any_json(value: Any, path: Path) -> Pairs:
+    if isinstance(value, list):
+        return _scalismo(value, path)
+    if "markups" in value:
+        return _slicer(value, path)
+    return _ljson(value, path)
+
+
+def _numbers(point: FloatArray) -> list[float]:
+    return [float(value) for value in point]
+
+
+def _read_pp(data: bytes, path: Path) -> Pairs:
+    root = xml_root(data, path)
+    if root.tag != "PickedPoints":
+        raise damaged(path, "it is not a MeshLab file of picked points")
+    out: Pairs = []
+    for entry in root.iter("point"):
+        if entry.get("active", "1").strip().lower() not in ("0", "false"):
+            name = (entry.get("name") or "").strip()
+            out.append((name, _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)))
+    return out
+
+
+def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
+    root = ET.Element("PickedPoints")
+    for name, point in landmarks.items():
+        x, y, z = (repr(value) for value in _numbers(point))
+        ET.SubElement(root, "point", {"x": x, "y": y, "z": z, "name": name, "active": "1"})
+    ET.indent(root)
+    return "<!DOCTYPE PickedPoints>\n" + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _csv_rows(data: bytes, path: Path) -> list[list[str]]:
+    try:
+        text = data.decode("utf-8-sig")
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        return [[cell.strip() for cell in row] for row in csv.reader(lines, strict=True)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise damaged(path, "it is not comma-separated text") from error
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_csv(data: bytes, path: Path) -> Pairs:
+    rows = _csv_rows(data, path)
+    columns = [1, 2, 3]
+    if rows and not all(_is_number(cell) for cell in rows[0][1:4]):
+        header = [cell.lower() for cell in rows[0]]
+        if header[:2] == ["name", "vertex"]:
+            raise damaged(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
+        if not {"x", "y", "z"} <= set(header[1:]):
+            raise damaged(path, "its first line is neither 'name,x,y,z' nor a landmark")
+        columns = [header.index(axis, 1) for axis in "xyz"]
+        rows = rows[1:]
+    elif rows and len(rows[0]) != 4:
+        raise damaged(path, f"its first line has {len(rows[0])} columns, not the four of 'name,x,y,z'")
+    out: Pairs = []
+    for row in rows:
+        if len(row) <= max(columns):
+            raise damaged(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
+        out.append((row[0], _point((row[c] for c in columns), f"landmark '{row[0][:60]}'", path)))
+    return out
+
+
+def _csv_text(rows: Iterable[Iterable[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
+
+
+def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
+    rows = [[name, *map(repr, _numbers(point))] for name, point in landmarks.items()]
+    return _csv_text([["name", "x", "y", "z"], *rows])
+
+
+LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
+    {
+        ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
+        ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
+        ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
+        ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
+    }
+)
+"""File name ending -> format: the one place where landmark formats are listed."""
