@@ -119,7 +119,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False) -> Path:
             "quick": quick,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "machine": f"{platform.machine()}, Python {platform.python_version()}, {platform.system()}",
-            "versions": _versions(("numpy", "scipy", "h5py", "libigl", "trimesh", "matplotlib")),
+            "versions": _versions(("numpy", "scipy", "h5py", "libigl", "matplotlib")),
             "seed": _SEED,
             "settings": asdict(scale),
             "seconds": {**clock.seconds, "total": sum(clock.seconds.values())},
@@ -171,10 +171,13 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         v = np.stack([z[fit["name"]] - z["neutral"] for fit in tests])
         for expression in PAPER_EXPRESSIONS:
             own = [i for i, fit in enumerate(tests) if fit["expression"] == expression]
+            if len(own) < 3:
+                continue  # too few trusted fits for a line; `left_out` names the others
             line = line_scores(v[own], np.array([tests[i]["intensity"] for i in own]))
             for key, value in asdict(line).items():
                 scores.setdefault(f"line_{key}", {})[expression] = value
-        scores["disjointness"] = asdict(disjointness(v, [fit["expression"] for fit in tests]))
+        if all(sum(fit["expression"] == e for fit in tests) >= 2 for e in PAPER_EXPRESSIONS):
+            scores["disjointness"] = asdict(disjointness(v, [fit["expression"] for fit in tests]))
 
     make_folder(home / "training")
     examples: list[dict[str, str]] = []

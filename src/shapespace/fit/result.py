@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from scipy.stats import chi2
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
@@ -22,7 +23,7 @@ STAGES = ("before", "initial", "final")
 _SHRUNK_BY_SHAPE = 0.85
 _SHRUNK_IN_ALL = 0.7
 _LEADING_SHARE = 0.9
-_PLAUSIBLE_Z2 = 4.0
+_IMPLAUSIBLE = 1e-6
 _FAR_SHARE = 0.05
 _GAP_RATIO = 4.0
 _GAP_SHARE = 0.02
@@ -149,6 +150,6 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
         )
     leading = modes_for_variance(model.stddev**2, _LEADING_SHARE)
     z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
-    if z2 > _PLAUSIBLE_Z2:
+    if z2 > chi2.isf(_IMPLAUSIBLE, leading) / leading:
         found.append(f"the shape is implausible: its main coefficients lie {np.sqrt(z2):.1f} standard deviations out")
     return found

@@ -93,8 +93,9 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
                             "give a model written by shapespace build."
                         )
                     arrays[str(name)] = np.asarray(item[()])
-            for name, value in cast(Any, file.attrs).items():
-                attributes[str(name)] = cast(Attribute, value.item() if isinstance(value, np.generic) else value)
+            stored = cast(dict[str, Any], dict(file.attrs))
+            for name, value in stored.items():
+                attributes[name] = value.item() if isinstance(value, np.generic) else value
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
