@@ -92,7 +92,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
                             f"{path} declares {declared} bytes in {name!r} but is only {len(data)} bytes long; "
                             "give a model written by shapespace build."
                         )
-                    arrays[str(name)] = np.asarray(item[()])
+                    arrays[str(name)] = np.asarray(cast(Any, item)[()])
             stored = cast(dict[str, Any], dict(file.attrs))
             for name, value in stored.items():
                 attributes[name] = value.item() if isinstance(value, np.generic) else value
