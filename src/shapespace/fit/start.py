@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from shapespace.errors import FitError
+from shapespace.errors import FitError, InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
@@ -83,7 +83,13 @@ def start_from_landmarks(
         )
     source = model.mean_vertices[[model.landmarks[name] for name in names]]
     target = np.stack([scan_landmarks_mm[name] for name in names])
-    return Start(fit_similarity(source, target, with_scale=with_scale), "landmarks", float("nan"))
+    try:
+        T = fit_similarity(source, target, with_scale=with_scale)
+    except InputError as error:
+        raise FitError(
+            f"{scan_name}: its landmarks give no pose, since they lie on a line or are not finite; check them."
+        ) from error
+    return Start(T, "landmarks", float("nan"))
 
 
 def start_from_any_pose(model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int) -> Start:
