@@ -57,9 +57,7 @@ class DemoScale:
         training: faces and people that each model is made of.
         triangles: of the simulated scans.
         levels: intensities of each test expression.
-        people_modes: of the model of many people: `auto`, or a share of the variance.
-        search_rate: stopping rate of the fits.
-        stop_motion_mm: largest vertex motion at which they stop.
+        stop_motion_mm: largest vertex motion at which the fits stop.
     """
 
     training: int = 100
@@ -91,19 +89,20 @@ class _Clock:
         self._since = now
 
 
-def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False) -> Path:
+def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: DemoScale | None = None) -> Path:
     """Run both experiments into `folder` and return the path of the report.
 
     Args:
         folder: made if absent; results of an earlier demo in it are replaced.
         quick: coarser scans and an earlier stop.
         quiet: no progress bar.
+        scale: counts and sizes; None goes by `quick`.
 
     Raises:
         FileError: the folder cannot be written.
         ShapespaceError: the extra `report` is not installed.
     """
-    scale = QUICK if quick else FULL
+    scale = scale or (QUICK if quick else FULL)
     make_folder(folder)
     for part in ("experiment1", "experiment2"):
         shutil.rmtree(folder / part, ignore_errors=True)
