@@ -37,7 +37,7 @@ def test_a_line_that_misses_neutral_scores_better_free_than_through_neutral():
     v = np.stack([np.full(4, 5.0), 10.0 * INTENSITY], axis=1)
     scores = line_scores(v, INTENSITY)
     assert scores.r2_free == pytest.approx(1.0)
-    assert scores.r2_through_neutral < 0.95
+    assert scores.r2_through_neutral < 0.97
 
 
 def test_samples_on_both_sides_of_neutral_are_inconsistent():
