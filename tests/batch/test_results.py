@@ -1,0 +1,148 @@
+import csv
+import errno
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapespace.batch.results import (
+    Source,
+    coefficient_row,
+    failed_record,
+    fit_record,
+    read_record,
+    write_coefficients,
+    write_fitted_mesh,
+    write_record,
+    write_stages,
+)
+from shapespace.errors import FileError, FileFormatError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.result import FitResult
+from shapespace.io.meshes import read_mesh
+from shapespace.types import Mesh
+from synthetic_shapes import blob_model, raw_scan, similarity
+
+SCAN, MODEL = Source("raw.ply", "a" * 64), Source("blob.h5", "b" * 64)
+SUMMARY = {"mean", "median", "rms", "p95", "max", "count"}
+
+
+@pytest.fixture(scope="module")
+def result() -> FitResult:
+    scan = raw_scan(np.array([0.5, -0.5, 1.0, 0.0, 0.3]), similarity(2, 10.0, 0.001)).scan
+    return fit_scan(blob_model(), scan, FitConfig(max_iterations=15))
+
+
+def test_the_record_has_the_keys_of_the_contract(result: FitResult) -> None:
+    record = fit_record(result, SCAN, MODEL)
+    assert {
+        "scan", "model", "status", "reason", "method", "config", "T_scan_model", "mm_per_scan_unit", "b", "z",
+        "b_stddev", "distances_mm", "history", "iterations", "seconds",
+    } <= set(record)  # fmt: skip
+    assert record["scan"] == {"name": "raw.ply", "hash": "a" * 64}
+    assert set(record["T_scan_model"]) == {"scale", "rotation", "translation"}
+    assert set(record["distances_mm"]) == {"before", "initial", "final"}
+    for stage in record["distances_mm"].values():
+        assert set(stage) == {"model_to_scan", "scan_to_model"}
+        for direction in stage.values():
+            assert set(direction) >= SUMMARY
+    assert len(record["b"]) == len(record["z"]) == len(record["b_stddev"]) == 5
+    assert record["config"]["seed"] == 0
+    assert record["config"]["version"]
+    assert {(h["phase"], h["iteration"]) for h in record["history"]} >= {(1, 0), (2, 0)}
+    assert set(record["iterations"]) <= set(record["seconds"])
+
+
+def test_the_pose_in_the_record_maps_the_model_onto_the_scan(result: FitResult, tmp_path: Path) -> None:
+    write_record(tmp_path / "r.fit.json", fit_record(result, SCAN, MODEL))
+    T = read_record(tmp_path / "r.fit.json")["T_scan_model"]
+    model_points = blob_model().reconstruct(result.b)
+    placed = T["scale"] * model_points @ np.array(T["rotation"]).T + T["translation"]
+    write_fitted_mesh(tmp_path / "r.fitted.ply", result, blob_model())
+    fitted = read_mesh(tmp_path / "r.fitted.ply")
+    assert np.allclose(fitted.vertices, placed, atol=1e-12)
+    assert np.array_equal(fitted.faces, blob_model().faces)
+
+
+def strict(text: str) -> object:
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_numbers_that_are_not_finite_become_null(tmp_path: Path, result: FitResult) -> None:
+    record = fit_record(result, SCAN, MODEL)
+    assert not math.isfinite(record["history"][0]["motion_mm"])
+    write_record(tmp_path / "r.fit.json", record | {"extra": [float("nan"), (1.0, -math.inf)]})
+    text = (tmp_path / "r.fit.json").read_text()
+    assert strict(text)["extra"] == [None, [1.0, None]]
+    assert strict(text)["history"][0]["motion_mm"] is None
+    assert np.allclose(read_record(tmp_path / "r.fit.json")["b"], result.b, rtol=0, atol=0)
+
+
+def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, result: FitResult) -> None:
+    good = coefficient_row("one", fit_record(result, SCAN, MODEL))
+    bad = coefficient_row("two", failed_record(SCAN, MODEL, "two.ply is empty, so re-export it.", {}))
+    write_coefficients(tmp_path / "c.csv", [good, bad], 5)
+    with (tmp_path / "c.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+        stream.seek(0)
+        header = next(csv.reader(stream))
+    modes = [f"b{k}" for k in range(1, 6)] + [f"z{k}" for k in range(1, 6)]
+    assert header[:15] == ["scan", "status", "reason", *modes, "model_to_scan_mean_mm", "scan_to_model_mean_mm"]
+    assert len(header) == len(set(header))
+    assert float(rows[0]["b3"]) == result.b[2]
+    assert float(rows[0]["z3"]) == result.z[2]
+    assert float(rows[0]["model_to_scan_mean_mm"]) == result.distances.model_to_scan.mean
+    assert (rows[1]["status"], rows[1]["reason"]) == ("failed", "two.ply is empty, so re-export it.")
+    assert all(not rows[1][name] for name in header[3:])
+
+
+def test_names_that_look_like_formulas_are_made_harmless(tmp_path: Path) -> None:
+    row = coefficient_row("=cmd()", failed_record(SCAN, MODEL, "@why", {}))
+    write_coefficients(tmp_path / "c.csv", [row], 1)
+    with (tmp_path / "c.csv").open(newline="") as stream:
+        said = next(iter(csv.DictReader(stream)))
+    assert (said["scan"], said["reason"]) == ("'=cmd()", "'@why")
+
+
+def test_stages_are_kept_for_figures(tmp_path: Path, result: FitResult) -> None:
+    write_stages(tmp_path / "s.npz", result, blob_model())
+    with np.load(tmp_path / "s.npz", allow_pickle=False) as stages:
+        assert np.allclose(stages["final"], 1000 * result.surface(blob_model()).vertices, rtol=1e-5, atol=1e-2)
+        assert np.allclose(stages["model_to_scan_final"], result.distances.model_to_scan_mm, rtol=1e-5)
+        assert {"before", "initial", "scan_to_model_initial", "faces"} <= set(stages.files)
+
+
+@pytest.mark.parametrize("content", ["", "{", '{"scan": 1', "[]", '{"format": "other"}', "nonsense"])
+def test_what_is_not_a_record_is_refused_by_name(tmp_path: Path, content: str) -> None:
+    (tmp_path / "x.fit.json").write_text(content)
+    with pytest.raises(FileFormatError, match=r"x\.fit\.json"):
+        read_record(tmp_path / "x.fit.json")
+
+
+def test_a_full_disk_leaves_the_old_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = coefficient_row("one", failed_record(SCAN, MODEL, "why", {}))
+    write_coefficients(tmp_path / "c.csv", [row], 1)
+    before = (tmp_path / "c.csv").read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(FileError, match=r"c\.csv: the disk is full"):
+        write_coefficients(tmp_path / "c.csv", [row, row], 1)
+    assert (tmp_path / "c.csv").read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_model_of_points_gives_a_point_cloud(tmp_path: Path) -> None:
+    model = blob_model(vertices=200)
+    points = type(model)(model.mean, model.basis, model.stddev, model.total_variance, model.n_training)
+    result = fit_scan(points, Mesh(raw_scan(np.zeros(5)).scan.vertices, name="cloud"), FitConfig(max_iterations=3))
+    write_fitted_mesh(tmp_path / "p.fitted.ply", result, points)
+    write_stages(tmp_path / "p.npz", result, points)
+    assert read_mesh(tmp_path / "p.fitted.ply").faces is None
