@@ -1,0 +1,354 @@
+"""The documents say what the code does: their examples run, their links and names exist, their tables are complete."""
+
+import argparse
+import ast
+import contextlib
+import glob
+import importlib
+import inspect
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shapespace import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+NEEDS_DATA = "<!-- needs data -->"
+# The demo takes minutes and has tests of its own; here its arguments are parsed only.
+PARSED_ONLY = ("demo",)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a document."""
+
+    language: str
+    text: str
+    line: int
+    needs_data: bool
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def blocks(document: Path) -> list[Block]:
+    found: list[Block] = []
+    lines = document.read_text("utf-8").splitlines()
+    start, before = None, ""
+    for number, line in enumerate(lines):
+        if line.startswith("```"):
+            if start is None:
+                start = number
+            else:
+                language = lines[start][3:].strip()
+                found.append(Block(language, "\n".join(lines[start + 1 : number]), start + 1, before == NEEDS_DATA))
+                start, before = None, ""
+        elif start is None and line.strip():
+            before = line.strip()
+    assert start is None, f"{named(document)}: the block in line {(start or 0) + 1} is never closed"
+    return found
+
+
+def commands(block: Block) -> list[str]:
+    """Return what a reader types: the lines after `$` in a console, all lines of a bash block."""
+    if block.language == "console":
+        return [line[2:] for line in block.text.splitlines() if line.startswith("$ ")]
+    if block.language == "bash":
+        return [line for line in block.text.splitlines() if line.strip() and not line.startswith("#")]
+    return []
+
+
+def arguments(command: str) -> list[str]:
+    """Return the arguments after `shapespace` as a shell would give them."""
+    out: list[str] = []
+    for word in shlex.split(command, comments=True)[1:]:
+        out += sorted(glob.glob(word)) if "*" in word else [word]
+    return out
+
+
+def run(document: Path, *, with_data: bool) -> int:
+    """Run the examples of `document` in order in the current folder, and return how many there were."""
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    count = 0
+    for block in blocks(document):
+        if block.needs_data and not with_data:
+            continue
+        where = f"{named(document)}, line {block.line}"
+        if block.language == "python":
+            # Padding makes the line numbers of a traceback those of the document.
+            exec(compile("\n" * block.line + block.text, str(document), "exec"), namespace)
+            count += 1
+        for command in commands(block):
+            program = shlex.split(command, comments=True)[0]
+            if program != "shapespace":
+                continue
+            argv = arguments(command)
+            if argv[0] in PARSED_ONLY:
+                cli.parser().parse_args(argv)
+                continue
+            with contextlib.redirect_stdout(None):
+                assert cli.main(argv) == 0, f"{where}: {command}"
+            count += 1
+    return count
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, without open data unless a test names them."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("SHAPESPACE_DATA", "SHAPESPACE_DATA_URL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def has_examples(document: Path, *, needing_data: bool) -> bool:
+    chosen = [b for b in blocks(document) if b.needs_data == needing_data]
+    return any(b.language == "python" or any(c.startswith("shapespace") for c in commands(b)) for b in chosen)
+
+
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=False)], ids=named)
+def test_examples_run_as_they_stand(document: Path, workplace: Path) -> None:
+    assert run(document, with_data=False) > 0
+
+
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=True)], ids=named)
+def test_examples_with_open_data_run_too(
+    document: Path, workplace: Path, shared_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHAPESPACE_DATA", str(shared_data))
+    assert run(document, with_data=True) > 0
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_make_lines_name_targets_of_the_makefile(document: Path) -> None:
+    targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    text = document.read_text("utf-8")
+    asked = {match for match in re.findall(r"`make ([a-z-]+)", text)}
+    for block in blocks(document):
+        for command in commands(block):
+            words = shlex.split(command, comments=True)
+            if words[0] == "make":
+                asked |= {word for word in words[1:] if "=" not in word}
+    assert asked <= targets
+
+
+def test_readme_gives_the_two_commands() -> None:
+    typed = [command for block in blocks(ROOT / "README.md") for command in commands(block)]
+    assert {"make demo", "make test"} <= {command.split("#")[0].strip() for command in typed}
+
+
+# Links, pictures, paths
+
+
+def links(document: Path) -> list[tuple[str, str]]:
+    """Return (text, target) of every link and picture outside fenced blocks."""
+    text = re.sub(r"^```.*?^```", "", document.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)", text)
+
+
+def anchors(document: Path) -> set[str]:
+    headings = re.findall(r"^#+ (.*)$", document.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_links_and_pictures_lead_somewhere(document: Path) -> None:
+    for _, target in links(document):
+        if re.match(r"(https|mailto):", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (document.parent / path).resolve() if path else document
+        assert file.exists(), f"{named(document)} points at {target}, which does not exist"
+        assert file.is_relative_to(ROOT), f"{named(document)} points out of the repository: {target}"
+        if anchor:
+            assert anchor in anchors(file), f"{named(document)} points at {target}, but there is no such heading"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_no_document_names_a_path_of_one_machine(document: Path) -> None:
+    text = document.read_text("utf-8")
+    absolute = re.findall(r"(?:(?<=[\s`\"'(=])|^)/[a-z]\w*/[\w.]+", text, re.MULTILINE)
+    assert not absolute and not re.search(r"\b[A-Z]:\\", text)
+
+
+def code_links(document: Path) -> Iterator[tuple[str, Path]]:
+    """Yield (name, file) of every link whose text is code and whose target is a Python file."""
+    for text, target in links(document):
+        if target.endswith(".py") and text.startswith("`") and not text.endswith((".py`", "/`")):
+            yield text.strip("`").removesuffix("()"), (document.parent / target).resolve()
+
+
+@cache
+def names_in(file: Path) -> set[str]:
+    """Return the functions, classes, methods, fields and constants that a file defines, dotted."""
+    found: set[str] = set()
+
+    def walk(nodes: list[ast.stmt], prefix: str) -> None:
+        for node in nodes:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                found.add(prefix + node.name)
+                if isinstance(node, ast.ClassDef):
+                    walk(node.body, f"{prefix}{node.name}.")
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                found.update(prefix + target.id for target in targets if isinstance(target, ast.Name))
+
+    walk(ast.parse(file.read_text("utf-8")).body, "")
+    return found
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_code_that_is_linked_to_is_in_that_file(document: Path) -> None:
+    for name, file in code_links(document):
+        assert name in names_in(file), f"{named(document)} names {name}, but {file.name} has no such thing"
+        if file.is_relative_to(ROOT / "src"):
+            module = importlib.import_module(".".join(file.relative_to(ROOT / "src").with_suffix("").parts))
+            owner: Any = module
+            for part in name.split("."):
+                known = hasattr(owner, part) or part in getattr(owner, "__dataclass_fields__", ())
+                assert known, f"{named(document)} names {name}, which {module.__name__} does not have"
+                owner = getattr(owner, part, None)
+
+
+# Tables
+
+
+def rows(document: Path, heading: str) -> list[list[str]]:
+    """Return the cells of the first table under `heading`, without its head."""
+    text = document.read_text("utf-8")
+    match = re.search(rf"^#+ {re.escape(heading)}$(.*?)(?=^#+ |\Z)", text, re.MULTILINE | re.DOTALL)
+    assert match, f"{named(document)} has no heading {heading!r}"
+    lines = [line for line in match[1].splitlines() if line.startswith("|")]
+    assert len(lines) > 2, f"{named(document)} has no table under {heading!r}"
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def code_in(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def project() -> Mapping[str, Any]:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+
+
+def test_the_paper_map_covers_every_equation_and_figure_with_code_and_a_test() -> None:
+    document = ROOT / "docs" / "paper-map.md"
+    for heading, last in (("Equations", 19), ("Figures", 11)):
+        covered: list[int] = []
+        for first, code, test, *_ in rows(document, heading):
+            numbers = [int(n) for n in re.findall(r"\d+", first)]
+            covered += range(numbers[0], numbers[-1] + 1)
+            assert "../src/" in code, f"{heading} {first} has no code"
+            assert "../tests/" in test, f"{heading} {first} has no test"
+        assert sorted(set(covered)) == list(range(1, last + 1))
+
+
+def test_the_layers_are_those_that_are_enforced() -> None:
+    (block,) = [b for b in blocks(ROOT / "docs" / "architecture.md") if b.language == "layers"]
+    written = [line.split("  ")[0].strip() for line in block.text.splitlines()]
+    assert written == project()["tool"]["importlinter"]["contracts"][0]["layers"]
+
+
+def test_every_dependency_has_its_line_and_every_line_its_dependency() -> None:
+    declared = project()["project"]
+    extras = declared["optional-dependencies"]
+    for heading, wanted in (("Needed to run", declared["dependencies"]), *((f"Extra {e}", extras[e]) for e in extras)):
+        if heading == "Extra all":
+            continue
+        names = sorted(re.split(r"[<>=\[;]", requirement)[0].strip() for requirement in wanted)
+        table = rows(ROOT / "docs" / "dependencies.md", heading)
+        assert sorted(code_in(row[0])[0] for row in table) == names
+        assert all(len(row) == 4 and all(row) for row in table)
+
+
+def test_every_plug_is_where_the_document_says_with_its_choices_and_its_test() -> None:
+    document = ROOT / "docs" / "extending.md"
+    table = rows(document, "The plugs")
+    for plug, home, choices, test in table:
+        (name,) = code_in(plug)
+        module = importlib.import_module(code_in(home)[0])
+        assert sorted(code_in(choices)) == sorted(getattr(module, name)), f"{name} has other choices"
+        assert "../tests/" in test
+        file = (document.parent / re.findall(r"\(([^)]+\.py)\)", test)[0]).resolve()
+        assert name in file.read_text("utf-8"), f"{named(file)} does not read {name}"
+        assert f"## {name}" in document.read_text("utf-8")
+    found = set()
+    for file in (ROOT / "src").rglob("*.py"):
+        for node in ast.parse(file.read_text("utf-8")).body:
+            if isinstance(node, ast.AnnAssign) and "Mapping[str, Callable" in ast.unparse(node.annotation):
+                found |= {node.target.id} if isinstance(node.target, ast.Name) else set()
+    assert found and found <= {code_in(row[0])[0] for row in table}, "a plug is missing from the table"
+
+
+def subparsers(parser: argparse.ArgumentParser, path: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    children = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for action in children:
+        for name, child in action.choices.items():
+            yield from subparsers(child, f"{path} {name}".strip())
+    if not children:
+        yield path, parser
+
+
+def test_the_reference_lists_every_command_and_every_option_and_no_other() -> None:
+    document = ROOT / "docs" / "cli.md"
+    known = dict(subparsers(cli.parser()))
+    text = document.read_text("utf-8")
+    assert sorted(re.findall(r"^## shapespace (.*)$", text, re.MULTILINE)) == sorted(known)
+    for command, parser in known.items():
+        options = {
+            o for a in parser._actions for o in a.option_strings if o not in ("-h", "--help", "--quiet", "--json")
+        }
+        written = {
+            part.split()[0] for row in rows(document, f"shapespace {command}") for part in code_in(row[0])
+            if part.startswith("-")
+        }  # fmt: skip
+        assert written == options, f"shapespace {command}"
+
+
+def test_the_reference_lists_every_key_of_a_fit_record() -> None:
+    from shapespace.batch.results import Source, fit_record
+    from shapespace.fit.fit import fit_scan
+    from synthetic_shapes import blob_model, raw_scan
+
+    model = blob_model()
+    record = fit_record(
+        fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), Source("a", ""), Source("b", "")
+    )
+    written = [key for row in rows(ROOT / "docs" / "cli.md", "NAME.fit.json") for key in code_in(row[0])]
+    assert sorted(written) == sorted(record)
+
+
+def test_the_model_file_holds_what_its_document_lists(tmp_path: Path) -> None:
+    import h5py
+
+    from synthetic_shapes import blob_model
+
+    blob_model().save(tmp_path / "model.h5")
+    document = ROOT / "docs" / "model-file.md"
+    with h5py.File(tmp_path / "model.h5") as file:
+        assert sorted(code_in(row[0])[0] for row in rows(document, "Datasets")) == sorted(file)
+        assert sorted(code_in(row[0])[0] for row in rows(document, "Attributes")) == sorted(file.attrs)
+
+
+def test_public_names_are_in_the_readme_example_or_the_architecture() -> None:
+    import shapespace
+
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    for name in shapespace.__all__:
+        assert f"`{name}`" in text, f"architecture.md does not say what {name} is"
+        assert inspect.getdoc(getattr(shapespace, name))
