@@ -3,9 +3,9 @@
 import argparse
 import ast
 import contextlib
-import glob
 import importlib
 import inspect
+import io
 import re
 import shlex
 import tomllib
@@ -76,7 +76,7 @@ def arguments(command: str) -> list[str]:
     """Return the arguments after `shapespace` as a shell would give them."""
     out: list[str] = []
     for word in shlex.split(command, comments=True)[1:]:
-        out += sorted(glob.glob(word)) if "*" in word else [word]
+        out += sorted(map(str, Path().glob(word))) if "*" in word else [word]
     return out
 
 
@@ -100,7 +100,7 @@ def run(document: Path, *, with_data: bool) -> int:
             if argv[0] in PARSED_ONLY:
                 cli.parser().parse_args(argv)
                 continue
-            with contextlib.redirect_stdout(None):
+            with contextlib.redirect_stdout(io.StringIO()):
                 assert cli.main(argv) == 0, f"{where}: {command}"
             count += 1
     return count
@@ -138,7 +138,7 @@ def test_examples_with_open_data_run_too(
 def test_make_lines_name_targets_of_the_makefile(document: Path) -> None:
     targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
     text = document.read_text("utf-8")
-    asked = {match for match in re.findall(r"`make ([a-z-]+)", text)}
+    asked = set(re.findall(r"`make ([a-z-]+)", text))
     for block in blocks(document):
         for command in commands(block):
             words = shlex.split(command, comments=True)
@@ -250,7 +250,7 @@ def test_the_paper_map_covers_every_equation_and_figure_with_code_and_a_test() -
     document = ROOT / "docs" / "paper-map.md"
     for heading, last in (("Equations", 19), ("Figures", 11)):
         covered: list[int] = []
-        for first, code, test, *_ in rows(document, heading):
+        for first, _, code, test in rows(document, heading):
             numbers = [int(n) for n in re.findall(r"\d+", first)]
             covered += range(numbers[0], numbers[-1] + 1)
             assert "../src/" in code, f"{heading} {first} has no code"
