@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.errors import CorrespondenceError, FileError, InputError, ModelFileError
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.hdf5 import write_hdf5
+from shapespace.model.choose_modes import choose_modes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, similarity, training_meshes
@@ -434,3 +435,17 @@ def test_turning_a_model_shape_about_does_not_matter_at_any_angle(model: ShapeMo
     b = model.project(x)
     for R in Rotation.create_group("O").as_matrix():
         assert np.allclose(model.project(x @ R.T), b, atol=1e-8)
+
+
+def test_the_choice_of_modes_is_the_smallest_within_one_standard_error_of_the_best() -> None:
+    rng = np.random.default_rng(4)
+    modes = np.linalg.qr(rng.standard_normal((600, 25)))[0] * np.geomspace(100, 1, 25)
+    data = rng.standard_normal((60, 25)) @ modes.T
+    choice = choose_modes(data + 0.5 * rng.standard_normal(data.shape))
+    best = choice.error_mm.argmin()
+    near = choice.error_mm <= choice.error_mm[best] + choice.standard_error_mm[best]
+    assert choice.modes == choice.candidates[near].min()
+    assert choice.modes < choice.candidates[best]
+    # Hidden vertices cannot be told better than their own noise, sqrt(8 / pi) of its deviation in three dimensions.
+    assert 0.5 * np.sqrt(8 / np.pi) < choice.error_mm[best] < 1.3
+    assert choice.error_mm[0] > 2 * choice.error_mm[best]
