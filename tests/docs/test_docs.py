@@ -24,6 +24,7 @@ DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "CHANGELOG.md",
+    ROOT / "benchmarks" / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NEEDS_DATA = "<!-- needs data -->"
@@ -352,3 +353,27 @@ def test_public_names_are_in_the_readme_example_or_the_architecture() -> None:
     for name in shapespace.__all__:
         assert f"`{name}`" in text, f"architecture.md does not say what {name} is"
         assert inspect.getdoc(getattr(shapespace, name))
+
+
+def test_the_defaults_in_the_reference_are_those_of_the_parser() -> None:
+    stated = 0
+    for command, parser in subparsers(cli.parser()):
+        for row in rows(ROOT / "docs" / "cli.md", f"shapespace {command}"):
+            names = [part.split()[0] for part in code_in(row[0])]
+            default = re.search(r"`([^`]+)` \(default|`?([\w-]+)`? by default", row[1])
+            for action in parser._actions:
+                if default and set(action.option_strings) & set(names):
+                    assert str(action.default) == (default[1] or default[2]), f"shapespace {command} {names[-1]}"
+                    stated += 1
+    assert stated > 10
+
+
+def test_the_sizes_of_the_bundled_faces_are_those_stated() -> None:
+    from shapespace.datasets.faces import EXPRESSIONS, load_faces
+
+    faces = load_faces()
+    text = " ".join((ROOT / "docs" / "data.md").read_text("utf-8").split())
+    assert f"{len(faces.template.vertices):,} vertices and {len(faces.template.faces):,} triangles" in text
+    assert f"{len(faces.landmarks)} landmarks" in text
+    assert f"{len(faces.unit_names)} expression units" in text
+    assert f"made of them: {', '.join(EXPRESSIONS)}." in text
