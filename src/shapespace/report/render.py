@@ -1,0 +1,470 @@
+"""Stills of meshes and point clouds by a z-buffer in numpy: no GPU, no window, the same bytes every time.
+
+A triangle is turned into rows, a row into the exact span of pixel centres inside it, and a fragment survives when
+it is the nearest of its pixel; normals and scalars are interpolated for the surviving fragments only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
+
+from shapespace.errors import InputError
+from shapespace.geometry.surface import vertex_normals
+from shapespace.types import FloatArray, IntArray, Mesh, read_only
+
+Image: TypeAlias = npt.NDArray[np.uint8]
+"""(H, W, 3) uint8, sRGB."""
+Colour: TypeAlias = tuple[float, float, float]
+"""Red, green, blue in [0, 1], sRGB."""
+
+WHITE: Colour = (1.0, 1.0, 1.0)
+CLAY: Colour = (0.80, 0.755, 0.715)
+
+_FRAGMENTS_AT_ONCE = 2_000_000
+_LARGEST_SIDE = 8192
+_GAMMA = 2.2
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Where a picture is taken from; share one in a row so that its panels can be compared.
+
+    With yaw and pitch 0 it looks along -z with +y up: the front of a face that looks along +z.
+
+    Args:
+        centre: (3,) point in the middle of the picture, mm.
+        height_mm: height of what the picture shows at the centre's depth.
+        yaw_deg: the object turns this far to the picture's right.
+        pitch_deg: the object's front tilts this far down.
+        distance_mm: from the eye to the centre; None for an orthographic picture.
+
+    Raises:
+        InputError: a height or distance that is not positive.
+    """
+
+    centre: FloatArray
+    height_mm: float
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    distance_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre", read_only(self.centre))
+        if self.centre.shape != (3,) or not np.isfinite(self.centre).all():
+            raise InputError("The centre of a camera must be 3 finite numbers.")
+        if not (np.isfinite(self.height_mm) and self.height_mm > 0):
+            raise InputError(f"The height seen by a camera must be positive, not {self.height_mm!r} mm.")
+        if self.distance_mm is not None and not self.distance_mm > 0:
+            raise InputError(f"The distance of a camera must be positive, not {self.distance_mm!r} mm.")
+
+    @staticmethod
+    def framing(
+        points: npt.ArrayLike,
+        *,
+        yaw_deg: float = 0.0,
+        pitch_deg: float = 0.0,
+        aspect: float = 1.0,
+        margin: float = 0.06,
+        perspective: bool = True,
+    ) -> Camera:
+        """Return a camera that sees all `points` (N, 3) in a picture `aspect` times as wide as high.
+
+        Raises:
+            InputError: no points, or points that are not finite.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        if not len(points) or not np.isfinite(points).all():
+            raise InputError("A camera needs at least one point to look at, and all of them finite.")
+        axes = _view_axes(yaw_deg, pitch_deg)
+        seen = points @ axes.T
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        extent = high - low
+        height = float(max(extent[1], extent[0] / aspect, 1e-6)) * (1 + 2 * margin)
+        centre = ((low + high) / 2) @ axes
+        if not perspective:
+            return Camera(centre, height, yaw_deg, pitch_deg)
+        # Nearer parts grow in perspective: the margin pays for the half of the depth in front of the centre.
+        distance = 5.0 * height + float(extent[2])
+        grown = height * (1 + 0.15 * float(extent[2]) / distance)
+        return Camera(centre, grown, yaw_deg, pitch_deg, distance)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One mesh or point cloud in a picture, in one colour or coloured by a scalar.
+
+    Args:
+        mesh: vertices in mm; without faces each vertex is drawn as a small ball.
+        colour: used where there are no scalars.
+        scalars: (V,) float64, one a vertex; values that are not finite are drawn in grey.
+        colormap: (N, 3) colours from `vmin` to `vmax`; few colours give bands with sharp edges.
+        vmin: scalar of the first colour.
+        vmax: scalar of the last colour.
+        opacity: 1 hides what is behind; less blends.
+        point_radius_mm: radius of the balls of a point cloud.
+
+    Raises:
+        InputError: scalars without a map, of another length, or an empty range.
+    """
+
+    mesh: Mesh
+    colour: Colour = CLAY
+    scalars: FloatArray | None = None
+    colormap: FloatArray | None = None
+    vmin: float = 0.0
+    vmax: float = 1.0
+    opacity: float = 1.0
+    point_radius_mm: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.scalars is None:
+            return
+        name = self.mesh.name
+        scalars = read_only(self.scalars)
+        object.__setattr__(self, "scalars", scalars)
+        if scalars.shape != (len(self.mesh.vertices),):
+            raise InputError(
+                f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {scalars.shape}."
+            )
+        if self.colormap is None or np.ndim(self.colormap) != 2 or np.shape(self.colormap)[1] != 3:
+            raise InputError(f"{name}: scalars need a colour map of the shape (N, 3).")
+        if not self.vmax > self.vmin:
+            raise InputError(f"{name}: the scale from {self.vmin} to {self.vmax} is empty.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Surfels:
+    """What a layer leaves in the picture: for each covered pixel, where, how deep and what."""
+
+    pixel: npt.NDArray[np.int64]
+    depth_mm: FloatArray
+    normal: FloatArray
+    scalar: FloatArray | None
+    back: npt.NDArray[np.bool_]
+
+
+def render(
+    mesh: Mesh,
+    *,
+    camera: Camera,
+    size: tuple[int, int] = (480, 560),
+    colour: Colour = CLAY,
+    scalars: FloatArray | None = None,
+    colormap: FloatArray | None = None,
+    vmin: float = 0.0,
+    vmax: float = 1.0,
+    background: Colour = WHITE,
+    supersample: int = 2,
+) -> Image:
+    """Return a picture of one mesh; arguments as in `Layer` and `render_layers`."""
+    layer = Layer(mesh, colour, scalars, colormap, vmin, vmax)
+    return render_layers([layer], camera=camera, size=size, background=background, supersample=supersample)
+
+
+def render_layers(
+    layers: Sequence[Layer],
+    *,
+    camera: Camera,
+    size: tuple[int, int] = (480, 560),
+    background: Colour = WHITE,
+    supersample: int = 2,
+) -> Image:
+    """Return a picture of several layers, the nearest surface of each blended in the order of depth.
+
+    Args:
+        layers: what to draw; with full opacity the nearer one wins each pixel.
+        camera: where from.
+        size: (width, height) in pixels.
+        background: colour where nothing is.
+        supersample: samples per pixel and axis.
+
+    Returns:
+        (height, width, 3) uint8.
+
+    Raises:
+        InputError: a size or supersample that is not a small positive whole number.
+    """
+    width, height = size
+    if supersample < 1 or min(size) < 1 or max(size) * supersample > _LARGEST_SIDE:
+        raise InputError(
+            f"A picture of {width} x {height} pixels with {supersample} samples each way cannot be drawn; "
+            f"each side times the samples must be 1 to {_LARGEST_SIDE}."
+        )
+    fine = (width * supersample, height * supersample)
+    count = fine[0] * fine[1]
+    colours = np.empty((len(layers), count, 3))
+    alphas = np.zeros((len(layers), count))
+    depths = np.full((len(layers), count), np.inf)
+    for k, layer in enumerate(layers):
+        surfels = _surfels(layer, camera, fine)
+        shade = _occlusion(surfels, fine, supersample, camera)
+        colours[k, surfels.pixel] = _shaded(layer, surfels, shade)
+        alphas[k, surfels.pixel] = layer.opacity
+        depths[k, surfels.pixel] = surfels.depth_mm
+    out = np.empty((count, 3))
+    out[:] = np.asarray(background, dtype=np.float64) ** _GAMMA
+    if len(layers) == 1:
+        hit = alphas[0] > 0
+        out[hit] += alphas[0][hit, None] * (colours[0][hit] - out[hit])
+    elif layers:
+        some = np.flatnonzero((alphas > 0).any(axis=0))
+        order = np.argsort(-depths[:, some], axis=0, kind="stable")
+        for rank in range(len(layers)):
+            which = order[rank]
+            alpha = alphas[which, some]
+            hit = alpha > 0
+            at = some[hit]
+            out[at] += alpha[hit, None] * (colours[which[hit], at] - out[at])
+    fine_image = out.reshape(height, supersample, width, supersample, 3)
+    mean: FloatArray = np.clip(fine_image.mean(axis=(1, 3)), 0, 1)
+    return np.round(255.0 * mean ** (1 / _GAMMA)).astype(np.uint8)
+
+
+def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
+    """Return which triangle each pixel shows, and how deep.
+
+    Args:
+        mesh: with faces.
+        camera: where from.
+        size: (width, height) in pixels.
+
+    Returns:
+        (H, W) int32 index of the nearest triangle at the pixel's centre, -1 where there is none, and (H, W)
+        float64 depth, growing away from the eye (infinite where there is none). Its unit is mm for an
+        orthographic camera; in perspective it is -1/mm.
+    """
+    screen, depth = _project(mesh.vertices, camera, size)
+    faces = mesh.faces if mesh.faces is not None else np.zeros((0, 3), dtype=np.int32)
+    triangle, nearest = _rasterise(screen, depth, faces, size)
+    shape = (size[1], size[0])
+    return triangle.astype(np.int32).reshape(shape), nearest.reshape(shape)
+
+
+def _view_axes(yaw_deg: float, pitch_deg: float) -> FloatArray:
+    """Return the rows right, up and towards the eye, (3, 3), in world coordinates."""
+    yaw, pitch = np.radians([yaw_deg, pitch_deg])
+    turn = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    tilt = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    return tilt @ turn
+
+
+def _project(points: FloatArray, camera: Camera, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return pixel positions (N, 2), y down, and depths (N,) that are linear across a triangle on the screen."""
+    width, height = size
+    seen = (points - camera.centre) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    pixels_per_mm = height / camera.height_mm
+    if camera.distance_mm is None:
+        scale, depth = np.full(len(seen), pixels_per_mm), -seen[:, 2]
+    else:
+        away = camera.distance_mm - seen[:, 2]
+        # Behind the eye there is no picture: NaN drops the triangle.
+        away = np.where(away > 0.05 * camera.distance_mm, away, np.nan)
+        scale, depth = pixels_per_mm * camera.distance_mm / away, -1.0 / away
+    screen = np.stack([width / 2 + seen[:, 0] * scale, height / 2 - seen[:, 1] * scale], axis=1)
+    return screen, depth
+
+
+def _depth_mm(depth: FloatArray, camera: Camera) -> FloatArray:
+    """Turn the depth of `_project` into mm behind the camera's centre."""
+    return depth if camera.distance_mm is None else -1.0 / depth - camera.distance_mm
+
+
+def _rasterise(
+    screen: FloatArray, depth: FloatArray, faces: IntArray, size: tuple[int, int]
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """Return for each pixel, row by row, the nearest triangle at its centre (-1 for none) and its depth."""
+    width, height = size
+    nearest = np.full(width * height, np.inf)
+    triangle = np.full(width * height, -1, dtype=np.int64)
+    x, y, z = screen[faces, 0], screen[faces, 1], depth[faces]
+    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
+    tiny = 1e-9
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (np.abs(area) > 1e-12)
+            & (x.max(axis=1) > 0)
+            & (x.min(axis=1) < width)
+            & (y.max(axis=1) > 0)
+            & (y.min(axis=1) < height)
+            & np.isfinite(z).all(axis=1)
+        )
+    kept = np.flatnonzero(inside)
+    if not len(kept):
+        return triangle, nearest
+    x, y, z, area = x[kept], y[kept], z[kept], area[kept]
+    flip = area < 0
+    x[flip], y[flip], z[flip] = x[flip][:, ::-1], y[flip][:, ::-1], z[flip][:, ::-1]
+    area = np.abs(area)
+    slope_x = ((z[:, 1] - z[:, 0]) * (y[:, 2] - y[:, 0]) - (z[:, 2] - z[:, 0]) * (y[:, 1] - y[:, 0])) / area
+    slope_y = ((x[:, 1] - x[:, 0]) * (z[:, 2] - z[:, 0]) - (x[:, 2] - x[:, 0]) * (z[:, 1] - z[:, 0])) / area
+    top = np.maximum(np.ceil(y.min(axis=1) - 0.5 - tiny), 0).astype(np.int64)
+    bottom = np.minimum(np.floor(y.max(axis=1) - 0.5 + tiny), height - 1).astype(np.int64)
+    rows = np.maximum(bottom - top + 1, 0)
+    near, far = z.min(axis=1), z.max(axis=1)
+    for first, last in _chunks(rows, _FRAGMENTS_AT_ONCE // 4):
+        part = slice(first, last)
+        owner = first + np.repeat(np.arange(last - first), rows[part])
+        row = top[owner] + _counting(rows[part])
+        low, high = np.full(len(row), -np.inf), np.full(len(row), np.inf)
+        centre_y = row + 0.5
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            # Inside is rise * px <= reach for each edge of a triangle that turns the positive way.
+            rise = (y[:, b] - y[:, a])[owner]
+            reach = rise * x[owner, a] + (x[:, b] - x[:, a])[owner] * (centre_y - y[owner, a])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossing = reach / rise
+            np.minimum(high, crossing, out=high, where=rise > 0)
+            np.maximum(low, crossing, out=low, where=rise < 0)
+        left = np.ceil(np.clip(low - 0.5 - tiny, 0, width)).astype(np.int64)
+        right = np.floor(np.clip(high - 0.5 + tiny, -1, width - 1)).astype(np.int64)
+        spans = np.maximum(right - left + 1, 0)
+        for start, stop in _chunks(spans, _FRAGMENTS_AT_ONCE):
+            span = slice(start, stop)
+            source = start + np.repeat(np.arange(stop - start), spans[span])
+            column = left[source] + _counting(spans[span])
+            tri = owner[source]
+            value = (
+                z[tri, 0] + slope_x[tri] * (column + 0.5 - x[tri, 0]) + slope_y[tri] * (centre_y[source] - y[tri, 0])
+            )
+            # A sliver's slopes are mostly rounding: its depth stays between its corners.
+            value = np.clip(value, near[tri], far[tri])
+            pixel = row[source] * width + column
+            before = nearest[pixel]
+            np.minimum.at(nearest, pixel, value)
+            won = np.flatnonzero((value == nearest[pixel]) & (value < before))[::-1]
+            # Reversed, so that of equally near triangles the first one stays.
+            triangle[pixel[won]] = kept[tri[won]]
+    return triangle, nearest
+
+
+def _counting(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return 0..n-1 for each n in `counts`, joined."""
+    ends = np.cumsum(counts)
+    return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)
+
+
+def _chunks(counts: npt.NDArray[np.int64], most: int) -> list[tuple[int, int]]:
+    """Cut the list of `counts` into runs that sum to about `most` each."""
+    if not len(counts):
+        return []
+    part = np.cumsum(counts) // most
+    cuts = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(counts)]
+    return list(pairwise(cuts))
+
+
+def _surfels(layer: Layer, camera: Camera, size: tuple[int, int]) -> _Surfels:
+    if layer.mesh.faces is None:
+        return _balls(layer, camera, size)
+    vertices, faces = layer.mesh.vertices, layer.mesh.faces
+    screen, depth = _project(vertices, camera, size)
+    triangle, nearest = _rasterise(screen, depth, faces, size)
+    pixel = np.flatnonzero(triangle >= 0)
+    corner = faces[triangle[pixel]]
+    at = np.stack([pixel % size[0] + 0.5, pixel // size[0] + 0.5], axis=1)
+    a, b, c = (screen[corner[:, k]] for k in range(3))
+
+    def turn(p: FloatArray, q: FloatArray) -> FloatArray:
+        return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+    area = turn(b - a, c - a)
+    share = np.stack([turn(b - at, c - at), turn(c - at, a - at), turn(a - at, b - at)], axis=1) / area[:, None]
+    share = np.clip(share, 0, 1)
+    if camera.distance_mm is not None:
+        share *= -depth[corner]
+    share /= share.sum(axis=1, keepdims=True)
+    axes = _view_axes(camera.yaw_deg, camera.pitch_deg)
+    normals = vertex_normals(layer.mesh) @ axes.T
+    normal = np.einsum("nk,nkd->nd", share, normals[corner])
+    # On the screen y points down, so a triangle that faces the eye turns the negative way.
+    back = area > 0
+    normal[back] *= -1
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    scalar = None if layer.scalars is None else np.einsum("nk,nk->n", share, layer.scalars[corner])
+    return _Surfels(pixel, _depth_mm(nearest[pixel], camera), normal, scalar, back)
+
+
+def _balls(layer: Layer, camera: Camera, size: tuple[int, int]) -> _Surfels:
+    """Draw each vertex as a ball: a disc of pixels with the depth and the normals of a sphere."""
+    width, height = size
+    screen, depth = _project(layer.mesh.vertices, camera, size)
+    behind = _depth_mm(depth, camera)
+    radius = max(layer.point_radius_mm * height / camera.height_mm, 0.75)
+    reach = int(np.ceil(radius))
+    step_y, step_x = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    nearest = np.full(width * height, np.inf)
+    winner = np.full(width * height, -1, dtype=np.int64)
+    usable = np.flatnonzero(np.isfinite(screen).all(axis=1))
+    corner = np.floor(screen[usable]).astype(np.int64)
+    for dx, dy in zip(step_x.tolist(), step_y.tolist(), strict=True):
+        column, row = corner[:, 0] + dx, corner[:, 1] + dy
+        off = (column + 0.5 - screen[usable, 0]) ** 2 + (row + 0.5 - screen[usable, 1]) ** 2
+        hit = np.flatnonzero((off <= radius**2) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
+        pixel = row[hit] * width + column[hit]
+        rise = np.sqrt(radius**2 - off[hit]) / radius * layer.point_radius_mm
+        value = behind[usable[hit]] - rise
+        before = nearest[pixel]
+        np.minimum.at(nearest, pixel, value)
+        won = np.flatnonzero((value == nearest[pixel]) & (value < before))[::-1]
+        winner[pixel[won]] = usable[hit[won]]
+    pixel = np.flatnonzero(winner >= 0)
+    owner = winner[pixel]
+    at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
+    flat = (at - screen[owner]) / radius * [1.0, -1.0]
+    up = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, 1))
+    normal = np.concatenate([flat, up[:, None]], axis=1)
+    scalar = None if layer.scalars is None else layer.scalars[owner]
+    return _Surfels(pixel, nearest[pixel], normal, scalar, np.zeros(len(pixel), dtype=np.bool_))
+
+
+_KEY = np.array([-0.42, 0.50, 0.76]) / np.linalg.norm([-0.42, 0.50, 0.76])
+_FILL = np.array([0.75, 0.05, 0.66]) / np.linalg.norm([0.75, 0.05, 0.66])
+_HALF = (_KEY + np.array([0, 0, 1])) / np.linalg.norm(_KEY + np.array([0, 0, 1]))
+
+
+def _shaded(layer: Layer, surfels: _Surfels, occlusion: FloatArray) -> FloatArray:
+    """Return linear colours (n, 3): soft key, fill and rim light, a little gloss."""
+    normal = surfels.normal
+    base = np.tile(np.asarray(layer.colour, dtype=np.float64) ** _GAMMA, (len(normal), 1))
+    mapped = surfels.scalar is not None and layer.colormap is not None
+    if surfels.scalar is not None and layer.colormap is not None:
+        table = np.asarray(layer.colormap, dtype=np.float64) ** _GAMMA
+        finite = np.isfinite(surfels.scalar)
+        share = (np.where(finite, surfels.scalar, 0) - layer.vmin) / (layer.vmax - layer.vmin)
+        base = table[np.clip((share * len(table)).astype(np.int64), 0, len(table) - 1)]
+        base[~finite] = 0.35
+    # Wrapped diffuse light keeps the shadow side of a face readable.
+    key = np.clip((normal @ _KEY + 0.25) / 1.25, 0, 1)
+    fill = np.clip(normal @ _FILL, 0, 1)
+    rim = np.clip(1 - np.abs(normal[:, 2]), 0, 1) ** 3
+    gloss = np.clip(normal @ _HALF, 0, 1) ** 28
+    # A map is read by its colours: less shading there, so that they stay close to the scale's.
+    ambient, key_share, fill_share, shine = (0.42, 0.58, 0.12, 0.02) if mapped else (0.10, 0.80, 0.10, 0.05)
+    light = (ambient + key_share * key + fill_share * fill) * occlusion
+    out = base * light[:, None] + (shine * gloss * occlusion + (0 if mapped else 0.03) * rim)[:, None]
+    if surfels.back.any():
+        out[surfels.back] = 0.4 * out[surfels.back] + 0.02
+    return np.clip(out, 0, 1)
+
+
+def _occlusion(surfels: _Surfels, size: tuple[int, int], supersample: int, camera: Camera) -> FloatArray:
+    """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
+    width, height = size
+    covered_part = np.zeros(width * height, dtype=np.float32)
+    covered_part[surfels.pixel] = 1
+    depth = np.zeros(width * height, dtype=np.float32)
+    depth[surfels.pixel] = surfels.depth_mm
+    coarse = (slice(None, None, supersample), slice(None, None, supersample))
+    there = covered_part.reshape(height, width)[coarse]
+    sigma = 0.022 * there.shape[0]
+    total = gaussian_filter(there, sigma)
+    mean = gaussian_filter(depth.reshape(height, width)[coarse], sigma) / np.maximum(total, 1e-6)
+    mean_here = mean[surfels.pixel // width // supersample, surfels.pixel % width // supersample]
+    behind = np.clip(surfels.depth_mm - mean_here, 0, 0.03 * camera.height_mm)
+    return np.exp(-30.0 * behind / camera.height_mm)
