@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import math
 import os
@@ -24,20 +25,38 @@ _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # A file's name may hold what the terminal's encoding cannot show.
+            stream.reconfigure(errors="backslashreplace")
     arguments = parser().parse_args(argv)
     try:
-        return int(arguments.run(arguments))
+        code = int(arguments.run(arguments))
+        sys.stdout.flush()
+        return code
     except ShapespaceError as error:
         _say(f"shapespace: {error}")
+        return 2
+    except MemoryError:
+        _say("shapespace: there is not enough memory for this; give fewer or smaller meshes, or fewer --jobs.")
         return 2
     except KeyboardInterrupt:
         _say("shapespace: stopped; the files written so far are whole.")
         return 130
     except BrokenPipeError:
-        # The reader of our output went away; python must not complain when it flushes at exit.
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 0
+    except OSError as error:
+        _drop_output()
+        where = f" ({error.filename})" if error.filename else ""
+        _say(f"shapespace: the system refused{where}: {error.strerror or error}; check the path and the free space.")
+        return 2
+
+
+def _drop_output() -> None:
+    """Send what is left of the output nowhere, so that python does not complain when it flushes at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -165,9 +184,9 @@ def _demo(arguments: argparse.Namespace) -> int:
 
     report = run_demo(arguments.out, quick=arguments.quick, quiet=arguments.quiet)
     if arguments.json:
-        print(json.dumps({"report": str(report)}))
+        _print_json({"report": str(report)})
     else:
-        print(f"The report is {report}")
+        _print(f"The report is {report}")
     if not arguments.no_open:
         import webbrowser
 
@@ -180,10 +199,11 @@ def _data_list(arguments: argparse.Namespace) -> int:
 
     rows = commands.data_list()
     if arguments.json:
-        print(json.dumps(rows, indent=1, default=str))
+        _print_json(rows)
     else:
         for row in rows:
-            print("\n  ".join(f"{key}: {value}" for key, value in row.items()))
+            for number, (key, value) in enumerate(row.items()):
+                _print(f"{'  ' if number else ''}{key}: {value}")
     return 0
 
 
@@ -191,7 +211,10 @@ def _data_get(arguments: argparse.Namespace) -> int:
     from shapespace import commands
 
     folder = commands.data_get(arguments.name, arguments.to, quiet=arguments.quiet)
-    print(json.dumps({"folder": str(folder)}) if arguments.json else folder)
+    if arguments.json:
+        _print_json({"folder": str(folder)})
+    else:
+        _print(str(folder))
     return 0
 
 
@@ -208,8 +231,10 @@ def _data_faces(arguments: argparse.Namespace) -> int:
         area=arguments.area,
         quiet=arguments.quiet,
     )
-    facts = {"folder": str(arguments.output), "faces": count}
-    print(json.dumps(facts) if arguments.json else f"{count} faces in {arguments.output}")
+    if arguments.json:
+        _print_json({"folder": str(arguments.output), "faces": count})
+    else:
+        _print(f"{count} faces in {arguments.output}")
     return 0
 
 
@@ -218,7 +243,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
     reports = commands.check(arguments.files)
     if arguments.json:
-        print(json.dumps(_plain(reports), indent=1))
+        _print_json(reports)
     else:
         for report in reports:
             _print_check(report)
@@ -232,15 +257,15 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _print_check(report: Mapping[str, Any]) -> None:
-    print(report["file"])
+    _print(report["file"])
     if "error" in report:
-        print(f"  unusable: {report['error']}")
+        _print(f"  unusable: {report['error']}")
         return
     for key, value in report.items():
         if key not in ("file", "usable", "findings", "name"):
-            print(f"  {key}: {_short(value)}")
+            _print(f"  {key}: {_short(value)}")
     for finding in report["findings"]:
-        print(f"  {finding['level']}: {finding['what']} {finding['action']}")
+        _print(f"  {finding['level']}: {finding['what']} {finding['action']}")
     print("  usable" if report["usable"] else "  not usable for fitting")
 
 
@@ -265,9 +290,9 @@ def _build(arguments: argparse.Namespace) -> int:
         _say(note)
     facts = commands.model_facts(model)
     if arguments.json:
-        print(json.dumps({"model": str(arguments.output), **facts}, indent=1))
+        _print_json({"model": str(arguments.output), **facts})
     else:
-        print(
+        _print(
             f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
             f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of their variance, "
             f"gauge {facts['gauge']}"
@@ -280,10 +305,10 @@ def _info(arguments: argparse.Namespace) -> int:
 
     facts = commands.info(arguments.file)
     if arguments.json:
-        print(json.dumps(_plain(facts), indent=1))
+        _print_json(facts)
     else:
         for key, value in facts.items():
-            print(f"{key}: {_short(value)}")
+            _print(f"{key}: {_short(value)}")
     return 0
 
 
@@ -315,12 +340,12 @@ def _fit(arguments: argparse.Namespace) -> int:
     for record in records:
         counts[record["status"]] += 1
     if arguments.json:
-        print(json.dumps({"folder": str(arguments.output), "scans": len(records), **counts}))
+        _print_json({"folder": str(arguments.output), "scans": len(records), **counts})
     elif counts["failed"] < len(records):
         for record in records[:10]:
             _print_fit(record)
-        print(
-            f"{len(records)} scans: "
+        _print(
+            f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
             + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
             + f"; results in {arguments.output}"
         )
@@ -333,7 +358,7 @@ def _print_fit(record: Mapping[str, Any]) -> None:
     if record["status"] == "failed":
         return
     final = record["distances_mm"]["final"]
-    print(
+    _print(
         f"{record['scan']['name']}: {record['status']}; model to scan {final['model_to_scan']['mean']:.2f} mm mean, "
         f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
         f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
@@ -341,7 +366,20 @@ def _print_fit(record: Mapping[str, Any]) -> None:
 
 
 def _say(sentence: str) -> None:
-    print(sentence, file=sys.stderr)
+    print(_visible(sentence), file=sys.stderr)
+
+
+def _print(line: str) -> None:
+    print(_visible(line))
+
+
+def _print_json(facts: Any) -> None:
+    print(json.dumps(_plain(facts), indent=1, allow_nan=False))
+
+
+def _visible(line: str) -> str:
+    """Return `line` with control characters as escapes: a file's name may hold line breaks and terminal codes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
 
 
 def _short(value: Any) -> str:
@@ -364,7 +402,7 @@ def _plain(value: Any) -> Any:
         return _plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    return value if isinstance(value, (str, int, float, type(None))) else str(value)
 
 
 def _positive(text: str) -> int:

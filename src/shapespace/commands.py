@@ -21,7 +21,7 @@ from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.files import make_folder, write_bytes
+from shapespace.io.files import make_folder, read_error, write_bytes
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -39,13 +39,19 @@ def expand(paths: Sequence[Path]) -> list[Path]:
 
     Raises:
         InputError: a folder without meshes.
+        FileError: a folder that cannot be read.
     """
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir():
-            found.append(path)
-            continue
-        inside = sorted(p for p in path.iterdir() if p.suffix.lower() in MESH_FORMATS and not p.name.startswith("."))
+        try:
+            if not path.is_dir():
+                found.append(path)
+                continue
+            inside = sorted(
+                p for p in path.iterdir() if p.suffix.lower() in MESH_FORMATS and not p.name.startswith(".")
+            )
+        except OSError as error:
+            raise read_error(path, error) from error
         if not inside:
             raise InputError(f"{path} holds no meshes; shapespace reads {', '.join(MESH_FORMATS)}.")
         found += inside
@@ -174,6 +180,21 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
     }
 
 
+def _without_results(scans: Sequence[Path], folder: Path) -> list[Path]:
+    """Return `scans` without the fitted surfaces that an earlier run left in `folder`, where scans and results mix."""
+    ending = ".fitted.ply"
+    here = folder.resolve()
+
+    def is_result(scan: Path) -> bool:
+        record = scan.with_name(scan.name.removesuffix(ending) + ".fit.json")
+        return scan.name.endswith(ending) and scan.parent.resolve() == here and record.is_file()
+
+    left = [scan for scan in scans if not is_result(scan)]
+    if not left:
+        raise InputError(f"{folder} holds only results of earlier fits; give the scans, or another folder for results.")
+    return left
+
+
 def fit_scans(
     model_path: Path,
     scans: Sequence[Path],
@@ -193,7 +214,7 @@ def fit_scans(
         FileError: the model cannot be read, or the results not written.
         InputError: landmarks for more than one scan.
     """
-    files = expand(scans)
+    files = _without_results(expand(scans), folder)
     if landmarks is not None and len(files) > 1:
         raise InputError("--landmarks belongs to one scan, but several were given; fit them one at a time.")
     model = ShapeModel.load(model_path)
@@ -209,8 +230,11 @@ def fit_scans(
 
     def done(job: Any, record: Mapping[str, Any]) -> None:
         bar.update()
-        if record["status"] != "converged":
-            say(f"{job.scan}: {record['status']}: {record['reason']}")
+        if record["status"] == "converged":
+            return
+        bar.clear()
+        # The reason of a failure names the file already.
+        say(record["reason"] if record["status"] == "failed" else f"{job.scan}: {record['status']}: {record['reason']}")
 
     with bar:
         if workers <= 1:

@@ -22,6 +22,7 @@ from shapespace.model.shape_model import ShapeModel
 
 RECORD_FORMAT = "shapespace fit"
 RECORD_VERSION = 1
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
 
 
@@ -37,14 +38,15 @@ class Source:
         return {"name": self.name, "hash": self.content_hash}
 
 
-def fit_record(result: FitResult, scan: Source, model: Source) -> dict[str, Any]:
-    """Return what NAME.fit.json says of `result`."""
+def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source | None = None) -> dict[str, Any]:
+    """Return what NAME.fit.json says of `result`; `landmarks` is the file it started from, None if it used none."""
     T = result.T_scan_model
     return {
         "format": RECORD_FORMAT,
         "format_version": RECORD_VERSION,
         "scan": scan.as_dict(),
         "model": model.as_dict(),
+        "landmarks": landmarks.as_dict() if landmarks else None,
         "status": result.status,
         "reason": result.reason,
         "method": result.method,
@@ -110,7 +112,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     try:
         record = json.loads(read_bytes(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
         raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
@@ -182,7 +184,9 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
 def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
     # A spreadsheet would run a cell that starts like a formula; only names and reasons are text.
     return {
-        key: "'" + value if isinstance(value, str) and value[:1] in "=+@" and value else value
+        key: ("'" if value[:1] in _FORMULA else "") + value.encode("utf-8", "backslashreplace").decode("utf-8")
+        if isinstance(value, str) and value
+        else value
         for key, value in row.items()
     }
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from shapespace import __version__
 from shapespace.batch.results import (
     Source,
     coefficient_row,
@@ -23,10 +28,11 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
-from shapespace.errors import FileError, ShapespaceError
+from shapespace.errors import FileError, FitError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.result import Status
 from shapespace.fit.state import IcpState
-from shapespace.io.files import make_folder, sha256_of_file
+from shapespace.io.files import make_folder, sha256_of_file, write_error
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -34,6 +40,7 @@ from shapespace.types import FloatArray
 
 COEFFICIENTS = "coefficients.csv"
 _SAVE_EVERY_S = 5.0
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ def make_jobs(scans: Sequence[Path], landmarks: Path | None = None) -> list[Job]
     taken: dict[str, int] = {}
     jobs: list[Job] = []
     for scan in scans:
-        stem = scan.stem or scan.name
+        stem = _shortened(scan.stem or scan.name)
         count = taken[stem] = taken.get(stem, 0) + 1
         name = stem
         while count > 1 and (name := f"{stem}_{count}") in taken:
@@ -64,6 +71,12 @@ def make_jobs(scans: Sequence[Path], landmarks: Path | None = None) -> list[Job]
         taken.setdefault(name, 1)
         jobs.append(Job(name, scan, landmarks))
     return jobs
+
+
+def _shortened(stem: str) -> str:
+    # File names end at 255 bytes, and the results add theirs.
+    content = os.fsencode(stem)
+    return stem if len(content) <= _LONGEST_NAME else content[:_LONGEST_NAME].decode("utf-8", "ignore")
 
 
 def fit_file(
@@ -85,24 +98,42 @@ def fit_file(
     """
     model_source = Source(model_name, model.content_hash)
     scan_source = Source(job.scan.name, "")
+    marks_source: Source | None = None
     try:
         scan_source = Source(job.scan.name, sha256_of_file(job.scan))
         scan = read_mesh(job.scan)
-        landmarks: Mapping[str, FloatArray] | None = read_landmarks(job.landmarks) if job.landmarks else None
+        landmarks: Mapping[str, FloatArray] | None = None
+        if job.landmarks is not None:
+            marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
+            landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
         record = failed_record(
             scan_source, model_source, f"{job.scan}: not enough memory to fit it; thin the scan first.", asdict(config)
         )
     except ShapespaceError as error:
-        record = failed_record(scan_source, model_source, str(error), asdict(config))
+        record = failed_record(scan_source, model_source, _naming(job.scan, str(error)), asdict(config))
     else:
-        record = fit_record(result, scan_source, model_source)
+        record = fit_record(result, scan_source, model_source, marks_source)
         write_fitted_mesh(folder / f"{job.name}.fitted.ply", result, model)
         if stages:
             write_stages(folder / f"{job.name}.stages.npz", result, model)
+    if record["status"] == "failed":
+        # An earlier run's surface would contradict the record.
+        remove_file(folder / f"{job.name}.fitted.ply")
+    if record["status"] == "failed" or not stages:
+        remove_file(folder / f"{job.name}.stages.npz")
     write_record(folder / f"{job.name}.fit.json", record)
     return record
+
+
+def _naming(scan: Path, sentence: str) -> str:
+    """Return `sentence` with the scan's path in it."""
+    if str(scan) in sentence:
+        return sentence
+    if sentence.startswith(f"{scan.name}: "):
+        return f"{scan}{sentence.removeprefix(scan.name)}"
+    return f"{scan}: {sentence[:1].lower()}{sentence[1:]}"
 
 
 def fit_files(
@@ -154,7 +185,7 @@ def fit_files(
 
     open_jobs: list[Job] = []
     for job in jobs:
-        earlier = _earlier_record(job, model, folder, config) if resume else None
+        earlier = _earlier_record(job, model, folder, config, stages) if resume else None
         if earlier is None:
             open_jobs.append(job)
         else:
@@ -175,12 +206,33 @@ def _run_on(
     executor: Executor, jobs: Sequence[Job], model_name: str, folder: Path, config: FitConfig, stages: bool
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
     with ExitStack() as stack:
-        futures = {
-            executor.submit(_fit_with_loaded_model, job, model_name, folder, config, stages): job for job in jobs
-        }
+        with _interrupts_ignored():
+            futures = {
+                executor.submit(_fit_with_loaded_model, job, model_name, folder, config, stages): job for job in jobs
+            }
         stack.callback(lambda: [future.cancel() for future in futures])
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            try:
+                record = future.result()
+            except BrokenExecutor as error:
+                raise FitError(
+                    "A worker was stopped from outside, most likely for lack of memory; "
+                    "run again with --resume and fewer --jobs."
+                ) from error
+            yield futures[future], record
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Generator[None]:
+    """Let worker processes that start in this block inherit deafness to Ctrl-C: stopping them is the parent's job."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 _model: ShapeModel | None = None
@@ -221,17 +273,38 @@ def make_executor(model: Path, workers: int, kind: str = "processes") -> Executo
     return EXECUTORS[kind](model, workers)
 
 
-def _earlier_record(job: Job, model: ShapeModel, folder: Path, config: FitConfig) -> dict[str, Any] | None:
+def remove_file(path: Path) -> None:
+    """Remove `path` if it is there.
+
+    Raises:
+        FileError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def _earlier_record(
+    job: Job, model: ShapeModel, folder: Path, config: FitConfig, stages: bool
+) -> dict[str, Any] | None:
     """Return the record of an earlier run if it is good for the same scan, model and settings."""
     path = folder / f"{job.name}.fit.json"
-    if not path.is_file() or not (folder / f"{job.name}.fitted.ply").is_file():
+    needed = [path, folder / f"{job.name}.fitted.ply", *([folder / f"{job.name}.stages.npz"] if stages else [])]
+    if not all(file.is_file() for file in needed):
         return None
     try:
         record = read_record(path)
         same_scan = record["scan"]["hash"] == sha256_of_file(job.scan)
         same_model = record["model"]["hash"] == model.content_hash
         settings: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+        settings["version"] = __version__
         same_settings = all(record["config"].get(key) == value for key, value in settings.items())
+        marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
+        same_marks = bool(record["landmarks"] == marks)
+        whole = bool(len(record["b"]) == model.n_modes and record["status"] in get_args(Status))
+        coefficient_row(job.name, record)
     except (ShapespaceError, KeyError, TypeError, AttributeError):
         return None
-    return record if same_scan and same_model and same_settings and record["status"] != "failed" else None
+    good = same_scan and same_model and same_settings and same_marks and whole
+    return record if good and record["status"] != "failed" else None
