@@ -7,10 +7,12 @@ is written as plain files, and the report reads nothing but those.
 from __future__ import annotations
 
 import json
+import os
 import platform
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -22,7 +24,7 @@ from tqdm import tqdm
 
 from shapespace import __version__
 from shapespace.batch.results import read_record
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.run import fit_files, make_executor, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
@@ -233,6 +235,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         _case(
             folder, home, bundled, "bundled", simulated, scale, clock,
             title="Simulated scan of a person outside the training set",
+                short="simulated scan",
             note="Simulated, not a real scan: hair, a collar, three holes, 0.5 % outliers and 0.3 mm noise.",
             labelled_simulated=True,
         )
@@ -255,6 +258,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
                 _case(
                     folder, home, model, "ict", james, scale, clock,
                     title="James, a real 3dMD scan, with a model of ICT-FaceKit people",
+                short="James, ICT model",
                     note="A real scan with hair and collar; the model is made of statistics of real people.",
                     labelled_simulated=False,
                 )
@@ -264,6 +268,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
             _case(
                 folder, home, main_modes, "bundled_main", james, scale, clock,
                 title="James, a real 3dMD scan, with the bundled model",
+                short="James, bundled model",
                 note="A real scan with hair and collar; the model knows only simulated people, shows ears that his "
                 "hair covers, and is held to the modes with 90 % of its variance.",
                 labelled_simulated=False,
@@ -283,6 +288,7 @@ def _case(
     *,
     title: str,
     note: str,
+    short: str,
     labelled_simulated: bool,
 ) -> dict[str, Any]:
     """Fit one scan of experiment 2 and return its entry."""
@@ -294,6 +300,7 @@ def _case(
     fits = _fit_all(folder, home, model, {name: scan}, {name: ("neutral", 0.0)}, scale, clock, f"{model_name}_model.h5")
     return {
         "title": title,
+        "short": short,
         "simulated": labelled_simulated,
         "note": note,
         "model": model_file,
@@ -326,16 +333,19 @@ def _fit_all(
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
 
-    records = fit_files(
-        make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
-        model,
-        model_name,
-        make_folder(home / "fits"),
-        config,
-        stages=True,
-        on_done=lambda job, _: clock.step(f"fitted {job.name}"),
-        on_state=show,
-    )
+    with ExitStack() as stack:
+        workers = min(os.cpu_count() or 1, len(scans))
+        records = fit_files(
+            make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
+            model,
+            model_name,
+            make_folder(home / "fits"),
+            config,
+            executor=stack.enter_context(make_executor(home / model_name, workers)) if workers > 1 else None,
+            stages=True,
+            on_done=lambda job, _: clock.step(f"fitted {job.name}"),
+            on_state=show,
+        )
     entries: list[dict[str, Any]] = []
     for (name, scan), record in zip(scans.items(), records, strict=True):
         base = f"{home.name}/fits/{name}"

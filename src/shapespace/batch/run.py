@@ -16,6 +16,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, get_args
 
+from threadpoolctl import threadpool_limits
+
 from shapespace import __version__
 from shapespace.batch.results import (
     Source,
@@ -244,6 +246,12 @@ def _load_model(path: Path) -> None:
     _model = ShapeModel.load(path)
 
 
+def _start_process(path: Path) -> None:
+    """Load the model, and keep BLAS to one thread: the processes fill the cores already."""
+    threadpool_limits(1)
+    _load_model(path)
+
+
 def _fit_with_loaded_model(job: Job, model_name: str, folder: Path, config: FitConfig, stages: bool) -> dict[str, Any]:
     if _model is None:
         raise FileError("The worker has no model; start it with make_executor.")
@@ -251,7 +259,7 @@ def _fit_with_loaded_model(job: Job, model_name: str, folder: Path, config: FitC
 
 
 def _processes(model: Path, workers: int) -> Executor:
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_load_model, initargs=(model,))
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_process, initargs=(model,))
 
 
 def _threads(model: Path, workers: int) -> Executor:
