@@ -22,14 +22,14 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
-from shapespace.report.render import CLAY, Camera, Colour, Image, Layer, render, render_layers
+from shapespace.report.render import CLAY, Camera, Colour, Image, Layer, render, render_layers, render_maps
 from shapespace.types import FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SCAN_COLOUR: Colour = (0.90, 0.56, 0.20)
-MODEL_COLOUR: Colour = (0.31, 0.53, 0.74)
+SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)
+MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)
 STAGE_TITLES: Mapping[str, str] = {
     "before": "before",
     "initial": "after phase 1 (pose)",
@@ -98,7 +98,7 @@ def faces_grid(
     *,
     title: str,
     columns: int = 4,
-    size: tuple[int, int] = (290, 320),
+    size: tuple[int, int] = (280, 360),
     colour: Colour = CLAY,
 ) -> Figure:
     """Draw `meshes` in one light and at one scale, each under its label (figures 1 and 8)."""
@@ -121,7 +121,7 @@ def modes_figure(
         title: heading.
         deviations: how many standard deviations to each side.
     """
-    size = (280, 300)
+    size = (270, 345)
     moved = np.concatenate([mean + sign * deviations * mode for mode in modes for sign in (-1, 1)])
     camera = Camera.framing(moved, aspect=size[0] / size[1], margin=0.03)
     length = deviations * np.linalg.norm(modes, axis=2)
@@ -175,7 +175,7 @@ def spectrum_figure(
 
 def overlay_figure(fit: StagedFit, *, title: str) -> Figure:
     """Draw scan and model over each other at the three moments, from two sides (figures 4 to 7)."""
-    size = (390, 430)
+    size = (370, 460)
     rows = [
         [
             render_layers(
@@ -201,7 +201,7 @@ def overlay_figure(fit: StagedFit, *, title: str) -> Figure:
 
 def portrait_figure(fits: Sequence[StagedFit], labels: Sequence[str], *, title: str, yaw_deg: float = 25.0) -> Figure:
     """Draw for each fit: the scan, the model fitted to it, both together, and how far the model lies from the scan."""
-    size = (290, 330)
+    size = (285, 360)
     finals = np.concatenate([fit.model_to_scan_mm["final"] for fit in fits])
     top = _nice_ceiling(float(np.percentile(finals, 98)))
     table = _table("viridis")
@@ -230,7 +230,7 @@ def portrait_figure(fits: Sequence[StagedFit], labels: Sequence[str], *, title: 
 
 def aligned_grid(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> Figure:
     """Draw scan and fitted model over each other for many fits."""
-    size = (290, 320)
+    size = (280, 360)
     images = [
         render_layers(
             [Layer(fit.scan, SCAN_COLOUR), Layer(fit.surfaces["final"], MODEL_COLOUR)],
@@ -398,21 +398,22 @@ def b_space(
 
 def threshold_figure(fits: Sequence[StagedFit], *, title: str) -> Figure:
     """Draw where the model lies within 2, 4, 6, 8 and 10 mm of the scan (figure 11), a row a fit."""
-    size = (232, 262)
+    size = (218, 280)
     table = np.array([[0.16, 0.50, 0.73], [0.93, 0.55, 0.18]])
     rows: list[list[Image]] = []
     titles: list[list[str]] = []
     for fit in fits:
         far, camera = fit.model_to_scan_mm["final"], fit.camera(aspect=size[0] / size[1])
         rows.append(
-            [
-                render(
-                    fit.surfaces["final"], camera=camera, size=size, scalars=far - limit, colormap=table, vmin=-1e-3,
-                    vmax=1e-3,
-                )
-                for limit in THRESHOLDS_MM
-            ]
-        )  # fmt: skip
+            render_maps(
+                fit.surfaces["final"],
+                far,
+                [(limit - 1e-3, limit + 1e-3) for limit in THRESHOLDS_MM],
+                colormap=table,
+                camera=camera,
+                size=size,
+            )
+        )
         titles.append([f"≤ {limit:g} mm: {_percent(float((far <= limit).mean()))}" for limit in THRESHOLDS_MM])
     return _grid(
         rows,
@@ -425,7 +426,7 @@ def threshold_figure(fits: Sequence[StagedFit], *, title: str) -> Figure:
 
 def distance_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> Figure:
     """Draw the distance from the fitted model to the scan as bands at 2, 4, 6, 8 and 10 mm, all fits at one scale."""
-    size = (290, 320)
+    size = (280, 360)
     table = _bands()
     images = [
         render(
@@ -449,7 +450,7 @@ def distance_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) ->
 
 def detail_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> Figure:
     """Draw the same distances on one continuous scale that ends at the 99th percentile of all fits."""
-    size = (290, 320)
+    size = (280, 360)
     top = _nice_ceiling(float(np.percentile(np.concatenate([f.model_to_scan_mm["final"] for f in fits]), 99)))
     table = _table("viridis")
     images = [

@@ -1,442 +1,761 @@
-"""One self-contained HTML report from the saved results of a demo; it runs no algorithm of its own."""
+"""One self-contained HTML file from the results that the demo saved.
+
+Every section is made on its own: one that cannot be made says why, and the others stand.
+"""
 
 from __future__ import annotations
 
 import base64
-import html
-import json
+import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
+from html import escape
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.io.files import read_bytes, write_text
-from shapespace.io.meshes import read_mesh
-from shapespace.types import Mesh, Similarity
+from shapespace.io.files import write_text
+from shapespace.report.saved import Folder, SavedFit, read_fit, surfaces_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from shapespace.report.figures import Coefficients, StagedFit
 
-_STAGES = ("before", "initial", "final")
-_TRUSTED = ("converged", "max_iterations")
+LARGEST_REPORT_BYTES = 8_000_000
+"""A report stays below this size, so that it can be mailed."""
+
+_STATUS_WORDS = {
+    "converged": "converged",
+    "max_iterations": "stopped at the limit",
+    "doubtful": "doubtful",
+    "failed": "failed",
+}
+_SCORE_WORDS = {
+    "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
+    "line_r2_free": "R² of the best line that need not pass through neutral",
+    "line_sign_consistency": "Share of faces on the same side of neutral",
+    "line_spearman": "Rank correlation of position on the line with intensity",
+    "line_permutation_p": "Its permutation p-value",
+    "disjointness": "All expressions",
+    "leave_one_out_accuracy": "Leave-one-out accuracy of the nearest mean direction",
+    "chance": "Accuracy of guessing",
+    "cosine_silhouette": "Silhouette of the directions (−1 to 1)",
+    "separability": "Between-class over within-class scatter",
+    "accuracy_p": "Permutation p-value of the accuracy",
+    "silhouette_p": "Permutation p-value of the silhouette",
+    "left_out": "Faces left out because their fit is not trusted",
+}
+
+
+def require_report_extra() -> None:
+    """Raise unless the packages that draw are installed.
+
+    Raises:
+        ShapespaceError: they are not; the sentence says how to install them.
+    """
+    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    if missing:
+        raise ShapespaceError(
+            f"The report needs {' and '.join(missing)}, which is not installed; run pip install 'shapespace[report]'."
+        )
 
 
 def write_report(folder: Path) -> Path:
-    """Write `folder/report.html` from the results that `shapespace demo` saved in `folder`, and return its path.
+    """Write `folder`/report.html from the results saved in `folder`, and return its path.
+
+    It reads demo.json and the files that it names, and runs no fit. The page needs no network and no script.
 
     Raises:
-        FileError: results are missing, or the report cannot be written.
-        FileFormatError: `demo.json` is damaged.
+        FileError: demo.json cannot be read, or the report cannot be written.
+        FileFormatError: demo.json is damaged.
         ShapespaceError: the extra `report` is not installed.
     """
-    if find_spec("matplotlib") is None:
-        raise ShapespaceError("The report needs matplotlib; install it with: pip install 'shapespace[report]'.")
-    try:
-        demo = cast(dict[str, Any], json.loads(read_bytes(folder / "demo.json")))
-    except ValueError as error:
-        raise FileFormatError(f"{folder / 'demo.json'} is damaged; run shapespace demo again.") from error
-    page = _Page(folder)
-    page.section("Summary", lambda: _summary(page, demo))
-    page.section("Experiment 1: expressions of one person", lambda: _experiment_1(page, demo["experiment1"]))
-    page.section("Experiment 2: many people, and a scan of somebody else", lambda: _experiment_2(page, demo))
-    page.section("Settings, versions and hashes", lambda: _settings(page, demo))
-    path = folder / "report.html"
-    write_text(path, page.html(f"shapespace {demo.get('version', '')}: the paper, measured"))
+    require_report_extra()
+    results = Folder(Path(folder))
+    page = _Page(results, results.json("demo.json")).html()
+    path = Path(folder) / "report.html"
+    write_text(path, page)
     return path
 
 
 class _Page:
-    """Collects sections; one that fails says why and leaves the others alone."""
+    """The page in the making: what was read once and is shown in several sections."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Folder, demo: Mapping[str, Any]) -> None:
         self.folder = folder
-        self._parts: list[str] = []
-        self._titles: list[str] = []
-        self._cache: dict[str, StagedFit] = {}
+        self.demo = demo
+        self.quick = bool(demo.get("quick"))
+        self._fits: dict[str, SavedFit] = {}
+        self._staged: dict[str, StagedFit] = {}
 
-    def section(self, title: str, fill: Callable[[], None]) -> None:
-        self._titles.append(title)
-        self._parts.append(f'<section id="s{len(self._titles)}"><h2>{_text(title)}</h2>')
-        self.attempt("This section", fill)
-        self._parts.append("</section>")
-
-    def attempt(self, what: str, fill: Callable[[], None]) -> None:
-        mark = len(self._parts)
-        try:
-            fill()
-        except (ShapespaceError, OSError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
-            del self._parts[mark:]
-            reason = f"{type(error).__name__}: {error}" if isinstance(error, (KeyError, TypeError)) else str(error)
-            self._parts.append(f'<p class="failed">{_text(what)} could not be drawn: {_text(reason)}</p>')
-
-    def heading(self, title: str) -> None:
-        self._parts.append(f"<h3>{_text(title)}</h3>")
-
-    def paragraph(self, text: str, kind: str = "") -> None:
-        self._parts.append(f'<p class="{kind}">{_text(text)}</p>' if kind else f"<p>{_text(text)}</p>")
-
-    def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str) -> None:
-        head = "".join(f'<th scope="col">{_text(column)}</th>' for column in columns)
-        body = "".join(
-            "<tr>"
-            + "".join(
-                f'<td data-label="{_text(column)}">{_text(cell)}</td>'
-                for column, cell in zip(columns, row, strict=True)
-            )
-            + "</tr>"
-            for row in rows
-        )
-        self._parts.append(
-            f'<div class="wide"><table><caption>{_text(caption)}</caption><thead><tr>{head}</tr></thead>'
-            f"<tbody>{body}</tbody></table></div>"
-        )
-
-    def figure(self, what: str, draw: Callable[[], Figure], *, chart: bool = False) -> None:
-        """Draw one figure; `what` is its alternative text and its caption."""
-        from shapespace.report.figures import encode_webp
-
-        def fill() -> None:
-            data, (width, height) = encode_webp(draw(), lossless=chart)
-            image = base64.b64encode(data).decode()
-            self._parts.append(
-                f'<figure class="{"chart" if chart else "stills"}"><img loading="lazy" width="{width}" '
-                f'height="{height}" alt="{_text(what)}" src="data:image/webp;base64,{image}">'
-                f"<figcaption>{_text(what)}</figcaption></figure>"
-            )
-
-        self.attempt(what, fill)
-
-    def html(self, title: str) -> str:
-        style = resources.files("shapespace.report").joinpath("assets/report.css").read_text(encoding="utf-8")
-        links = "".join(f'<li><a href="#s{i}">{_text(section)}</a></li>' for i, section in enumerate(self._titles, 1))
+    def html(self) -> str:
+        title = "Low-dimensional surface parameterisation: the paper, run again"
+        css = files("shapespace.report").joinpath("assets/report.css").read_text(encoding="utf-8")
+        made = f"shapespace {self.demo.get('version', '')}, {self.demo.get('created', '')}"
+        quick = " This was the quick demo: coarser scans and an earlier stop." if self.quick else ""
+        sections = [
+            self.guarded("Summary", self.summary),
+            self.guarded("Experiment 1", self.experiment_1),
+            self.guarded("Experiment 2", self.experiment_2),
+            self.guarded("Settings, versions and hashes", self.settings),
+        ]
         return (
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            '<meta name="color-scheme" content="light dark">'
-            f"<title>{_text(title)}</title><style>{style}</style></head><body>"
-            f"<header><h1>{_text(title)}</h1><nav><ol>{links}</ol></nav></header>"
-            f"<main>{''.join(self._parts)}</main></body></html>\n"
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            '<link rel="icon" href="data:,">\n'
+            f"<title>{_esc(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<header>\n<h1>{_esc(title)}</h1>\n"
+            "<p>Raw surfaces are fitted by a statistical shape model with the modified ICP of Quan, Matuszewski, Shark "
+            "and Ait-Boudaoud. All distances are in millimetres.</p>\n"
+            f'<p class="soft">{_esc(made)}.{_esc(quick)}</p>\n'
+            '<nav aria-label="Sections"><a href="#summary">Summary</a><a href="#experiment-1">Experiment 1</a>'
+            '<a href="#experiment-2">Experiment 2</a><a href="#settings-versions-and-hashes">Settings</a></nav>\n'
+            "</header>\n<main>\n" + "\n".join(sections) + "\n</main>\n"
+            f"<footer>Made by {_esc(made)} from the files in its own folder.</footer>\n</body>\n</html>\n"
         )
 
-    def fit(self, entry: Mapping[str, Any]) -> StagedFit:
-        """Return a saved fit with scan and model in the model's frame, mm."""
-        from shapespace.report.figures import StagedFit
-
-        name = str(entry["name"])
-        if name not in self._cache:
-            record = _read_json(self.folder / entry["json"])
-            mm = float(record["mm_per_scan_unit"])
-            T = record["T_scan_model"]
-            T_scan_model = Similarity(mm * T["scale"], np.array(T["rotation"]), mm * np.array(T["translation"]))
-            T_model_scan = T_scan_model.inverse()
-            scan = read_mesh(self.folder / entry["scan"])
-            with np.load(self.folder / entry["stages"], allow_pickle=False) as stages:
-                arrays = {key: stages[key] for key in stages.files}
-            self._cache[name] = StagedFit(
-                name=name,
-                scan=Mesh(T_model_scan.apply(mm * scan.vertices), scan.faces, name=name),
-                surfaces={
-                    stage: Mesh(T_model_scan.apply(arrays[stage]), arrays.get("faces"), name=stage) for stage in _STAGES
-                },
-                model_to_scan_mm={s: arrays[f"model_to_scan_{s}"].astype(np.float64) for s in _STAGES},
-                scan_to_model_mm={s: arrays[f"scan_to_model_{s}"].astype(np.float64) for s in _STAGES},
+    def guarded(self, heading: str, make: Callable[[], str], level: int = 2) -> str:
+        """Return a section, or its heading and why it could not be made."""
+        anchor = heading.lower().replace(",", "").replace(" ", "-")
+        mark = f' id="{_esc(anchor)}"' if level == 2 else ""
+        top = f"<h{level}{mark}>{_esc(heading)}</h{level}>\n"
+        try:
+            body = make()
+        except ShapespaceError as error:
+            body = f'<p class="broken">This part could not be made. {_esc(str(error))}</p>'
+        except Exception as error:
+            # Result files can be wrong in more ways than can be listed, and one of them must not cost the rest.
+            what = f"{type(error).__name__}: {error}"
+            body = (
+                '<p class="broken">This part could not be made, because a result file does not have the expected form '
+                f"({_esc(what)}); run the demo again.</p>"
             )
-        return self._cache[name]
+        return f"<section>\n{top}{body}\n</section>"
 
+    def fit(self, entry: Mapping[str, Any]) -> SavedFit:
+        key = str(entry.get("json"))
+        if key not in self._fits:
+            self._fits[key] = read_fit(self.folder, entry)
+        return self._fits[key]
 
-def _summary(page: _Page, demo: Mapping[str, Any]) -> None:
-    fits = [*demo["experiment1"]["fits"], *(case["fit"] for case in demo["experiment2"]["cases"])]
-    counts = {status: sum(fit["status"] == status for fit in fits) for status in {fit["status"] for fit in fits}}
-    trusted = sum(counts.get(status, 0) for status in _TRUSTED)
-    page.paragraph(
-        f"{len(fits)} raw surfaces were fitted by the paper's modified ICP: {trusted} can be trusted, "
-        f"{counts.get('doubtful', 0)} are doubtful and {counts.get('failed', 0)} failed. "
-        f"{'Quick run. ' if demo.get('quick') else ''}The whole took {demo['seconds']['total']:.0f} s "
-        f"({demo['machine']}).",
-        "lead",
-    )
-    for fit in fits:
-        if fit["status"] not in _TRUSTED:
-            page.paragraph(f"{_nice(fit['name'])}: {fit['reason']}", "doubt")
-    shown = [case["fit"] for case in demo["experiment2"]["cases"] if case["fit"]["stages"]]
-    labels = [case["title"] for case in demo["experiment2"]["cases"] if case["fit"]["stages"]]
-    from shapespace.report.figures import portrait_figure
+    def staged(self, fit: SavedFit, label: str) -> StagedFit:
+        from shapespace.report.figures import STAGE_TITLES, StagedFit
 
-    page.figure(
-        "Scan, fitted model, both together, and how far the model lies from the scan: experiment 2",
-        lambda: portrait_figure([page.fit(fit) for fit in shown], labels, title="A scan becomes a few numbers"),
-    )
-    page.table(
-        ("quantity", "the paper states", "this run measured", "against the truth", "why it differs"),
-        [
-            (row["quantity"], row["paper"], row["measured"], row["truth"] or "not known", row["why"] or "it does not")
-            for row in demo["paper_table"]
-        ],
-        "What the paper states beside what this run measured. The floor is the best the model could do with true "
-        "correspondences.",
-    )
+        key = str(fit.entry.get("stages"))
+        if key not in self._staged:
+            self._staged[key] = StagedFit(label, *surfaces_of(self.folder, fit, list(STAGE_TITLES)))
+        return self._staged[key]
 
+    def readable(self, entries: Sequence[Mapping[str, Any]]) -> tuple[list[SavedFit], list[str]]:
+        """Return the fits whose records can be read, and one sentence for each that cannot."""
+        found: list[SavedFit] = []
+        problems: list[str] = []
+        for entry in entries:
+            try:
+                found.append(self.fit(entry))
+            except ShapespaceError as error:
+                problems.append(str(error))
+        return found, problems
 
-def _experiment_1(page: _Page, first: Mapping[str, Any]) -> None:
-    from shapespace.report import figures
+    def pictured(self, fits: Sequence[SavedFit]) -> tuple[list[tuple[SavedFit, StagedFit]], str]:
+        """Return the fits whose surfaces can be shown, and HTML that names the others."""
+        shown: list[tuple[SavedFit, StagedFit]] = []
+        absent: list[str] = []
+        for fit in fits:
+            if not fit.pictured:
+                absent.append(f"{fit.name}: {fit.record.get('reason', 'no surface was kept')}")
+                continue
+            try:
+                shown.append((fit, self.staged(fit, fit.label)))
+            except ShapespaceError as error:
+                absent.append(f"{fit.name}: {error}")
+        return shown, _problems("Not in the pictures", absent)
 
-    fits = [fit for fit in first["fits"] if fit["stages"]]
-    tests = [fit for fit in fits if fit["expression"] != "neutral"]
-    page.paragraph(
-        f"{first['n_training']} simulated faces of one person with mixed expressions make the model; "
-        f"{first['modes_for_98_5']} modes hold 98.5 % of their variance. {len(tests)} unseen faces of four "
-        "expressions at four levels are fitted as raw surfaces: other triangles, moved, turned, scaled, with noise."
-    )
-    page.heading("The shape space")
-    page.figure(
-        "Figure 1: some of the training faces",
-        lambda: figures.faces_grid(
-            [read_mesh(page.folder / example["file"]) for example in first["training_examples"]],
-            [example["label"] for example in first["training_examples"]],
-            title="Training faces",
-            columns=6,
-        ),
-    )
-    _model_figures(page, first, "Figures 2 and 3: the mean face and the first modes")
-    page.heading("Fits")
-    page.figure(
-        "Figure 8: the test faces as the fit sees them, raw surfaces on other triangles",
-        lambda: figures.faces_grid(
-            [page.fit(fit).scan for fit in tests], [_nice(fit["name"]) for fit in tests], title="Test faces"
-        ),
-    )
-    strongest = max(tests, key=lambda fit: fit["intensity"])
-    _one_fit(page, strongest, first.get("population_z"))
-    page.figure(
-        "Fitted model over scan, all test faces",
-        lambda: figures.aligned_grid([page.fit(fit) for fit in tests], title="Model over scan"),
-    )
-    page.figure(
-        "How far the fitted models lie from the scans, all test faces at one scale",
-        lambda: figures.detail_maps([page.fit(fit) for fit in tests], title="Distance from model to scan"),
-    )
-    page.table(
-        (
-            "scan",
-            "status",
-            "model to scan, mean",
-            "model to scan, largest",
-            "scan to model, mean",
-            "true vertex error, mean",
-            "floor",
-        ),
-        [_fit_row(page, fit) for fit in first["fits"]],
-        "All fits, in mm of the model's frame.",
-    )
-    page.heading("Expressions as lines")
-    page.paragraph(
-        "Samples of one expression at rising intensity should lie on a line through neutral, and different "
-        "expressions on different lines (figures 9 and 10)."
-    )
-    points = [_coefficients(page, fit) for fit in fits]
-    neutral = next((point for point in points if point.expression == "neutral"), None)
-    for caption, draw in (
-        ("Figure 9: b1 against b2, larger marks for stronger expressions", figures.b_plane),
-        ("Figure 10: b1, b2 and b3 from two sides", figures.b_space),
-    ):
-        page.figure(
-            caption,
-            lambda draw=draw, caption=caption: draw(
-                points,
-                title=caption.partition(": ")[2],
-                neutral_b=neutral.b if neutral else None,
-                neutral_z=neutral.z if neutral else None,
-            ),
-            chart=True,
+    def entries(self) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
+        """Return the entries of the fits of both experiments."""
+        first = list((self.demo.get("experiment1") or {}).get("fits") or [])
+        cases = (self.demo.get("experiment2") or {}).get("cases") or []
+        return first, [case["fit"] for case in cases if case.get("fit")]
+
+    def summary(self) -> str:
+        return "\n".join(
+            [self.tiles(), self.guarded("Main figure", self.main_figure, 3), self.guarded(
+                "The paper beside this run", self.paper_table, 3
+            )]
+        )  # fmt: skip
+
+    def tiles(self) -> str:
+        first, second = self.entries()
+        fits, problems = self.readable([*first, *second])
+        counts = Counter(fit.status for fit in fits)
+        trusted = counts["converged"]
+        first_fits = fits[: len(first)]
+        tests = [fit for fit in first_fits if fit.entry.get("intensity") and fit.status != "failed"]
+        errors = [_inner(fit.entry, "vertex_error_mm", "mean") for fit in tests]
+        floors = [_inner(fit.entry, "floor_mm", "mean") for fit in tests]
+        distances = [fit.summary_mm("final", "model_to_scan", "mean") for fit in tests]
+        rest = ", ".join(
+            f"{counts[key]} {word}" for key, word in _STATUS_WORDS.items() if counts[key] and key != "converged"
         )
-    _score_tables(page, first["scores"])
-    _coefficient_table(page, first["fits"])
-
-
-def _experiment_2(page: _Page, demo: Mapping[str, Any]) -> None:
-    drawn: set[str] = set()
-    for case in demo["experiment2"]["cases"]:
-        page.heading(case["title"])
-        page.paragraph(case["note"], "simulated" if case["simulated"] else "")
-        page.paragraph(
-            f"The model is made of {case['n_training']} people and keeps {case['n_modes']} modes; "
-            f"{case['modes_for_98_5']} hold 98.5 % of the variance."
+        tiles = [
+            (f"{trusted} <small>of {len(first) + len(second)}</small>", "fits can be trusted: they converged and nothing speaks against them"),
+            (_esc(str((self.demo.get("experiment1") or {}).get("modes_for_98_5", "–"))), "modes hold 98.5 % of the variance of one person's expressions"),
+            (_mm_html(_mean(distances)), "mean closest distance of the test faces, model to scan"),
+            (_mm_html(_mean(errors)), f"their true vertex error; no fit in this model can be below {_mm(_mean(floors))}"),
+        ]  # fmt: skip
+        blocks = "".join(f"<div><dd>{value}</dd><dt>{_esc(text)}</dt></div>" for value, text in tiles)
+        told = (
+            f"{len(first)} simulated scans of one person's expressions and {len(second)} "
+            f"{'scan' if len(second) == 1 else 'scans'} of other people were fitted."
         )
-        if case["model"] not in drawn:
-            drawn.add(case["model"])
-            _model_figures(page, case, f"Mean and first modes, {case['title']}")
-        fit = case["fit"]
-        page.paragraph(f"Status: {fit['status']}. {fit['reason']}", "" if fit["status"] in _TRUSTED else "doubt")
-        if fit["stages"]:
-            _one_fit(page, fit, None)
+        told += f" Besides those that converged: {rest}." if rest else ""
+        doubts = [
+            f"{fit.name}: {_STATUS_WORDS.get(fit.status, fit.status)}. {fit.record.get('reason', '')}"
+            for fit in fits
+            if fit.status != "converged"
+        ]
+        return (
+            f'<p>{_esc(told)}</p>\n<dl class="tiles">{blocks}</dl>\n'
+            + _problems("Not to be trusted without a look", doubts)
+            + _problems("Cannot be read", problems)
+        )
 
+    def main_figure(self) -> str:
+        from shapespace.report import figures
 
-def _model_figures(page: _Page, about: Mapping[str, Any], caption: str) -> None:
-    from shapespace.report import figures
+        first, _ = self.entries()
+        fits, _ = self.readable(first)
+        chosen: list[tuple[StagedFit, str]] = []
+        usable = [fit for fit in fits if fit.pictured and fit.entry.get("intensity")]
+        usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
+        if usable:
+            middle = usable[len(usable) // 2]
+            chosen.append((self.staged(middle, middle.label), f"{middle.label} (simulated)"))
+        unread: list[str] = []
+        for case in (self.demo.get("experiment2") or {}).get("cases") or []:
+            try:
+                fit = self.fit(case["fit"])
+                if fit.pictured:
+                    chosen.append((self.staged(fit, fit.name), _short(case)))
+            except ShapespaceError as error:
+                unread.append(str(error))
+        if not chosen:
+            raise FileFormatError("No fit kept a surface to show; run the demo again.")
+        figure = figures.portrait_figure(
+            [fit for fit, _ in chosen], [label for _, label in chosen], title="Raw scans and the models fitted to them"
+        )
+        return _figure(
+            figure,
+            "Rows: the test expression with the median distance, then each scan of experiment 2. The last column maps "
+            "the distance of each model vertex to the scan, all rows on one scale.",
+            alt="Scan, fitted model, both overlaid, and a distance map, for " + "; ".join(label for _, label in chosen),
+        ) + _problems("Not in the picture", unread)
 
-    def modes() -> Figure:
-        with np.load(page.folder / about["mode_shapes"], allow_pickle=False) as arrays:
-            return figures.modes_figure(
-                arrays["mean"].astype(np.float64),
-                arrays["faces"],
-                arrays["basis5"].astype(np.float64),
-                title="The mean and what the first modes do",
+    def paper_table(self) -> str:
+        rows = self.demo.get("paper_table") or []
+        if not rows:
+            raise FileFormatError("demo.json holds no comparison with the paper; run the demo again.")
+        heads = ("Quantity", "Paper", "This run", "True error", "Why it differs")
+        body = ""
+        for row in rows:
+            cells = [
+                row.get("paper"),
+                row.get("measured"),
+                row.get("truth") or "–",
+                row.get("why") or "It does not.",
+            ]
+            body += f'<tr><th scope="row">{_esc(row.get("quantity"))}</th>' + "".join(
+                f'<td data-label="{_esc(head)}">{_esc(cell)}</td>' for head, cell in zip(heads[1:], cells, strict=True)
+            ) + "</tr>\n"  # fmt: skip
+        head = "".join(f'<th scope="col">{_esc(text)}</th>' for text in heads)
+        return (
+            '<div class="table"><table class="stack"><caption>Distances are to the closest point of the scan; the true '
+            "error is between vertices that correspond, beside the floor that a perfect fit of the same model would "
+            f"reach.</caption><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>"
+        )
+
+    def experiment_1(self) -> str:
+        experiment = self.demo["experiment1"]
+        intro = (
+            f"{experiment.get('title', 'Expressions of one person')}: {experiment.get('n_training', '?')} faces of one "
+            f"simulated person make the model, {experiment.get('modes_for_98_5', '?')} modes hold 98.5 % of their "
+            "variance, and unseen expressions are fitted as raw surfaces: triangulated anew, moved, turned, scaled, "
+            "with 0.2 mm noise."
+        )
+        fits, problems = self.readable(experiment.get("fits") or [])
+        parts = [
+            ("The training faces", lambda: self.training(experiment)),
+            ("Mean and first modes", lambda: self.modes(experiment)),
+            ("The test faces", lambda: self.test_faces(fits)),
+            ("Alignment, before and after", lambda: self.alignment(self.farthest(fits))),
+            ("All test faces, fitted", lambda: self.all_fitted(fits)),
+            ("Expressions as directions", lambda: self.b_plots(experiment, fits)),
+            ("Distance maps", lambda: self.maps(fits)),
+            ("Convergence and coefficients", lambda: self.convergence(self.farthest(fits)[:1], experiment)),
+            ("Every fit in numbers", lambda: _fit_table(fits)),
+        ]
+        return (
+            f"<p>{_esc(intro)}</p>\n"
+            + _problems("Cannot be read", problems)
+            + "\n".join(self.guarded(heading, make, 3) for heading, make in parts)
+        )
+
+    def training(self, experiment: Mapping[str, Any]) -> str:
+        from shapespace.report import figures
+
+        examples = list(experiment.get("training_examples") or [])[: 8 if self.quick else 12]
+        meshes = [self.folder.mesh(example.get("file")) for example in examples]
+        figure = figures.faces_grid(
+            meshes,
+            [str(example.get("label", "")) for example in examples],
+            title="Training faces: one person, mixed expressions",
+        )
+        count = experiment.get("n_training", "?")
+        return _figure(
+            figure,
+            f"Paper, figure 1. {len(meshes)} of the {count} faces that the model is made of.",
+            alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
+        )
+
+    def modes(self, experiment: Mapping[str, Any], paper: str = "Paper, figures 2 and 3. ") -> str:
+        from shapespace.report import figures
+
+        arrays = self.folder.arrays(experiment.get("mode_shapes"))
+        modes = arrays["basis5"].astype(np.float64)
+        shown = modes[: 3 if self.quick else 5]
+        picture = figures.modes_figure(
+            arrays["mean"].astype(np.float64), arrays["faces"], shown, title="The mean face and what each mode moves"
+        )
+        out = _figure(
+            picture,
+            f"{paper}Each row: the mean with the mode at −3, 0 and +3 standard deviations, and how far each point moves "
+            "at 3. One scale for all rows.",
+            alt=f"Mean face and the first {len(shown)} modes at minus and plus three standard deviations, with maps",
+        )
+        cumulative = np.asarray(experiment.get("cumulative_variance") or [], dtype=np.float64)
+        if len(cumulative):
+            out += _figure(
+                figures.spectrum_figure(cumulative, title="How many modes the variance needs"),
+                "Share of the training set's variance that the first modes hold.",
+                alt=f"Spectrum: {_modes_needed(cumulative)}",
+                chart=True,
             )
+        return out
 
-    page.figure(caption, modes)
-    page.figure(
-        "Share of the variance that the first modes hold",
-        lambda: figures.spectrum_figure(np.array(about["cumulative_variance"]), title="Spectrum"),
-        chart=True,
-    )
+    def test_faces(self, fits: Sequence[SavedFit]) -> str:
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(_tests(fits))
+        if not shown:
+            return absent or '<p class="broken">No test face was fitted.</p>'
+        figure = figures.faces_grid(
+            [staged.scan for _, staged in shown],
+            [staged.name for _, staged in shown],
+            title="Test faces: raw surfaces, none of them in the training set",
+        )
+        return (
+            _figure(
+                figure,
+                "Paper, figure 8. The scans, turned back to the front by the fitted pose; simulated.",
+                alt="Grid of test faces: " + ", ".join(staged.name for _, staged in shown),
+            )
+            + absent
+        )
+
+    def farthest(self, fits: Sequence[SavedFit]) -> list[SavedFit]:
+        """Return the two test faces that start farthest from the model."""
+        usable = [fit for fit in _tests(fits) if fit.pictured]
+        usable.sort(key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")))
+        return usable[:2]
+
+    def alignment(self, fits: Sequence[SavedFit]) -> str:
+        if not fits:
+            return '<p class="broken">No fit kept its surfaces.</p>'
+        return "\n".join(
+            self.one_alignment(fit, fit.label, "Paper, figures 4 to 7. ") for fit in fits[: 1 if self.quick else 2]
+        )
+
+    def one_alignment(self, fit: SavedFit, label: str, paper: str = "") -> str:
+        from shapespace.report import figures
+
+        staged = self.staged(fit, label)
+        both = [
+            f"{fit.summary_mm(stage, 'model_to_scan', 'max'):.1f} mm {words}"
+            for stage, words in figures.STAGE_TITLES.items()
+        ]
+        return _figure(
+            figures.overlay_figure(staged, title=f"{label}: scan and model, the nearer one shown"),
+            f"{paper}Where scan and model alternate finely, they lie on each other. Seen in the final pose's frame.",
+            alt=f"Scan and model of {label} over each other, before, after phase 1, after phase 2; largest distance "
+            + ", ".join(both),
+        ) + _figure(
+            figures.distance_histograms(staged, title=f"{label}: closest distances, both ways"),
+            f"{paper}Each panel has its own axis. Scan points beyond the model's rim are not counted.",
+            alt=f"Histograms of closest distances of {label}; largest from model to scan: " + ", ".join(both),
+        )
+
+    def all_fitted(self, fits: Sequence[SavedFit]) -> str:
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(_tests(fits))
+        if not shown:
+            return absent
+        figure = figures.aligned_grid([s for _, s in shown], title="Scan and fitted model over each other")
+        return (
+            _figure(
+                figure,
+                "Model-to-scan mean above each. The scan reaches beyond the model nowhere by design, so what shows is the "
+                "mixture of two surfaces that coincide.",
+                alt="Overlays of scan and fitted model for " + ", ".join(s.name for _, s in shown),
+            )
+            + absent
+        )
+
+    def b_plots(self, experiment: Mapping[str, Any], fits: Sequence[SavedFit]) -> str:
+        from shapespace.report import figures
+
+        scores = experiment.get("scores") or {}
+        left_out = {str(name) for name in scores.get("left_out") or []}
+        kept = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
+        scans = [_coefficients(fit) for fit in _tests(kept)]
+        neutral = next((fit for fit in kept if not fit.entry.get("intensity")), None)
+        neutral_b = None if neutral is None else neutral.numbers("b")
+        neutral_z = None if neutral is None else neutral.numbers("z")
+        out = ""
+        if scans and all(len(scan.b) >= 2 for scan in scans):
+            about = (
+                "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
+                "coefficients, each in its standard deviations."
+            )
+            if neutral is None:
+                about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
+            out += _figure(
+                figures.b_plane(scans, title="Test expressions in the first two coefficients", neutral_b=neutral_b, neutral_z=neutral_z),
+                f"Paper, figure 9. {about}",
+                alt=f"Scatter plot of b1 and b2 for {len(scans)} faces: each expression runs along its own line",
+                chart=True,
+            )  # fmt: skip
+            if all(len(scan.b) >= 3 for scan in scans):
+                out += _figure(
+                    figures.b_space(scans, title="The first three coefficients, from two sides", neutral_b=neutral_b, neutral_z=neutral_z),
+                    "Paper, figure 10. Grey lines drop to the floor of the box.",
+                    alt=f"Two views of b1, b2 and b3 for {len(scans)} faces with a line for each expression",
+                )  # fmt: skip
+        return out + _score_tables(scores)
+
+    def maps(self, fits: Sequence[SavedFit]) -> str:
+        from shapespace.report import figures
+
+        shown, absent = self.pictured(_tests(fits))
+        if not shown:
+            return absent
+        strongest: dict[str, tuple[SavedFit, StagedFit]] = {}
+        for fit, staged in shown:
+            key = str(fit.entry.get("expression"))
+            if key not in strongest or float(fit.entry["intensity"]) > float(strongest[key][0].entry["intensity"]):
+                strongest[key] = (fit, staged)
+        chosen = [staged for _, staged in strongest.values()]
+        out = _figure(
+            figures.threshold_figure(chosen, title="Where the model lies within 2 to 10 mm of the scan"),
+            "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the model's "
+            "vertices within the limit.",
+            alt="Maps of the face with the part within 2, 4, 6, 8 and 10 mm of the scan for "
+            + ", ".join(staged.name for staged in chosen),
+        )
+        every = [staged for _, staged in shown]
+        out += _figure(
+            figures.detail_maps(every, title="The same distances on a finer scale, all test faces"),
+            "Distance from each model vertex to the scan; one scale, which ends at the 99th percentile.",
+            alt="Distance maps of all test faces on one scale",
+        )
+        return out + absent
+
+    def convergence(self, fits: Sequence[SavedFit], owner: Mapping[str, Any], label: str | None = None) -> str:
+        from shapespace.report import figures
+
+        out = ""
+        for fit in fits:
+            name = label or fit.label
+            history = fit.history()
+            if history:
+                out += _figure(
+                    figures.history_figure(history, title=f"{name}: RMS distance while fitting"),
+                    f"RMS of the closest distances that the fit itself sees. {fit.record.get('reason', '')}",
+                    alt=f"RMS falls from {_mm(history[0][2])} to {_mm(history[-1][2])} in {len(history)} steps",
+                    chart=True,
+                )
+            population = owner.get("population_z")
+            spread = None if not population else np.asarray(population, dtype=np.float64)
+            z = fit.numbers("z")
+            out += _figure(
+                figures.coefficients_figure(z, title=f"{name}: coefficients", population=spread),
+                "Coefficients in standard deviations of the training set. Beyond about 3 they are rare in it.",
+                alt="Bar chart of z: " + ", ".join(f"{value:.1f}" for value in z[:10]),
+                chart=True,
+            )
+        return out
+
+    def experiment_2(self) -> str:
+        cases = list(self.demo["experiment2"].get("cases") or [])
+        if not cases:
+            raise FileFormatError("demo.json holds no case of experiment 2; run the demo again.")
+        intro = f"<p>Models of many people's neutral faces, fitted to {'a scan' if len(cases) == 1 else 'scans'} of somebody else.</p>\n"
+        seen: set[str] = set()
+        out: list[str] = []
+        for case in cases:
+            model = str(case.get("mode_shapes"))
+            first = model not in seen
+            seen.add(model)
+
+            def make(case: Mapping[str, Any] = case, first: bool = first) -> str:
+                return self.case(case, with_model=first)
+
+            out.append(self.guarded(str(case.get("title", "Case")), make, 3))
+        return intro + "\n".join(out)
+
+    def case(self, case: Mapping[str, Any], *, with_model: bool) -> str:
+        fit = self.fit(case["fit"])
+        kind = "Simulated scan, not a real one. " if case.get("simulated") else "A real scan. "
+        note = str(case.get("note") or "")
+        facts = (
+            f"The model is made of {case.get('n_training', '?')} people; {case.get('modes_for_98_5', '?')} modes hold "
+            "98.5 % of the variance" + (f", and {case['n_modes']} are used." if case.get("n_modes") else ".")
+        )
+        mark = ' class="notice"' if case.get("simulated") else ""
+        out = f"<p{mark}><strong>{_esc(kind)}</strong>{_esc(note)}</p>\n<p>{_esc(facts)}</p>\n" + _fit_table([fit])
+        if not fit.pictured:
+            return out
+        label = _short(case)
+        parts: list[Callable[[], str]] = [
+            lambda: self.one_alignment(fit, label),
+            lambda: self.case_thresholds(fit, label),
+            lambda: self.convergence([fit], case, label),
+        ]
+        if with_model and not self.quick:
+            parts.append(lambda: self.modes(case, "The same for this model of many people (paper, figures 2 and 3). "))
+        headings = ["Alignment", "Distance maps", "Convergence and coefficients", "The model"]
+        return out + "\n".join(self.guarded(h, make, 4) for h, make in zip(headings, parts, strict=False))
+
+    def case_thresholds(self, fit: SavedFit, label: str) -> str:
+        from shapespace.report import figures
+
+        staged = self.staged(fit, label)
+        shares = [
+            f"{100 * (staged.model_to_scan_mm['final'] <= limit).mean():.0f} % within {limit:g} mm"
+            for limit in figures.THRESHOLDS_MM
+        ]
+        return _figure(
+            figures.threshold_figure([staged], title=f"{label}: where the model lies within 2 to 10 mm of the scan"),
+            "Paper, figure 11. Above each panel: share of the model's vertices within the limit.",
+            alt="Maps of the face: " + ", ".join(shares),
+        )
+
+    def settings(self) -> str:
+        demo = self.demo
+        rows: list[tuple[str, str]] = [
+            ("Machine", str(demo.get("machine", "not recorded"))),
+            ("Seed", str(demo.get("seed", "not recorded"))),
+        ]
+        rows += [
+            (f"Time, {_words(key)}", f"{float(value):.1f} s") for key, value in (demo.get("seconds") or {}).items()
+        ]
+        rows += [
+            (f"Setting, {_words(key)}", _plain_value(value)) for key, value in (demo.get("settings") or {}).items()
+        ]
+        rows += [(f"Version, {key}", str(value)) for key, value in (demo.get("versions") or {}).items()]
+        first, second = self.entries()
+        fits, problems = self.readable([*first, *second])
+        if fits:
+            rows += [
+                (f"Fit, {_words(key)}", _plain_value(value))
+                for key, value in (fits[0].record.get("config") or {}).items()
+            ]
+        hashes = "".join(
+            f'<tr><th scope="row">{_esc(fit.name)}</th><td><code>{_esc(_hash(fit, "scan"))}</code></td>'
+            f"<td><code>{_esc(_hash(fit, 'model'))}</code></td></tr>\n"
+            for fit in fits
+        )
+        body = "".join(f'<tr><th scope="row">{_esc(key)}</th><td>{_esc(value)}</td></tr>\n' for key, value in rows)
+        return (
+            f'<div class="table"><table><tbody>\n{body}</tbody></table></div>\n'
+            "<details><summary>Content hashes (SHA-256)</summary>\n"
+            '<div class="table"><table><thead><tr><th scope="col">Fit</th><th scope="col">Scan</th>'
+            f'<th scope="col">Model</th></tr></thead><tbody>\n{hashes}</tbody></table></div></details>'
+            + _problems("Cannot be read", problems)
+        )
 
 
-def _one_fit(page: _Page, entry: Mapping[str, Any], population: object) -> None:
-    """Draw the course of one fit: figures 4 to 7 and 11."""
-    from shapespace.report import figures
+def _figure(figure: Figure, caption: str, *, alt: str, chart: bool = False) -> str:
+    from shapespace.report.figures import encode_webp
 
-    name = _nice(entry["name"])
-    record = _read_json(page.folder / entry["json"])
-    page.figure(
-        f"Figures 4 and 7: model over scan before, after phase 1 and after phase 2, {name}",
-        lambda: figures.overlay_figure(page.fit(entry), title=f"{name}: model over scan"),
-    )
-    page.figure(
-        f"Figures 5 and 6: histograms of the closest distance, both ways, {name}",
-        lambda: figures.distance_histograms(page.fit(entry), title=f"{name}: closest distances"),
-        chart=True,
-    )
-    page.figure(
-        f"Figure 11: where the model lies within 2, 4, 6, 8 and 10 mm of the scan, {name}",
-        lambda: figures.threshold_figure([page.fit(entry)], title=f"{name}: distance maps"),
-    )
-    page.figure(
-        f"RMS closest distance by iteration, {name}",
-        lambda: figures.history_figure(
-            [(state["phase"], state["iteration"], state["rms_mm"]) for state in record["history"]],
-            title=f"{name}: the loop",
-        ),
-        chart=True,
-    )
-    page.figure(
-        f"Coefficients in standard deviations of the model, {name}",
-        lambda: figures.coefficients_figure(
-            np.array(record["z"]),
-            title=f"{name}: coefficients",
-            population=None if population is None else np.array(population),
-        ),
-        chart=True,
-    )
-
-
-def _fit_row(page: _Page, fit: Mapping[str, Any]) -> tuple[object, ...]:
-    if not fit["stages"]:
-        return (_nice(fit["name"]), fit["status"], "", "", "", "", "")
-    final = _read_json(page.folder / fit["json"])["distances_mm"]["final"]
-    error, floor = fit["vertex_error_mm"], fit["floor_mm"]
+    data, (width, height) = encode_webp(figure, lossless=chart)
+    source = base64.b64encode(data).decode("ascii")
+    kind = "chart" if chart else "wide"
+    scroll = "" if chart else ' tabindex="0"'
     return (
-        _nice(fit["name"]),
-        fit["status"],
-        _mm(final["model_to_scan"]["mean"]),
-        _mm(final["model_to_scan"]["max"]),
-        _mm(final["scan_to_model"]["mean"]),
-        _mm(error["mean"]) if error else "",
-        _mm(floor["mean"]) if floor else "",
+        f'<figure class="{kind}"><div class="plate"{scroll}><img alt="{_esc(alt)}" width="{width}" height="{height}" '
+        f'src="data:image/webp;base64,{source}"></div>\n<figcaption>{_esc(caption)}</figcaption></figure>\n'
     )
 
 
-def _coefficients(page: _Page, fit: Mapping[str, Any]) -> Coefficients:
+def _fit_table(fits: Sequence[SavedFit]) -> str:
+    heads = (
+        "Scan", "Status", "Model to scan: mean", "max", "Scan to model: mean", "True vertex error: mean", "max",
+        "Floor: mean", "Steps",
+    )  # fmt: skip
+    body = ""
+    for fit in fits:
+        steps = fit.record.get("iterations") or {}
+        cells = [
+            _mm(fit.summary_mm("final", "model_to_scan", "mean")),
+            _mm(fit.summary_mm("final", "model_to_scan", "max")),
+            _mm(fit.summary_mm("final", "scan_to_model", "mean")),
+            _mm(_inner(fit.entry, "vertex_error_mm", "mean")),
+            _mm(_inner(fit.entry, "vertex_error_mm", "max")),
+            _mm(_inner(fit.entry, "floor_mm", "mean")),
+            " + ".join(str(value) for value in steps.values()) or "–",
+        ]
+        kind = fit.status if fit.status in _STATUS_WORDS else "failed"
+        body += (
+            f'<tr><th scope="row">{_esc(fit.name)}</th>'
+            f'<td><span class="status {kind}">{_esc(_STATUS_WORDS.get(fit.status, fit.status))}</span></td>'
+            + "".join(f'<td class="number">{_esc(cell)}</td>' for cell in cells)
+            + "</tr>\n"
+        )
+    head = "".join(
+        f'<th scope="col"{" class=number" if k > 1 else ""}>{_esc(text)}</th>' for k, text in enumerate(heads)
+    )
+    return (
+        '<div class="table" tabindex="0"><table class="figures"><caption>Final distances; steps of phase 1 + phase 2. '
+        f"A dash: not known.</caption><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n"
+    )
+
+
+def _score_tables(scores: Mapping[str, Any]) -> str:
+    """Show nested scores: those by expression as one table, single numbers as another."""
+    by_class = {key: value for key, value in scores.items() if isinstance(value, Mapping) and key.startswith("line_")}
+    out = ""
+    if by_class:
+        names = list(dict.fromkeys(str(name) for value in by_class.values() for name in value))
+        head = "".join(f'<th scope="col" class="number">{_esc(name)}</th>' for name in names)
+        body = "".join(
+            f'<tr><th scope="row">{_esc(_SCORE_WORDS.get(key, _words(key)))}</th>'
+            + "".join(f'<td class="number">{_esc(_plain_value(value.get(name)))}</td>' for name in names)
+            + "</tr>\n"
+            for key, value in by_class.items()
+        )
+        out += (
+            '<div class="table" tabindex="0"><table class="figures"><caption>Is each expression a line through '
+            f'neutral?</caption><thead><tr><th scope="col">Score</th>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
+        )
+    rows: list[tuple[str, str]] = []
+    for key, value in scores.items():
+        if key in by_class:
+            continue
+        if isinstance(value, Mapping):
+            inner: Mapping[str, Any] = value
+            rows += [(_SCORE_WORDS.get(name, _words(name)), _plain_value(item)) for name, item in inner.items()]
+        else:
+            rows.append((_SCORE_WORDS.get(key, _words(key)), _plain_value(value)))
+    if rows:
+        body = "".join(
+            f'<tr><th scope="row">{_esc(key)}</th><td class="number">{_esc(value)}</td></tr>\n' for key, value in rows
+        )
+        out += (
+            '<div class="table"><table class="figures"><caption>Are the expressions disjoint?</caption><tbody>\n'
+            f"{body}</tbody></table></div>\n"
+        )
+    return out
+
+
+def _problems(heading: str, sentences: Sequence[str]) -> str:
+    if not sentences:
+        return ""
+    items = "".join(f"<li>{_esc(text)}</li>" for text in sentences)
+    return f'<div class="notice"><strong>{_esc(heading)}</strong><ul>{items}</ul></div>\n'
+
+
+def _coefficients(fit: SavedFit) -> Coefficients:
     from shapespace.report.figures import Coefficients
 
-    record = _read_json(page.folder / fit["json"])
     return Coefficients(
-        name=str(fit["name"]),
-        expression=str(fit["expression"]),
-        intensity=float(fit["intensity"]),
-        b=np.array(record["b"], dtype=np.float64),
-        z=np.array(record["z"], dtype=np.float64),
+        fit.name,
+        str(fit.entry.get("expression")),
+        float(fit.entry.get("intensity") or 0),
+        fit.numbers("b"),
+        fit.numbers("z"),
     )
 
 
-def _score_tables(page: _Page, scores: Mapping[str, Any]) -> None:
-    columns = {
-        "line_r2_through_neutral": "R² of the line through neutral",
-        "line_r2_free": "R² of the best line anywhere",
-        "line_sign_consistency": "on the positive side",
-        "line_spearman": "rank correlation with intensity",
-        "line_permutation_p": "permutation p",
-    }
-    first = scores.get("line_r2_through_neutral", {})
-    page.table(
-        ("expression", *columns.values()),
-        [(name, *(f"{scores[key][name]:.3f}" for key in columns)) for name in first],
-        "Line structure. With four levels no permutation p can fall below 1/24 = 0.042 but by chance of the draw.",
-    )
-    if "disjointness" in scores:
-        d = scores["disjointness"]
-        page.table(
-            ("score", "value", "permutation p"),
-            [
-                (
-                    f"leave-one-out accuracy of the nearest mean direction (chance {d['chance']:.2f})",
-                    f"{d['leave_one_out_accuracy']:.3f}",
-                    f"{d['accuracy_p']:.3f}",
-                ),
-                ("cosine silhouette", f"{d['cosine_silhouette']:.3f}", f"{d['silhouette_p']:.3f}"),
-                ("separability, tr(S_w⁻¹ S_b)", f"{d['separability']:.1f}", ""),
-            ],
-            "Disjointness of the four expressions.",
-        )
-    if scores.get("left_out"):
-        page.paragraph(f"Left out because their fits are not trusted: {', '.join(scores['left_out'])}.", "doubt")
+def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    return [fit for fit in fits if fit.entry.get("intensity")]
 
 
-def _coefficient_table(page: _Page, fits: Sequence[Mapping[str, Any]]) -> None:
-    rows = [(fit, _read_json(page.folder / fit["json"]).get("b")) for fit in fits]
-    k = max((min(len(b), 5) for _, b in rows if b), default=0)
-    page.table(
-        ("scan", *(f"b{i}" for i in range(1, k + 1))),
-        [(_nice(fit["name"]), *(f"{value:.1f}" for value in b[:k])) for fit, b in rows if b],
-        "The vector b of each face, mm.",
-    )
+def _short(case: Mapping[str, Any]) -> str:
+    """Return the name of a case that fits beside a row of pictures."""
+    if case.get("simulated"):
+        return "simulated stranger"
+    scan = str(case["fit"].get("name", "scan"))
+    return f"{scan.replace('_', ', ')} model"
 
 
-def _settings(page: _Page, demo: Mapping[str, Any]) -> None:
-    rows: list[tuple[object, object]] = [
-        ("shapespace", demo["version"]),
-        ("made", demo["created"]),
-        ("machine", demo["machine"]),
-        ("seed", demo.get("seed", "")),
-        *((f"setting: {key}", value) for key, value in demo.get("settings", {}).items()),
-        *((f"version of {key}", value) for key, value in demo.get("versions", {}).items()),
-        *((f"seconds, {key}", f"{value:.1f}") for key, value in demo["seconds"].items()),
+def _modes_needed(cumulative: np.ndarray[Any, np.dtype[np.float64]]) -> str:
+    parts = [
+        f"{100 * share:g} % in {int(np.searchsorted(cumulative, share)) + 1} modes"
+        for share in (0.90, 0.95, 0.98, 0.985, 0.99)
+        if cumulative[-1] >= share
     ]
-    models = {demo["experiment1"]["model"]: demo["experiment1"].get("model_hash", "")}
-    models |= {case["model"]: case.get("model_hash", "") for case in demo["experiment2"]["cases"]}
-    rows += [(f"hash of {file}", digest) for file, digest in models.items()]
-    page.table(("what", "value"), rows, "Everything needed to run this again.")
+    return ", ".join(parts) or f"{len(cumulative)} modes"
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return cast(dict[str, Any], json.loads(read_bytes(path)))
-    except ValueError as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short.") from error
+def _hash(fit: SavedFit, what: str) -> str:
+    source = fit.record.get(what) or {}
+    return f"{source.get('name', '')} {source.get('hash', 'not recorded')}"
 
 
-def _text(value: object) -> str:
-    return html.escape(str(value), quote=True)
+def _inner(entry: Mapping[str, Any], key: str, measure: str) -> float:
+    value = (entry.get(key) or {}).get(measure)
+    return float("nan") if value is None else float(value)
 
 
-def _nice(name: object) -> str:
-    return str(name).replace("_", " ")
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return sum(known) / len(known) if known else float("nan")
 
 
-def _mm(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
+def _mm(value: float) -> str:
+    """Return a length with three or so digits and its unit."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.0f} mm" if abs(value) >= 100 else f"{value:.1f} mm" if abs(value) >= 10 else f"{value:.2f} mm"
+
+
+def _mm_html(value: float) -> str:
+    number, _, unit = _mm(value).partition(" ")
+    return f"{_esc(number)} <small>{_esc(unit)}</small>"
+
+
+def _plain_value(value: object) -> str:
+    """Return a setting or a score as text, numbers with three digits or so."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "–" if not math.isfinite(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    if isinstance(value, (list, tuple)):
+        items: Sequence[object] = value  # pyright: ignore[reportUnknownVariableType]  # JSON: anything
+        return ", ".join(_plain_value(item) for item in items) or "none"
+    return str(value)
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _esc(text: object) -> str:
+    return escape("" if text is None else str(text), quote=True)

@@ -24,6 +24,8 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 Colour: TypeAlias = tuple[float, float, float]
 """Red, green, blue in [0, 1], sRGB."""
 
+_Single: TypeAlias = npt.NDArray[np.float32]
+
 WHITE: Colour = (1.0, 1.0, 1.0)
 CLAY: Colour = (0.80, 0.755, 0.715)
 
@@ -144,10 +146,11 @@ class _Surfels:
     """What a layer leaves in the picture: for each covered pixel, where, how deep and what."""
 
     pixel: npt.NDArray[np.int64]
-    depth_mm: FloatArray
-    normal: FloatArray
-    scalar: FloatArray | None
+    depth_mm: _Single
+    normal: _Single  # (3, n), as seen from the eye
+    scalar: _Single | None
     back: npt.NDArray[np.bool_]
+    occlusion: _Single
 
 
 def render(
@@ -191,40 +194,78 @@ def render_layers(
     Raises:
         InputError: a size or supersample that is not a small positive whole number.
     """
+    _check_size(size, supersample)
     width, height = size
+    fine = (width * supersample, height * supersample)
+    drawn = [(layer, _surfels(layer, camera, fine, supersample)) for layer in layers]
+    pieces = [(_shaded(layer, surfels), surfels, layer.opacity) for layer, surfels in drawn]
+    return _composed(pieces, size, supersample, background)
+
+
+def render_maps(
+    mesh: Mesh,
+    scalars: FloatArray,
+    ranges: Sequence[tuple[float, float]],
+    *,
+    colormap: FloatArray,
+    camera: Camera,
+    size: tuple[int, int] = (480, 560),
+    background: Colour = WHITE,
+    supersample: int = 2,
+) -> list[Image]:
+    """Return the same view of `mesh` coloured by `scalars` (V,), once for each (vmin, vmax) of `ranges`.
+
+    The surface is found once, so several maps cost little more than one. Other arguments as in `render_layers`.
+    """
+    _check_size(size, supersample)
+    layers = [Layer(mesh, scalars=scalars, colormap=colormap, vmin=low, vmax=high) for low, high in ranges]
+    if not layers:
+        return []
+    surfels = _surfels(layers[0], camera, (size[0] * supersample, size[1] * supersample), supersample)
+    return [_composed([(_shaded(layer, surfels), surfels, 1.0)], size, supersample, background) for layer in layers]
+
+
+def _check_size(size: tuple[int, int], supersample: int) -> None:
     if supersample < 1 or min(size) < 1 or max(size) * supersample > _LARGEST_SIDE:
         raise InputError(
-            f"A picture of {width} x {height} pixels with {supersample} samples each way cannot be drawn; "
+            f"A picture of {size[0]} x {size[1]} pixels with {supersample} samples each way cannot be drawn; "
             f"each side times the samples must be 1 to {_LARGEST_SIDE}."
         )
-    fine = (width * supersample, height * supersample)
-    count = fine[0] * fine[1]
-    colours = np.empty((len(layers), count, 3))
-    alphas = np.zeros((len(layers), count))
-    depths = np.full((len(layers), count), np.inf)
-    for k, layer in enumerate(layers):
-        surfels = _surfels(layer, camera, fine)
-        shade = _occlusion(surfels, fine, supersample, camera)
-        colours[k, surfels.pixel] = _shaded(layer, surfels, shade)
-        alphas[k, surfels.pixel] = layer.opacity
-        depths[k, surfels.pixel] = surfels.depth_mm
-    out = np.empty((count, 3))
-    out[:] = np.asarray(background, dtype=np.float64) ** _GAMMA
-    if len(layers) == 1:
-        hit = alphas[0] > 0
-        out[hit] += alphas[0][hit, None] * (colours[0][hit] - out[hit])
-    elif layers:
-        some = np.flatnonzero((alphas > 0).any(axis=0))
-        order = np.argsort(-depths[:, some], axis=0, kind="stable")
-        for rank in range(len(layers)):
-            which = order[rank]
-            alpha = alphas[which, some]
-            hit = alpha > 0
-            at = some[hit]
-            out[at] += alpha[hit, None] * (colours[which[hit], at] - out[at])
-    fine_image = out.reshape(height, supersample, width, supersample, 3)
-    mean: FloatArray = np.clip(fine_image.mean(axis=(1, 3)), 0, 1)
-    return np.round(255.0 * mean ** (1 / _GAMMA)).astype(np.uint8)
+
+
+def _composed(
+    pieces: Sequence[tuple[_Single, _Surfels, float]], size: tuple[int, int], supersample: int, background: Colour
+) -> Image:
+    """Blend shaded layers by depth, average the samples of each pixel, and return sRGB."""
+    width, height = size
+    count = width * height * supersample**2
+    out = np.empty((count, 3), dtype=np.float32)
+    out[:] = np.asarray(background) ** _GAMMA
+    if all(opacity == 1 for *_, opacity in pieces):
+        nearest = np.full(count, np.inf, dtype=np.float32)
+        for colours, surfels, _ in pieces:
+            won = slice(None) if len(pieces) == 1 else surfels.depth_mm < nearest[surfels.pixel]
+            out[surfels.pixel[won]] = colours[won]
+            nearest[surfels.pixel[won]] = surfels.depth_mm[won]
+    else:
+        depths = np.full((len(pieces), count), np.inf, dtype=np.float32)
+        paint = np.zeros((len(pieces), count, 3), dtype=np.float32)
+        for k, (colours, surfels, _) in enumerate(pieces):
+            depths[k, surfels.pixel] = surfels.depth_mm
+            paint[k, surfels.pixel] = colours
+        alpha = np.array([opacity for *_, opacity in pieces], dtype=np.float32)
+        order = np.argsort(-depths, axis=0, kind="stable")
+        at = np.arange(count)
+        for which in order:
+            share = np.where(np.isfinite(depths[which, at]), alpha[which], 0)[:, None]
+            out += share * (paint[which, at] - out)
+    samples = out.reshape(height, supersample, width, supersample, 3)
+    mean = np.zeros((height, width, 3), dtype=np.float32)
+    for row in range(supersample):
+        for column in range(supersample):
+            mean += samples[:, row, :, column]
+    mean /= supersample**2
+    return np.round(255.0 * np.clip(mean, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
 
 
 def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
@@ -289,11 +330,11 @@ def _rasterise(
     with np.errstate(invalid="ignore"):
         inside = (
             (np.abs(area) > 1e-12)
-            & (x.max(axis=1) > 0)
-            & (x.min(axis=1) < width)
-            & (y.max(axis=1) > 0)
-            & (y.min(axis=1) < height)
-            & np.isfinite(z).all(axis=1)
+            & (_largest(x) > 0)
+            & (_smallest(x) < width)
+            & (_largest(y) > 0)
+            & (_smallest(y) < height)
+            & np.isfinite(z[:, 0] + z[:, 1] + z[:, 2])
         )
     kept = np.flatnonzero(inside)
     if not len(kept):
@@ -304,10 +345,10 @@ def _rasterise(
     area = np.abs(area)
     slope_x = ((z[:, 1] - z[:, 0]) * (y[:, 2] - y[:, 0]) - (z[:, 2] - z[:, 0]) * (y[:, 1] - y[:, 0])) / area
     slope_y = ((x[:, 1] - x[:, 0]) * (z[:, 2] - z[:, 0]) - (x[:, 2] - x[:, 0]) * (z[:, 1] - z[:, 0])) / area
-    top = np.maximum(np.ceil(y.min(axis=1) - 0.5 - tiny), 0).astype(np.int64)
-    bottom = np.minimum(np.floor(y.max(axis=1) - 0.5 + tiny), height - 1).astype(np.int64)
+    top = np.maximum(np.ceil(_smallest(y) - 0.5 - tiny), 0).astype(np.int64)
+    bottom = np.minimum(np.floor(_largest(y) - 0.5 + tiny), height - 1).astype(np.int64)
     rows = np.maximum(bottom - top + 1, 0)
-    near, far = z.min(axis=1), z.max(axis=1)
+    near, far = _smallest(z), _largest(z)
     for first, last in _chunks(rows, _FRAGMENTS_AT_ONCE // 4):
         part = slice(first, last)
         owner = first + np.repeat(np.arange(last - first), rows[part])
@@ -344,6 +385,15 @@ def _rasterise(
     return triangle, nearest
 
 
+def _smallest(corners: FloatArray) -> FloatArray:
+    # Much faster than a reduction over an axis of three.
+    return np.minimum(np.minimum(corners[:, 0], corners[:, 1]), corners[:, 2])
+
+
+def _largest(corners: FloatArray) -> FloatArray:
+    return np.maximum(np.maximum(corners[:, 0], corners[:, 1]), corners[:, 2])
+
+
 def _counting(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Return 0..n-1 for each n in `counts`, joined."""
     ends = np.cumsum(counts)
@@ -359,38 +409,54 @@ def _chunks(counts: npt.NDArray[np.int64], most: int) -> list[tuple[int, int]]:
     return list(pairwise(cuts))
 
 
-def _surfels(layer: Layer, camera: Camera, size: tuple[int, int]) -> _Surfels:
+def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
     if layer.mesh.faces is None:
-        return _balls(layer, camera, size)
+        return _balls(layer, camera, size, supersample)
     vertices, faces = layer.mesh.vertices, layer.mesh.faces
     screen, depth = _project(vertices, camera, size)
     triangle, nearest = _rasterise(screen, depth, faces, size)
     pixel = np.flatnonzero(triangle >= 0)
-    corner = faces[triangle[pixel]]
+    shown = triangle[pixel]
+    # Colours bear single precision, and gathering a triangle's numbers in one go is most of the speed.
     at = np.stack([pixel % size[0] + 0.5, pixel // size[0] + 0.5], axis=1)
-    a, b, c = (screen[corner[:, k]] for k in range(3))
-
-    def turn(p: FloatArray, q: FloatArray) -> FloatArray:
-        return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-
-    area = turn(b - a, c - a)
-    share = np.stack([turn(b - at, c - at), turn(c - at, a - at), turn(a - at, b - at)], axis=1) / area[:, None]
-    share = np.clip(share, 0, 1)
-    if camera.distance_mm is not None:
-        share *= -depth[corner]
-    share /= share.sum(axis=1, keepdims=True)
-    axes = _view_axes(camera.yaw_deg, camera.pitch_deg)
-    normals = vertex_normals(layer.mesh) @ axes.T
-    normal = np.einsum("nk,nkd->nd", share, normals[corner])
-    # On the screen y points down, so a triangle that faces the eye turns the negative way.
+    corners = screen[faces].reshape(-1, 6)[shown]
+    a, b, c = ((corners[:, 2 * k : 2 * k + 2] - at).T.astype(np.float32) for k in range(3))
+    shares = [_turn(b, c), _turn(c, a), _turn(a, b)]
+    area = shares[0] + shares[1] + shares[2]
     back = area > 0
-    normal[back] *= -1
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    scalar = None if layer.scalars is None else np.einsum("nk,nk->n", share, layer.scalars[corner])
-    return _Surfels(pixel, _depth_mm(nearest[pixel], camera), normal, scalar, back)
+    shares = [np.clip(share / np.where(area == 0, 1, area), 0, 1) for share in shares]
+    if camera.distance_mm is not None:
+        nearness = -depth.astype(np.float32)[faces][shown]
+        shares = [share * nearness[:, k] for k, share in enumerate(shares)]
+    total = np.maximum(shares[0] + shares[1] + shares[2], 1e-30)
+    shares = [share / total for share in shares]
+    normals = (vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
+    # On the screen y points down, so a triangle that faces the eye turns the negative way.
+    normal = _unit(_blend(shares, normals[faces].reshape(-1, 9)[shown]) * np.where(back, -1, 1).astype(np.float32))
+    scalar = None
+    if layer.scalars is not None:
+        scalar = _blend(shares, layer.scalars.astype(np.float32)[faces][shown])[0]
+    depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
+    return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
-def _balls(layer: Layer, camera: Camera, size: tuple[int, int]) -> _Surfels:
+def _turn(p: _Single, q: _Single) -> _Single:
+    return p[0] * q[1] - p[1] * q[0]
+
+
+def _blend(shares: Sequence[_Single], values: _Single) -> _Single:
+    """Return (d, n) from the shares of three corners, (n,) each, and their values (n, 3 d)."""
+    size = values.shape[1] // 3
+    return np.stack([sum(share * values[:, k * size + d] for k, share in enumerate(shares)) for d in range(size)])
+
+
+def _unit(vectors: _Single) -> _Single:
+    """Return (d, n) vectors at length one."""
+    squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
+    return vectors / np.sqrt(np.maximum(squares, 1e-24))
+
+
+def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
     """Draw each vertex as a ball: a disc of pixels with the depth and the normals of a sphere."""
     width, height = size
     screen, depth = _project(layer.mesh.vertices, camera, size)
@@ -418,53 +484,64 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int]) -> _Surfels:
     at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
     flat = (at - screen[owner]) / radius * [1.0, -1.0]
     up = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, 1))
-    normal = np.concatenate([flat, up[:, None]], axis=1)
-    scalar = None if layer.scalars is None else layer.scalars[owner]
-    return _Surfels(pixel, nearest[pixel], normal, scalar, np.zeros(len(pixel), dtype=np.bool_))
+    normal = np.concatenate([flat.T, up[None]]).astype(np.float32)
+    scalar = None if layer.scalars is None else layer.scalars[owner].astype(np.float32)
+    depth_mm = nearest[pixel].astype(np.float32)
+    back = np.zeros(len(pixel), dtype=np.bool_)
+    return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
 
-_KEY = np.array([-0.42, 0.50, 0.76]) / np.linalg.norm([-0.42, 0.50, 0.76])
-_FILL = np.array([0.75, 0.05, 0.66]) / np.linalg.norm([0.75, 0.05, 0.66])
-_HALF = (_KEY + np.array([0, 0, 1])) / np.linalg.norm(_KEY + np.array([0, 0, 1]))
+def _direction(x: float, y: float, z: float) -> _Single:
+    vector = np.array([x, y, z])
+    return (vector / np.linalg.norm(vector)).astype(np.float32)
 
 
-def _shaded(layer: Layer, surfels: _Surfels, occlusion: FloatArray) -> FloatArray:
+_KEY = _direction(-0.50, 0.58, 0.64)
+_FILL = _direction(0.80, 0.05, 0.60)
+_HALF = _direction(*(float(v) for v in _KEY + np.array([0, 0, 1])))
+
+
+def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3): soft key, fill and rim light, a little gloss."""
     normal = surfels.normal
-    base = np.tile(np.asarray(layer.colour, dtype=np.float64) ** _GAMMA, (len(normal), 1))
     mapped = surfels.scalar is not None and layer.colormap is not None
+    base = (np.asarray(layer.colour) ** _GAMMA).astype(np.float32)[None]
     if surfels.scalar is not None and layer.colormap is not None:
-        table = np.asarray(layer.colormap, dtype=np.float64) ** _GAMMA
+        table = (np.asarray(layer.colormap) ** _GAMMA).astype(np.float32)
         finite = np.isfinite(surfels.scalar)
         share = (np.where(finite, surfels.scalar, 0) - layer.vmin) / (layer.vmax - layer.vmin)
-        base = table[np.clip((share * len(table)).astype(np.int64), 0, len(table) - 1)]
+        base = table[np.clip(share * len(table), 0, len(table) - 1).astype(np.int64)]
         base[~finite] = 0.35
     # Wrapped diffuse light keeps the shadow side of a face readable.
-    key = np.clip((normal @ _KEY + 0.25) / 1.25, 0, 1)
-    fill = np.clip(normal @ _FILL, 0, 1)
-    rim = np.clip(1 - np.abs(normal[:, 2]), 0, 1) ** 3
-    gloss = np.clip(normal @ _HALF, 0, 1) ** 28
+    key = np.clip((_KEY @ normal + 0.15) / 1.15, 0, 1)
+    fill = np.clip(_FILL @ normal, 0, 1)
+    rim = np.clip(1 - np.abs(normal[2]), 0, 1)
+    gloss = np.clip(_HALF @ normal, 0, 1)
+    for _ in range(5):
+        gloss *= gloss
     # A map is read by its colours: less shading there, so that they stay close to the scale's.
-    ambient, key_share, fill_share, shine = (0.42, 0.58, 0.12, 0.02) if mapped else (0.10, 0.80, 0.10, 0.05)
-    light = (ambient + key_share * key + fill_share * fill) * occlusion
-    out = base * light[:, None] + (shine * gloss * occlusion + (0 if mapped else 0.03) * rim)[:, None]
+    ambient, key_share, fill_share, shine = (0.50, 0.55, 0.10, 0.02) if mapped else (0.08, 0.94, 0.12, 0.05)
+    light = (ambient + key_share * key + fill_share * fill) * surfels.occlusion
+    edge = 0.0 if mapped else 0.03
+    out = base * light[:, None] + (shine * gloss * surfels.occlusion + edge * rim * rim * rim)[:, None]
     if surfels.back.any():
         out[surfels.back] = 0.4 * out[surfels.back] + 0.02
-    return np.clip(out, 0, 1)
+    return np.clip(out, 0, 1).astype(np.float32)
 
 
-def _occlusion(surfels: _Surfels, size: tuple[int, int], supersample: int, camera: Camera) -> FloatArray:
+def _occlusion(
+    pixel: npt.NDArray[np.int64], depth_mm: _Single, size: tuple[int, int], supersample: int, camera: Camera
+) -> _Single:
     """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
     width, height = size
-    covered_part = np.zeros(width * height, dtype=np.float32)
-    covered_part[surfels.pixel] = 1
-    depth = np.zeros(width * height, dtype=np.float32)
-    depth[surfels.pixel] = surfels.depth_mm
+    there = np.zeros((height, width), dtype=np.float32)
+    there.ravel()[pixel] = 1
+    depth = np.zeros((height, width), dtype=np.float32)
+    depth.ravel()[pixel] = depth_mm
     coarse = (slice(None, None, supersample), slice(None, None, supersample))
-    there = covered_part.reshape(height, width)[coarse]
-    sigma = 0.022 * there.shape[0]
-    total = gaussian_filter(there, sigma)
-    mean = gaussian_filter(depth.reshape(height, width)[coarse], sigma) / np.maximum(total, 1e-6)
-    mean_here = mean[surfels.pixel // width // supersample, surfels.pixel % width // supersample]
-    behind = np.clip(surfels.depth_mm - mean_here, 0, 0.03 * camera.height_mm)
-    return np.exp(-30.0 * behind / camera.height_mm)
+    sigma = 0.022 * height / supersample
+    total = gaussian_filter(there[coarse], sigma, truncate=2.5)
+    mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
+    mean_here = mean[pixel // width // supersample, pixel % width // supersample]
+    behind = np.clip(depth_mm - mean_here, 0, 0.03 * camera.height_mm)
+    return np.exp(np.float32(-30.0 / camera.height_mm) * behind)
