@@ -13,10 +13,10 @@ import numpy as np
 from tqdm import tqdm
 
 from shapespace.batch.results import read_record
-from shapespace.batch.run import fit_files, make_executor, make_jobs
+from shapespace.batch.run import fit_files, make_executor, make_jobs, naming
 from shapespace.datasets import faces as bundled
 from shapespace.datasets import fetch, ict
-from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.doctor import examine
@@ -65,7 +65,7 @@ def check(paths: Sequence[Path]) -> list[dict[str, Any]]:
         try:
             report = examine(read_mesh(path))
         except ShapespaceError as error:
-            reports.append({"file": str(path), "usable": False, "error": str(error)})
+            reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
         facts = asdict(report)
         usable = not any(finding["level"] == "refused" for finding in facts["findings"])
@@ -91,6 +91,7 @@ def build(
 
     Raises:
         FileError: a mesh cannot be read, or the model not written.
+        MeshError: a mesh without vertices, or with faces that point past their end.
         CorrespondenceError: the meshes differ in vertices or triangles.
         InputError: too few meshes, no variation, too many modes asked for.
     """
@@ -102,7 +103,7 @@ def build(
     loaded: list[Mesh] = []
     with progress_bar(len(files), "reading", "mesh", quiet=quiet) as bar:
         for file in files:
-            mesh = read_mesh(file)
+            mesh = _training_mesh(file)
             loaded.append(mesh if unit == "mm" else mesh.with_vertices(mesh.vertices * MM_PER_UNIT[unit]))
             bar.update()
     beside = files[0].parent / "landmarks.csv"
@@ -125,6 +126,16 @@ def build(
     )
     model.save(output)
     return model, notes
+
+
+def _training_mesh(path: Path) -> Mesh:
+    try:
+        mesh = read_mesh(path)
+    except MeshError as error:
+        raise MeshError(naming(path, str(error))) from error
+    if not len(mesh.vertices):
+        raise MeshError(f"{path}: it has no vertices, so no shape model can be made of it; leave it out.")
+    return mesh
 
 
 def _landmark_indices(path: Path, first: Mesh, mm: float) -> dict[str, int]:

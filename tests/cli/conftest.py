@@ -8,12 +8,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
-from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
 
 from shapespace.cli import main
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
 from shapespace.types import FloatArray, Mesh
+from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
 
 VERTICES = 400
 Z = (

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from conftest import Outcome, Run, World, leftovers
 
+from conftest import Outcome, Run, World, leftovers
 from shapespace import __version__
 from shapespace.cli import parser
 from shapespace.datasets.faces import EXPRESSIONS
@@ -215,7 +215,7 @@ def read_vertices(rng: np.random.Generator) -> np.ndarray:
 def test_no_align_takes_the_meshes_as_they_stand(run: Run, world: World, tmp_path: Path) -> None:
     first = read_mesh(world.meshes / "blob_00.ply")
     for k in range(4):
-        write_mesh(tmp_path / f"m{k}.ply", first.with_vertices(first.vertices + [k * 3.0, 0, 0]))
+        write_mesh(tmp_path / f"m{k}.ply", first.with_vertices(first.vertices + np.array([k * 3.0, 0, 0])))
     meshes = sorted(tmp_path.glob("m*.ply"))
     facts = run("build", *meshes, "-o", tmp_path / "m.h5", "--no-align", "--modes", "all", "--json").facts
     # Only a shift varies: one mode, of 3 mm steps at each of 400 vertices.

@@ -114,7 +114,7 @@ def fit_file(
             scan_source, model_source, f"{job.scan}: not enough memory to fit it; thin the scan first.", asdict(config)
         )
     except ShapespaceError as error:
-        record = failed_record(scan_source, model_source, _naming(job.scan, str(error)), asdict(config))
+        record = failed_record(scan_source, model_source, naming(job.scan, str(error)), asdict(config))
     else:
         record = fit_record(result, scan_source, model_source, marks_source)
         write_fitted_mesh(folder / f"{job.name}.fitted.ply", result, model)
@@ -129,8 +129,8 @@ def fit_file(
     return record
 
 
-def _naming(scan: Path, sentence: str) -> str:
-    """Return `sentence` with the scan's path in it."""
+def naming(scan: Path, sentence: str) -> str:
+    """Return `sentence` about the mesh in `scan` with its path in it, not just its name."""
     if str(scan) in sentence:
         return sentence
     if sentence.startswith(f"{scan.name}: "):

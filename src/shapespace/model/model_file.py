@@ -80,5 +80,5 @@ def load(path: Path) -> dict[str, Any]:
             "provenance": str(attributes["provenance"]),
             "licence": str(attributes["licence"]),
         }
-    except (KeyError, ValueError, TypeError) as error:
+    except (AttributeError, KeyError, ValueError, TypeError) as error:
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing: {error}.") from error

@@ -74,6 +74,8 @@ class ShapeModel:
             np.isfinite(mean).all() and np.isfinite(basis).all() and np.isfinite(stddev).all() and stddev.min() > 0
         ):
             raise InputError("The arrays of a shape model must be finite and its standard deviations positive.")
+        if not (np.isfinite(self.total_variance) and self.total_variance > 0):
+            raise InputError(f"The total variance of a shape model must be positive, not {self.total_variance!r}.")
         if self.gauge not in ("form", "shape"):
             raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
         if self.representation not in REPRESENTATIONS:
