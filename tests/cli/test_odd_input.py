@@ -1,0 +1,218 @@
+"""Odd but legal input works: names, links, read-only files; and what the outside world does to a command."""
+
+import csv
+import errno
+import io
+import json
+import os
+import sys
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import Run, World, leftovers
+from shapespace.io.meshes import MESH_FORMATS, write_mesh
+from shapespace.types import Mesh
+
+FAST = ("--max-iterations", 2)
+NAMES = ["with space", "Grüße 顔 🙂", "-leading dash", "=1+1", "@cmd", "+x", "line\nbreak", "tab\tname", "a'b\"c;$(x)",
+         "dots.in.name", "x" * 240, "\udcff not utf-8"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES, ids=ascii)
+def test_scans_of_any_name_are_fitted(name: str, run: Run, world: World, tmp_path: Path) -> None:
+    scan = tmp_path / f"{name}.ply"
+    scan.write_bytes(world.scan.read_bytes())
+    out = tmp_path / "out"
+    outcome = run("fit", world.model, scan, "-o", out, *FAST)
+    assert outcome.code == 0, outcome.err
+    assert len(outcome.out.splitlines()) == 2 and len(outcome.err.splitlines()) == 1
+    assert {c for c in outcome.out + outcome.err if not c.isprintable()} == {"\n"}
+    (record,) = out.glob("*.fit.json")
+    assert json.loads(record.read_text())["scan"]["name"] == scan.name
+    assert len(list(out.glob("*.fitted.ply"))) == 1
+    text = (out / "coefficients.csv").read_text(encoding="utf-8")
+    (row,) = csv.DictReader(io.StringIO(text, newline=""))
+    assert row["scan"][0] not in "=+-@"
+    assert run("fit", world.model, scan, "-o", out, *FAST, "--resume", "--json").facts["max_iterations"] == 1
+    assert run("check", scan, "--json").facts[0]["usable"]
+    assert run("info", record, "--json").facts["status"] == "max_iterations"
+
+
+def test_a_relative_name_that_starts_with_a_dash_works_after_two_dashes(
+    run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "-scan.ply").write_bytes(world.scan.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert run("fit", world.model, "-o", "out", *FAST, "--", "-scan.ply").code == 0
+
+
+def test_the_same_scan_in_every_format_gives_the_same_fit(
+    run: Run, world: World, scan_mesh: Mesh, tmp_path: Path
+) -> None:
+    files = [tmp_path / f"scan{ending}" for ending in MESH_FORMATS]
+    for file in files:
+        write_mesh(file, scan_mesh)
+    assert run("fit", world.model, *files, "-o", tmp_path / "out").code == 0
+    records = [json.loads(path.read_text()) for path in (tmp_path / "out").glob("*.fit.json")]
+    assert len(records) == len(MESH_FORMATS)
+    for record in records:
+        np.testing.assert_allclose(record["b"], records[0]["b"], atol=0.02)
+
+
+def test_links_and_read_only_input_are_fine(run: Run, world: World, tmp_path: Path) -> None:
+    scan = tmp_path / "scan.ply"
+    scan.write_bytes(world.scan.read_bytes())
+    scan.chmod(0o400)
+    (tmp_path / "link.ply").symlink_to(scan)
+    (tmp_path / "model.h5").symlink_to(world.model)
+    outcome = run("fit", tmp_path / "model.h5", tmp_path / "link.ply", "-o", tmp_path / "out", *FAST)
+    assert outcome.code == 0
+    assert (tmp_path / "out" / "link.fit.json").is_file()
+
+
+def test_a_dangling_link_and_a_device_are_refused(run: Run, world: World, tmp_path: Path) -> None:
+    dangling = tmp_path / "dangling.ply"
+    dangling.symlink_to(tmp_path / "nothing.ply")
+    null = tmp_path / "null.ply"
+    null.symlink_to("/dev/null")
+    for scan in (dangling, null):
+        outcome = run("fit", world.model, scan, "-o", tmp_path / "out")
+        assert outcome.code == 2 and str(scan) in outcome.sentence()
+
+
+def test_a_folder_with_a_mesh_name_is_read_as_a_folder(run: Run, world: World, tmp_path: Path) -> None:
+    (tmp_path / "scan.ply").mkdir()
+    outcome = run("check", tmp_path / "scan.ply")
+    assert outcome.code == 2 and "holds no meshes" in outcome.sentence()
+
+
+def test_names_in_capitals_are_known(run: Run, world: World, tmp_path: Path) -> None:
+    (tmp_path / "SCAN.PLY").write_bytes(world.scan.read_bytes())
+    assert run("fit", world.model, tmp_path, "-o", tmp_path / "out", *FAST).code == 0
+
+
+def test_compressed_meshes_are_refused_with_the_known_endings(run: Run, world: World, tmp_path: Path) -> None:
+    import gzip
+
+    path = tmp_path / "scan.ply.gz"
+    path.write_bytes(gzip.compress(world.scan.read_bytes()))
+    outcome = run("fit", world.model, path, "-o", tmp_path / "out")
+    assert outcome.code == 2 and str(path) in outcome.sentence() and ".ply, .obj" in outcome.err
+    disguised = tmp_path / "scan.ply"
+    disguised.write_bytes(path.read_bytes())
+    assert run("check", disguised).code == 2
+
+
+def test_a_scan_that_fits_no_unit_is_refused(run: Run, world: World, scan_mesh: Mesh, tmp_path: Path) -> None:
+    for factor in (1e-9, 1e9):
+        write_mesh(tmp_path / "odd.ply", scan_mesh.with_vertices(scan_mesh.vertices * factor))
+        outcome = run("fit", world.model, tmp_path / "odd.ply", "-o", tmp_path / "out")
+        assert outcome.code == 2 and "unit" in outcome.sentence()
+
+
+def test_a_handful_of_points_never_passes_for_a_good_fit(run: Run, world: World, tmp_path: Path) -> None:
+    for count in (4, 5, 10):
+        points = 60 * np.random.default_rng(count).standard_normal((count, 3))
+        write_mesh(tmp_path / "few.ply", Mesh(points))
+        outcome = run("fit", world.model, tmp_path / "few.ply", "-o", tmp_path / "out", "--strict")
+        assert outcome.code in (1, 2), outcome.out
+        assert len(outcome.err.splitlines()) == 1
+
+
+class _Killed(Executor):
+    """Workers that the system stops, as it does when memory runs out."""
+
+    def submit(self, *_: Any, **__: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_exception(BrokenProcessPool("A process in the process pool was terminated abruptly."))
+        return future
+
+
+def test_workers_that_are_killed_end_in_one_sentence(
+    run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shapespace.commands.make_executor", lambda *_: _Killed())
+    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--jobs", 2)
+    assert outcome.code == 2
+    assert "fewer --jobs" in outcome.sentence() and "--resume" in outcome.err
+    assert leftovers(tmp_path) == [] and (tmp_path / "coefficients.csv").is_file()
+
+
+@pytest.mark.parametrize("where", ["shapespace.io.meshes.read_bytes", "shapespace.batch.run.fit_scan"])
+def test_too_little_memory_for_one_scan_fails_that_scan(
+    where: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exhausted(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(where, exhausted)
+    outcome = run("fit", world.model, world.scan, "-o", tmp_path)
+    assert outcome.code == 2
+    assert str(world.scan) in outcome.sentence() and "memory" in outcome.err
+
+
+def test_too_little_memory_to_build_ends_in_one_sentence(
+    run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exhausted(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("shapespace.commands.ShapeModel.fit", exhausted)
+    outcome = run("build", world.meshes, "-o", tmp_path / "m.h5")
+    assert outcome.code == 2 and "not enough memory" in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["build", "fit", "check"])
+def test_ctrl_c_ends_with_130_and_whole_files(
+    command: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from shapespace.io.meshes import read_mesh
+
+    seen: list[Path] = []
+
+    def interrupted(path: Path) -> Mesh:
+        seen.append(path)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return read_mesh(path)
+
+    for module in ("shapespace.commands", "shapespace.batch.run"):
+        monkeypatch.setattr(f"{module}.read_mesh", interrupted)
+    arguments: dict[str, tuple[object, ...]] = {
+        "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),
+        "fit": ("fit", world.model, *world.scans, "-o", tmp_path, *FAST),
+        "check": ("check", *world.scans),
+    }
+    outcome = run(*arguments[command])
+    assert outcome.code == 130
+    assert outcome.err.splitlines()[-1] == "shapespace: stopped; the files written so far are whole."
+    assert leftovers(tmp_path) == []
+    if command == "fit":
+        assert {path.name for path in tmp_path.iterdir()} == {
+            "coefficients.csv", "scan_0.fit.json", "scan_0.fitted.ply",
+        }  # fmt: skip
+        with (tmp_path / "coefficients.csv").open(newline="") as stream:
+            assert [row["scan"] for row in csv.DictReader(stream)] == ["scan_0"]
+    else:
+        assert not list(tmp_path.iterdir())
+
+
+class _FullOutput(io.StringIO):
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_output_that_cannot_be_written_is_said(
+    world: World, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from shapespace.cli import main
+
+    monkeypatch.setattr(sys, "stdout", _FullOutput())
+    assert main(["info", str(world.model)]) == 2
+    assert "No space left on device" in capsys.readouterr().err

@@ -1,0 +1,118 @@
+"""The command as the system runs it: start-up, signals, pipes, and workers of their own."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from conftest import World, leftovers
+from shapespace.io.meshes import read_mesh
+
+COMMAND = [sys.executable, "-m", "shapespace"]
+
+
+def call(*arguments: object, **options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=60, env={**os.environ, **options}
+    )
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, shapespace.cli as c\ntry: c.main(['fit', '--help'])\nexcept SystemExit: pass\nprint(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert not loaded & {"numpy", "scipy", "h5py", "igl", "tqdm", "pooch", "matplotlib"}
+
+
+def test_the_console_script_and_the_module_are_the_same_command() -> None:
+    script = Path(sys.executable).with_name("shapespace")
+    if not script.is_file():
+        pytest.skip("the package's console script is not installed beside python")
+    both = [subprocess.run([*c, "--help"], capture_output=True, text=True) for c in ([str(script)], COMMAND)]
+    assert both[0].returncode == both[1].returncode == 0
+    assert both[0].stdout == both[1].stdout
+
+
+def test_exit_codes_reach_the_shell(world: World, tmp_path: Path) -> None:
+    done = call("check", tmp_path / "none.ply", world.scan)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert call("info", tmp_path / "none.ply").returncode == 2
+    assert call("info", world.model, "--json").returncode == 0
+
+
+def test_names_that_the_terminal_cannot_show_are_printed_as_escapes(world: World, tmp_path: Path) -> None:
+    scan = tmp_path / "顔\udcff.ply"
+    shutil.copy(world.scan, scan)
+    done = call("check", scan, PYTHONIOENCODING="ascii")
+    assert done.returncode == 0, done.stderr
+    assert r"\u9854\udcff.ply" in done.stdout
+
+
+def test_a_reader_that_goes_away_is_no_error(world: World) -> None:
+    scans = [world.scan] * 300
+    with subprocess.Popen(
+        [*COMMAND, "check", *map(str, scans)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(60) == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_standard_output_on_a_full_disk_is_one_sentence(world: World) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, "info", str(world.model)], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("shapespace: ")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_in_a_batch_leaves_whole_files_that_resume_takes_up(jobs: int, world: World, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for k in range(150):
+        shutil.copy(world.scans[k % 3], scans / f"s{k:03d}.ply")
+    out = tmp_path / "out"
+    command = [*COMMAND, "fit", str(world.model), str(scans), "-o", str(out), "--jobs", str(jobs)]
+    # A session of its own, so that like in a terminal the workers get the signal too.
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    limit = time.monotonic() + 60
+    while len(list(out.glob("*.fit.json"))) < 3 and time.monotonic() < limit:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    printed, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert printed == ""
+    assert said.splitlines() == ["shapespace: stopped; the files written so far are whole."]
+    assert leftovers(tmp_path) == []
+    records = sorted(out.glob("*.fit.json"))
+    assert 3 <= len(records) < 150
+    for path in records:
+        assert json.loads(path.read_text())["status"] == "converged"
+        assert len(read_mesh(out / path.name.replace(".fit.json", ".fitted.ply")).vertices) == 400
+    with (out / "coefficients.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert 1 <= len(rows) <= len(records)
+    # Resumed on what is done, nothing is fitted again.
+    times = {path: path.stat().st_mtime_ns for path in records}
+    done = call(
+        "fit", world.model, *(scans / p.name.replace(".fit.json", ".ply") for p in records), "-o", out, "--resume"
+    )
+    assert done.returncode == 0, done.stderr
+    assert {path: path.stat().st_mtime_ns for path in records} == times
