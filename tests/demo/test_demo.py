@@ -14,7 +14,7 @@ def demo(tmp_path_factory, monkeypatch_module):
     folder = tmp_path_factory.mktemp("demo")
     monkeypatch_module.setenv("SHAPESPACE_CACHE", str(folder / "no cache"))
     monkeypatch_module.delenv("SHAPESPACE_DATA", raising=False)
-    scale = DemoScale(training=40, triangles=6_000, stop_motion_mm=0.05)
+    scale = DemoScale(training=40, triangles=16_000, stop_motion_mm=0.02)
     return run_demo(folder, quick=True, quiet=True, scale=scale).parent
 
 

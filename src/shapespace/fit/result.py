@@ -24,6 +24,7 @@ _SHRUNK_BY_SHAPE = 0.85
 _SHRUNK_IN_ALL = 0.7
 _LEADING_SHARE = 0.9
 _IMPLAUSIBLE = 1e-6
+_CLOSE_SHARE = 0.01
 _FAR_SHARE = 0.05
 _GAP_RATIO = 4.0
 _GAP_SHARE = 0.02
@@ -150,6 +151,7 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
         )
     leading = modes_for_variance(model.stddev**2, _LEADING_SHARE)
     z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
-    if z2 > chi2.isf(_IMPLAUSIBLE, leading) / leading:
+    # An extreme shape that lies on the scan all over is what the scan shows.
+    if z2 > chi2.isf(_IMPLAUSIBLE, leading) / leading and forward.rms > _CLOSE_SHARE * size_mm:
         found.append(f"the shape is implausible: its main coefficients lie {np.sqrt(z2):.1f} standard deviations out")
     return found
