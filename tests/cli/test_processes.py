@@ -16,6 +16,8 @@ from conftest import World, leftovers
 from shapespace.io.meshes import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
+# Buffered output, as users have it, meets a full disk only when it is flushed.
+BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 
 
 def call(*arguments: object, **options: str) -> subprocess.CompletedProcess[str]:
@@ -73,7 +75,12 @@ def test_a_reader_that_goes_away_is_no_error(world: World) -> None:
 def test_standard_output_on_a_full_disk_is_one_sentence(world: World) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [*COMMAND, "info", str(world.model)], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60
+            [*COMMAND, "info", str(world.model)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            env=BUFFERED,
         )
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("shapespace: ")
@@ -116,3 +123,20 @@ def test_ctrl_c_in_a_batch_leaves_whole_files_that_resume_takes_up(jobs: int, wo
     )
     assert done.returncode == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in records} == times
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_while_the_workers_start_is_quiet_too(world: World, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [*COMMAND, "fit", str(world.model), *map(str, world.scans * 20), "-o", str(out), "--jobs", "2"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    limit = time.monotonic() + 60
+    while not out.exists() and time.monotonic() < limit:
+        time.sleep(0.005)
+    time.sleep(0.2)  # the workers are importing now, which takes them longer than this
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.splitlines() == ["shapespace: stopped; the files written so far are whole."]
