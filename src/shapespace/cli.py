@@ -95,7 +95,7 @@ def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool 
 def _add_demo(commands: Any) -> None:
     sub = _add(commands, "demo", "both experiments of the paper, ending in a report", "shapespace demo --quick")
     sub.add_argument("--out", type=Path, default=Path("shapespace-demo"), metavar="DIR", help="where to write")
-    sub.add_argument("--quick", action="store_true", help="coarser scans and fewer of them, under a minute")
+    sub.add_argument("--quick", action="store_true", help="coarser scans and an earlier stop, under a minute")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=_demo)
 
@@ -234,7 +234,7 @@ def _data_faces(arguments: argparse.Namespace) -> int:
     if arguments.json:
         _print_json({"folder": str(arguments.output), "faces": count})
     else:
-        _print(f"{count} faces in {arguments.output}")
+        _print(f"{count} {'face' if count == 1 else 'faces'} in {arguments.output}")
     return 0
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import os
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,11 +21,14 @@ from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.files import make_folder, read_error, write_bytes
+from shapespace.io.files import make_folder, read_bytes, read_error, write_bytes, write_text
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, Mesh
+
+ABOUT = "about.json"
+"""Beside simulated faces: their provenance and licence, for the models made of them."""
 
 
 def progress_bar(total: int | None, what: str, unit: str, *, quiet: bool) -> tqdm[Any]:
@@ -106,11 +109,18 @@ def build(
             mesh = _training_mesh(file)
             loaded.append(mesh if unit == "mm" else mesh.with_vertices(mesh.vertices * MM_PER_UNIT[unit]))
             bar.update()
+    marks = _landmark_indices(landmarks, loaded[0], MM_PER_UNIT[unit]) if landmarks else {}
     beside = files[0].parent / "landmarks.csv"
     if landmarks is None and beside.is_file():
-        landmarks = beside
-        notes.append(f"Landmarks are taken from {beside}.")
-    marks = _landmark_indices(landmarks, loaded[0], MM_PER_UNIT[unit]) if landmarks else {}
+        try:
+            marks = _landmark_indices(beside, loaded[0], MM_PER_UNIT[unit])
+            notes.append(f"Landmarks are taken from {beside}.")
+        except ShapespaceError as error:
+            notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
+    about = _about(files[0].parent / ABOUT)
+    if about and not (provenance or licence):
+        provenance, licence = about
+        notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
     if modes == "auto" and len(files) < 4:
         modes = None
         notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
@@ -126,6 +136,17 @@ def build(
     )
     model.save(output)
     return model, notes
+
+
+def _about(path: Path) -> tuple[str, str] | None:
+    """Return the provenance and licence that `data faces` left beside its meshes, or None."""
+    if not path.is_file():
+        return None
+    try:
+        stored = json.loads(read_bytes(path))
+        return str(stored["provenance"]), str(stored["licence"])
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def _training_mesh(path: Path) -> Mesh:
@@ -286,6 +307,12 @@ def write_simulated_faces(
             )
         else:
             bundled.write_faces(folder, subjects=subjects, expressions=expressions, seed=seed, progress=progress)
+    licence, of = ("MIT", f"ICT-FaceKit, area {area}") if source == "ict-facekit" else (bundled.LICENSE, "shapespace")
+    about = {
+        "provenance": f"{subjects} simulated people of {of}, seed {seed}, expressions: {', '.join(expressions)}",
+        "licence": licence,
+    }
+    write_text(folder / ABOUT, json.dumps(about, indent=1) + "\n")
     return total
 
 
@@ -301,8 +328,3 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
         DataError: no such data set, no network, or content that does not match its hash.
     """
     return fetch.data_get(name, to=to, progress=False if quiet else None)
-
-
-def machine() -> str:
-    """Return the machine in words, for records."""
-    return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"

@@ -19,6 +19,8 @@ _WRITE_HINTS = {
     errno.EROFS: "the file system is read-only; choose another folder",
     errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
     errno.EISDIR: "it is a folder; give a file name",
+    errno.ENOENT: "the folder cannot be made there; choose another folder",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EEXIST: "a file of that name is in the way; choose another folder",
 }
 
