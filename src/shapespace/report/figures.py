@@ -16,13 +16,23 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
-from shapespace.report.render import CLAY, Camera, Colour, Image, Layer, render, render_layers, render_maps
+from shapespace.report.render import (
+    CLAY,
+    Camera,
+    Colour,
+    Image,
+    Layer,
+    render,
+    render_layers,
+    render_maps,
+    render_series,
+)
 from shapespace.types import FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:
@@ -176,15 +186,13 @@ def spectrum_figure(
 def overlay_figure(fit: StagedFit, *, title: str) -> Figure:
     """Draw scan and model over each other at the three moments, from two sides (figures 4 to 7)."""
     size = (370, 460)
+    scan = Layer(fit.scan, SCAN_COLOUR)
     rows = [
-        [
-            render_layers(
-                [Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)],
-                camera=fit.camera(yaw_deg=yaw, aspect=size[0] / size[1]),
-                size=size,
-            )
-            for surface in _ordered(fit.surfaces)
-        ]
+        render_series(
+            [[scan, Layer(fit.surfaces[stage], MODEL_COLOUR)] for stage in STAGE_TITLES],
+            camera=fit.camera(yaw_deg=yaw, aspect=size[0] / size[1]),
+            size=size,
+        )
         for yaw in (0.0, 50.0)
     ]
     means = [
@@ -210,14 +218,9 @@ def portrait_figure(fits: Sequence[StagedFit], labels: Sequence[str], *, title: 
     for fit in fits:
         camera = fit.camera(yaw_deg=yaw_deg, aspect=size[0] / size[1])
         final, far = fit.surfaces["final"], fit.model_to_scan_mm["final"]
-        rows.append(
-            [
-                render(fit.scan, camera=camera, size=size, colour=SCAN_COLOUR),
-                render(final, camera=camera, size=size, colour=MODEL_COLOUR),
-                render_layers([Layer(fit.scan, SCAN_COLOUR), Layer(final, MODEL_COLOUR)], camera=camera, size=size),
-                render(final, camera=camera, size=size, scalars=far, colormap=table, vmax=top),
-            ]
-        )
+        scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(final, MODEL_COLOUR)
+        mapped = Layer(final, scalars=far, colormap=table, vmax=top)
+        rows.append(render_series([[scan], [model], [scan, model], [mapped]], camera=camera, size=size))
         titles.append(["scan", "model, fitted", "both, the nearer one shown", f"distance: mean {_mm(far.mean())}"])
     return _grid(
         rows,
@@ -278,7 +281,7 @@ def distance_histograms(fit: StagedFit, *, title: str, bins: int = 50) -> Figure
             _legend(axes, loc="upper right")
         _style(axes)
     _heading(figure, title)
-    figure.tight_layout(rect=(0, 0, 1, 0.94), w_pad=0.6)
+    figure.tight_layout(rect=(0, 0, 1, 0.91), w_pad=0.6)
     return figure
 
 
@@ -359,7 +362,7 @@ def b_space(
     scans: Sequence[Coefficients], *, title: str, neutral_b: FloatArray | None, neutral_z: FloatArray | None
 ) -> Figure:
     """Draw b1, b2 and b3 (figure 10) from two sides, as `b_plane` does."""
-    figure = Figure(figsize=(7.6, 4.1), dpi=_DPI, facecolor="white")
+    figure = Figure(figsize=(7.6, 3.9), dpi=_DPI, facecolor="white")
     every = np.stack([scan.b[:3] for scan in scans])
     if neutral_b is not None:
         every = np.concatenate([every, neutral_b[None, :3]])
@@ -425,31 +428,7 @@ def threshold_figure(fits: Sequence[StagedFit], *, title: str) -> Figure:
 
 
 def distance_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> Figure:
-    """Draw the distance from the fitted model to the scan as bands at 2, 4, 6, 8 and 10 mm, all fits at one scale."""
-    size = (280, 360)
-    table = _bands()
-    images = [
-        render(
-            fit.surfaces["final"],
-            camera=fit.camera(aspect=size[0] / size[1]),
-            size=size,
-            scalars=fit.model_to_scan_mm["final"],
-            colormap=table,
-            vmax=12.0,
-        )
-        for fit in fits
-    ]
-    captions = [f"{fit.name}: max {_mm(fit.model_to_scan_mm['final'].max())}" for fit in fits]
-    return _grid(
-        _rows(images, columns),
-        titles=_rows(captions, columns),
-        heading=title,
-        scale=_Scale("model to scan (mm)", "bands", 0.0, 12.0),
-    )
-
-
-def detail_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> Figure:
-    """Draw the same distances on one continuous scale that ends at the 99th percentile of all fits."""
+    """Draw the distance from each fitted model to its scan, on one scale up to the 99th percentile of all."""
     size = (280, 360)
     top = _nice_ceiling(float(np.percentile(np.concatenate([f.model_to_scan_mm["final"] for f in fits]), 99)))
     table = _table("viridis")
@@ -483,7 +462,7 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> tuple[bytes, tuple
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(pixels)).save(
-        stream, format="WEBP", lossless=lossless, quality=60 if lossless else 86, method=3 if lossless else 4
+        stream, format="WEBP", lossless=lossless, quality=20 if lossless else 86, method=1 if lossless else 2
     )
     return stream.getvalue(), (pixels.shape[1], pixels.shape[0])
 
@@ -551,19 +530,9 @@ def _grid(
 
 def _colourbar(figure: Figure, scale: _Scale, line: float) -> None:
     axes = figure.add_axes((0.3, 2.1 * line, 0.4, 0.5 * line))
-    if scale.colormap == "bands":
-        edges = [0.0, *THRESHOLDS_MM, 12.0]
-        colours = ListedColormap(_bands())
-        norm: Normalize = BoundaryNorm(edges, len(edges) - 1)
-        labels = ["0", *(f"{limit:g}" for limit in THRESHOLDS_MM), "more"]
-        bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal", ticks=edges)
-        bar.set_ticklabels(labels)
-    else:
-        bar = figure.colorbar(
-            ScalarMappable(Normalize(scale.low, scale.high), scale.colormap),
-            cax=axes,
-            orientation="horizontal",
-        )
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(scale.low, scale.high), scale.colormap), cax=axes, orientation="horizontal"
+    )
     bar.set_label(scale.label, fontsize=_FONT - 0.5, color=_INK, labelpad=1)
     bar.ax.tick_params(labelsize=_FONT - 1.5, colors=_INK, length=2, pad=1.5)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue, reportUnknownMemberType]  # stub lacks it
@@ -578,13 +547,22 @@ def _chart(title: str, *, height: float) -> tuple[Figure, Axes]:
 
 def _finish(figure: Figure, axes: Axes) -> Figure:
     _style(axes)
-    figure.tight_layout(rect=(0, 0, 1, 0.95))
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.3 / float(figure.get_figheight())))
     return figure
 
 
 def _heading(figure: Figure, title: str, y: float = 0.985) -> None:
-    figure.suptitle(
-        _plain(title), x=0.01, y=y, ha="left", va="top", fontsize=_FONT + 0.5, fontweight="bold", color=_INK
+    # Not a suptitle, for which the layout would make room twice.
+    figure.text(
+        0.01,
+        y,
+        _plain(title),
+        ha="left",
+        va="top",
+        fontsize=_FONT + 0.5,
+        fontweight="bold",
+        color=_INK,
+        in_layout=False,
     )
 
 
@@ -638,10 +616,6 @@ def _line(
     return neutral_b + ends[:, None] * (direction * stddev)
 
 
-def _ordered(surfaces: Mapping[str, Mesh]) -> list[Mesh]:
-    return [surfaces[stage] for stage in STAGE_TITLES]
-
-
 def _rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
 
@@ -650,17 +624,12 @@ def _table(name: str) -> FloatArray:
     return np.asarray(matplotlib.colormaps[name](np.linspace(0, 1, 256)), dtype=np.float64)[:, :3]
 
 
-def _bands() -> FloatArray:
-    """Return a colour for each band of 2 mm, from near to far."""
-    return np.asarray(matplotlib.colormaps["viridis"](np.linspace(0.08, 1, 6)), dtype=np.float64)[:, :3]
-
-
 def _nice_ceiling(value: float) -> float:
-    """Return the next of 1, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten at or above `value`."""
+    """Return a round number at or a little above `value`."""
     if not value > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    steps = np.array([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    steps = np.array([1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9, 10])
     return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
 
 

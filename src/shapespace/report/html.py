@@ -9,11 +9,12 @@ import base64
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -96,7 +97,7 @@ class _Page:
     def html(self) -> str:
         title = "Low-dimensional surface parameterisation: the paper, run again"
         css = files("shapespace.report").joinpath("assets/report.css").read_text(encoding="utf-8")
-        made = f"shapespace {self.demo.get('version', '')}, {self.demo.get('created', '')}"
+        made = f"shapespace {self.demo.get('version', '')}, {_moment(self.demo.get('created'))}"
         quick = " This was the quick demo: coarser scans and an earlier stop." if self.quick else ""
         sections = [
             self.guarded("Summary", self.summary),
@@ -177,9 +178,12 @@ class _Page:
 
     def entries(self) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
         """Return the entries of the fits of both experiments."""
-        first = list((self.demo.get("experiment1") or {}).get("fits") or [])
-        cases = (self.demo.get("experiment2") or {}).get("cases") or []
-        return first, [case["fit"] for case in cases if case.get("fit")]
+        first = _list(_mapping(self.demo.get("experiment1")).get("fits"))
+        return first, [case["fit"] for case in self.cases() if case.get("fit")]
+
+    def cases(self) -> list[Mapping[str, Any]]:
+        """Return the cases of experiment 2."""
+        return _list(_mapping(self.demo.get("experiment2")).get("cases"))
 
     def summary(self) -> str:
         return "\n".join(
@@ -201,12 +205,16 @@ class _Page:
         rest = ", ".join(
             f"{counts[key]} {word}" for key, word in _STATUS_WORDS.items() if counts[key] and key != "converged"
         )
+        modes = str(_mapping(self.demo.get("experiment1")).get("modes_for_98_5", "–"))
         tiles = [
-            (f"{trusted} <small>of {len(first) + len(second)}</small>", "fits can be trusted: they converged and nothing speaks against them"),
-            (_esc(str((self.demo.get("experiment1") or {}).get("modes_for_98_5", "–"))), "modes hold 98.5 % of the variance of one person's expressions"),
+            (
+                f"{trusted} <small>of {len(first) + len(second)}</small>",
+                "fits can be trusted: they converged and nothing speaks against them",
+            ),
+            (_esc(modes), "modes hold 98.5 % of the variance of one person's expressions"),
             (_mm_html(_mean(distances)), "mean closest distance of the test faces, model to scan"),
-            (_mm_html(_mean(errors)), f"their true vertex error; no fit in this model can be below {_mm(_mean(floors))}"),
-        ]  # fmt: skip
+            (_mm_html(_mean(errors)), f"their true vertex error; the model's best possible is {_mm(_mean(floors))}"),
+        ]
         blocks = "".join(f"<div><dd>{value}</dd><dt>{_esc(text)}</dt></div>" for value, text in tiles)
         told = (
             f"{len(first)} simulated scans of one person's expressions and {len(second)} "
@@ -236,11 +244,11 @@ class _Page:
             middle = usable[len(usable) // 2]
             chosen.append((self.staged(middle, middle.label), f"{middle.label} (simulated)"))
         unread: list[str] = []
-        for case in (self.demo.get("experiment2") or {}).get("cases") or []:
+        for case in self.cases():
             try:
                 fit = self.fit(case["fit"])
                 if fit.pictured:
-                    chosen.append((self.staged(fit, fit.name), _short(case)))
+                    chosen.append((self.staged(fit, _short(case)), _short(case)))
             except ShapespaceError as error:
                 unread.append(str(error))
         if not chosen:
@@ -256,7 +264,7 @@ class _Page:
         ) + _problems("Not in the picture", unread)
 
     def paper_table(self) -> str:
-        rows = self.demo.get("paper_table") or []
+        rows = _list(self.demo.get("paper_table"))
         if not rows:
             raise FileFormatError("demo.json holds no comparison with the paper; run the demo again.")
         heads = ("Quantity", "Paper", "This run", "True error", "Why it differs")
@@ -279,20 +287,20 @@ class _Page:
         )
 
     def experiment_1(self) -> str:
-        experiment = self.demo["experiment1"]
+        experiment = _mapping(self.demo["experiment1"])
         intro = (
             f"{experiment.get('title', 'Expressions of one person')}: {experiment.get('n_training', '?')} faces of one "
             f"simulated person make the model, {experiment.get('modes_for_98_5', '?')} modes hold 98.5 % of their "
             "variance, and unseen expressions are fitted as raw surfaces: triangulated anew, moved, turned, scaled, "
             "with 0.2 mm noise."
         )
-        fits, problems = self.readable(experiment.get("fits") or [])
+        fits, problems = self.readable(_list(experiment.get("fits")))
         parts = [
             ("The training faces", lambda: self.training(experiment)),
             ("Mean and first modes", lambda: self.modes(experiment)),
             ("The test faces", lambda: self.test_faces(fits)),
             ("Alignment, before and after", lambda: self.alignment(self.farthest(fits))),
-            ("All test faces, fitted", lambda: self.all_fitted(fits)),
+            ("Test faces, fitted", lambda: self.all_fitted(fits)),
             ("Expressions as directions", lambda: self.b_plots(experiment, fits)),
             ("Distance maps", lambda: self.maps(fits)),
             ("Convergence and coefficients", lambda: self.convergence(self.farthest(fits)[:1], experiment)),
@@ -307,7 +315,7 @@ class _Page:
     def training(self, experiment: Mapping[str, Any]) -> str:
         from shapespace.report import figures
 
-        examples = list(experiment.get("training_examples") or [])[: 8 if self.quick else 12]
+        examples = _list(experiment.get("training_examples"))[: 8 if self.quick else 12]
         meshes = [self.folder.mesh(example.get("file")) for example in examples]
         figure = figures.faces_grid(
             meshes,
@@ -332,8 +340,8 @@ class _Page:
         )
         out = _figure(
             picture,
-            f"{paper}Each row: the mean with the mode at −3, 0 and +3 standard deviations, and how far each point moves "
-            "at 3. One scale for all rows.",
+            f"{paper}Each row: the mean with the mode at −3, 0 and +3 standard deviations, and how far each point "
+            "moves at 3. One scale for all rows.",
             alt=f"Mean face and the first {len(shown)} modes at minus and plus three standard deviations, with maps",
         )
         cumulative = np.asarray(experiment.get("cumulative_variance") or [], dtype=np.float64)
@@ -384,7 +392,7 @@ class _Page:
 
         staged = self.staged(fit, label)
         both = [
-            f"{fit.summary_mm(stage, 'model_to_scan', 'max'):.1f} mm {words}"
+            f"{_mm(fit.summary_mm(stage, 'model_to_scan', 'max'))} {words}"
             for stage, words in figures.STAGE_TITLES.items()
         ]
         return _figure(
@@ -404,12 +412,13 @@ class _Page:
         shown, absent = self.pictured(_tests(fits))
         if not shown:
             return absent
+        shown = _strongest(shown) if self.quick else shown
         figure = figures.aligned_grid([s for _, s in shown], title="Scan and fitted model over each other")
         return (
             _figure(
                 figure,
-                "Model-to-scan mean above each. The scan reaches beyond the model nowhere by design, so what shows is the "
-                "mixture of two surfaces that coincide.",
+                "Where the surfaces coincide, noise decides which one is seen: a fine mixture of both colours is a "
+                "close fit, a large patch of one is not. Above each: mean distance, model to scan.",
                 alt="Overlays of scan and fitted model for " + ", ".join(s.name for _, s in shown),
             )
             + absent
@@ -418,8 +427,8 @@ class _Page:
     def b_plots(self, experiment: Mapping[str, Any], fits: Sequence[SavedFit]) -> str:
         from shapespace.report import figures
 
-        scores = experiment.get("scores") or {}
-        left_out = {str(name) for name in scores.get("left_out") or []}
+        scores = _mapping(experiment.get("scores"))
+        left_out = {str(name) for name in _list(scores.get("left_out"))}
         kept = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
         scans = [_coefficients(fit) for fit in _tests(kept)]
         neutral = next((fit for fit in kept if not fit.entry.get("intensity")), None)
@@ -433,18 +442,19 @@ class _Page:
             )
             if neutral is None:
                 about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
+            lines = {"neutral_b": neutral_b, "neutral_z": neutral_z}
             out += _figure(
-                figures.b_plane(scans, title="Test expressions in the first two coefficients", neutral_b=neutral_b, neutral_z=neutral_z),
+                figures.b_plane(scans, title="Test expressions in the first two coefficients", **lines),
                 f"Paper, figure 9. {about}",
                 alt=f"Scatter plot of b1 and b2 for {len(scans)} faces: each expression runs along its own line",
                 chart=True,
-            )  # fmt: skip
+            )
             if all(len(scan.b) >= 3 for scan in scans):
                 out += _figure(
-                    figures.b_space(scans, title="The first three coefficients, from two sides", neutral_b=neutral_b, neutral_z=neutral_z),
+                    figures.b_space(scans, title="The first three coefficients, from two sides", **lines),
                     "Paper, figure 10. Grey lines drop to the floor of the box.",
                     alt=f"Two views of b1, b2 and b3 for {len(scans)} faces with a line for each expression",
-                )  # fmt: skip
+                )
         return out + _score_tables(scores)
 
     def maps(self, fits: Sequence[SavedFit]) -> str:
@@ -453,12 +463,7 @@ class _Page:
         shown, absent = self.pictured(_tests(fits))
         if not shown:
             return absent
-        strongest: dict[str, tuple[SavedFit, StagedFit]] = {}
-        for fit, staged in shown:
-            key = str(fit.entry.get("expression"))
-            if key not in strongest or float(fit.entry["intensity"]) > float(strongest[key][0].entry["intensity"]):
-                strongest[key] = (fit, staged)
-        chosen = [staged for _, staged in strongest.values()]
+        chosen = [staged for _, staged in _strongest(shown)]
         out = _figure(
             figures.threshold_figure(chosen, title="Where the model lies within 2 to 10 mm of the scan"),
             "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the model's "
@@ -466,11 +471,11 @@ class _Page:
             alt="Maps of the face with the part within 2, 4, 6, 8 and 10 mm of the scan for "
             + ", ".join(staged.name for staged in chosen),
         )
-        every = [staged for _, staged in shown]
+        every = chosen if self.quick else [staged for _, staged in shown]
         out += _figure(
-            figures.detail_maps(every, title="The same distances on a finer scale, all test faces"),
+            figures.distance_maps(every, title="The same distances on a finer scale"),
             "Distance from each model vertex to the scan; one scale, which ends at the 99th percentile.",
-            alt="Distance maps of all test faces on one scale",
+            alt="Distance maps on one scale for " + ", ".join(staged.name for staged in every),
         )
         return out + absent
 
@@ -500,10 +505,11 @@ class _Page:
         return out
 
     def experiment_2(self) -> str:
-        cases = list(self.demo["experiment2"].get("cases") or [])
+        cases = self.cases()
         if not cases:
             raise FileFormatError("demo.json holds no case of experiment 2; run the demo again.")
-        intro = f"<p>Models of many people's neutral faces, fitted to {'a scan' if len(cases) == 1 else 'scans'} of somebody else.</p>\n"
+        scans = "a scan" if len(cases) == 1 else "scans"
+        intro = f"<p>Models of many people's neutral faces, fitted to {scans} of somebody else.</p>\n"
         seen: set[str] = set()
         out: list[str] = []
         for case in cases:
@@ -519,7 +525,7 @@ class _Page:
 
     def case(self, case: Mapping[str, Any], *, with_model: bool) -> str:
         fit = self.fit(case["fit"])
-        kind = "Simulated scan, not a real one. " if case.get("simulated") else "A real scan. "
+        kind = "Simulated scan. " if case.get("simulated") else "Real scan. "
         note = str(case.get("note") or "")
         facts = (
             f"The model is made of {case.get('n_training', '?')} people; {case.get('modes_for_98_5', '?')} modes hold "
@@ -561,18 +567,18 @@ class _Page:
             ("Seed", str(demo.get("seed", "not recorded"))),
         ]
         rows += [
-            (f"Time, {_words(key)}", f"{float(value):.1f} s") for key, value in (demo.get("seconds") or {}).items()
+            (f"Time, {_words(key)}", f"{float(value):.1f} s") for key, value in _mapping(demo.get("seconds")).items()
         ]
         rows += [
-            (f"Setting, {_words(key)}", _plain_value(value)) for key, value in (demo.get("settings") or {}).items()
+            (f"Setting, {_words(key)}", _plain_value(value)) for key, value in _mapping(demo.get("settings")).items()
         ]
-        rows += [(f"Version, {key}", str(value)) for key, value in (demo.get("versions") or {}).items()]
+        rows += [(f"Version, {key}", str(value)) for key, value in _mapping(demo.get("versions")).items()]
         first, second = self.entries()
         fits, problems = self.readable([*first, *second])
         if fits:
             rows += [
                 (f"Fit, {_words(key)}", _plain_value(value))
-                for key, value in (fits[0].record.get("config") or {}).items()
+                for key, value in _mapping(fits[0].record.get("config")).items()
             ]
         hashes = "".join(
             f'<tr><th scope="row">{_esc(fit.name)}</th><td><code>{_esc(_hash(fit, "scan"))}</code></td>'
@@ -604,21 +610,28 @@ def _figure(figure: Figure, caption: str, *, alt: str, chart: bool = False) -> s
 
 def _fit_table(fits: Sequence[SavedFit]) -> str:
     heads = (
-        "Scan", "Status", "Model to scan: mean", "max", "Scan to model: mean", "True vertex error: mean", "max",
-        "Floor: mean", "Steps",
-    )  # fmt: skip
+        "Scan",
+        "Status",
+        "Model to scan, mean",
+        "Model to scan, max",
+        "Scan to model, mean",
+        "True vertex error, mean",
+        "True vertex error, max",
+        "Floor of that, mean",
+        "Steps",
+    )
     body = ""
     for fit in fits:
-        steps = fit.record.get("iterations") or {}
-        cells = [
-            _mm(fit.summary_mm("final", "model_to_scan", "mean")),
-            _mm(fit.summary_mm("final", "model_to_scan", "max")),
-            _mm(fit.summary_mm("final", "scan_to_model", "mean")),
-            _mm(_inner(fit.entry, "vertex_error_mm", "mean")),
-            _mm(_inner(fit.entry, "vertex_error_mm", "max")),
-            _mm(_inner(fit.entry, "floor_mm", "mean")),
-            " + ".join(str(value) for value in steps.values()) or "–",
+        lengths = [
+            fit.summary_mm("final", "model_to_scan", "mean"),
+            fit.summary_mm("final", "model_to_scan", "max"),
+            fit.summary_mm("final", "scan_to_model", "mean"),
+            _inner(fit.entry, "vertex_error_mm", "mean"),
+            _inner(fit.entry, "vertex_error_mm", "max"),
+            _inner(fit.entry, "floor_mm", "mean"),
         ]
+        cells = [_mm(length).removesuffix(" mm") for length in lengths]
+        cells.append(" + ".join(str(value) for value in _mapping(fit.record.get("iterations")).values()) or "–")
         kind = fit.status if fit.status in _STATUS_WORDS else "failed"
         body += (
             f'<tr><th scope="row">{_esc(fit.name)}</th>'
@@ -630,37 +643,39 @@ def _fit_table(fits: Sequence[SavedFit]) -> str:
         f'<th scope="col"{" class=number" if k > 1 else ""}>{_esc(text)}</th>' for k, text in enumerate(heads)
     )
     return (
-        '<div class="table" tabindex="0"><table class="figures"><caption>Final distances; steps of phase 1 + phase 2. '
-        f"A dash: not known.</caption><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n"
+        '<div class="table" tabindex="0"><table class="figures"><caption>Distances at the end, in mm; steps of phase 1 '
+        f"and phase 2. A dash: not known.</caption><thead><tr>{head}</tr></thead>"
+        f"<tbody>\n{body}</tbody></table></div>\n"
     )
 
 
 def _score_tables(scores: Mapping[str, Any]) -> str:
     """Show nested scores: those by expression as one table, single numbers as another."""
-    by_class = {key: value for key, value in scores.items() if isinstance(value, Mapping) and key.startswith("line_")}
+    by_class = {key: _mapping(value) for key, value in scores.items() if key.startswith("line_")}
     out = ""
     if by_class:
         names = list(dict.fromkeys(str(name) for value in by_class.values() for name in value))
         head = "".join(f'<th scope="col" class="number">{_esc(name)}</th>' for name in names)
         body = "".join(
             f'<tr><th scope="row">{_esc(_SCORE_WORDS.get(key, _words(key)))}</th>'
-            + "".join(f'<td class="number">{_esc(_plain_value(value.get(name)))}</td>' for name in names)
+            + "".join(f'<td class="number">{_esc(_score(value.get(name)))}</td>' for name in names)
             + "</tr>\n"
             for key, value in by_class.items()
         )
         out += (
             '<div class="table" tabindex="0"><table class="figures"><caption>Is each expression a line through '
-            f'neutral?</caption><thead><tr><th scope="col">Score</th>{head}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
+            f'neutral?</caption><thead><tr><th scope="col">Score</th>{head}</tr></thead>'
+            f"<tbody>\n{body}</tbody></table></div>\n"
         )
     rows: list[tuple[str, str]] = []
     for key, value in scores.items():
         if key in by_class:
             continue
         if isinstance(value, Mapping):
-            inner: Mapping[str, Any] = value
-            rows += [(_SCORE_WORDS.get(name, _words(name)), _plain_value(item)) for name, item in inner.items()]
+            inner = _mapping(cast(object, value))
+            rows += [(_SCORE_WORDS.get(name, _words(name)), _score(item)) for name, item in inner.items()]
         else:
-            rows.append((_SCORE_WORDS.get(key, _words(key)), _plain_value(value)))
+            rows.append((_SCORE_WORDS.get(key, _words(key)), _score(value)))
     if rows:
         body = "".join(
             f'<tr><th scope="row">{_esc(key)}</th><td class="number">{_esc(value)}</td></tr>\n' for key, value in rows
@@ -695,6 +710,14 @@ def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return [fit for fit in fits if fit.entry.get("intensity")]
 
 
+def _strongest(shown: Sequence[tuple[SavedFit, StagedFit]]) -> list[tuple[SavedFit, StagedFit]]:
+    """Return the fit of the highest intensity of each expression."""
+    best: dict[str, tuple[SavedFit, StagedFit]] = {}
+    for fit, staged in sorted(shown, key=lambda pair: float(pair[0].entry.get("intensity") or 0)):
+        best[str(fit.entry.get("expression"))] = (fit, staged)
+    return list(best.values())
+
+
 def _short(case: Mapping[str, Any]) -> str:
     """Return the name of a case that fits beside a row of pictures."""
     if case.get("simulated"):
@@ -713,12 +736,12 @@ def _modes_needed(cumulative: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 
 def _hash(fit: SavedFit, what: str) -> str:
-    source = fit.record.get(what) or {}
+    source = _mapping(fit.record.get(what))
     return f"{source.get('name', '')} {source.get('hash', 'not recorded')}"
 
 
 def _inner(entry: Mapping[str, Any], key: str, measure: str) -> float:
-    value = (entry.get(key) or {}).get(measure)
+    value = _mapping(entry.get(key)).get(measure)
     return float("nan") if value is None else float(value)
 
 
@@ -747,10 +770,32 @@ def _plain_value(value: object) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return "–" if not math.isfinite(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    if isinstance(value, (list, tuple)):
-        items: Sequence[object] = value  # pyright: ignore[reportUnknownVariableType]  # JSON: anything
-        return ", ".join(_plain_value(item) for item in items) or "none"
+    if isinstance(value, list):
+        return ", ".join(_plain_value(item) for item in _list(cast(object, value))) or "none"
     return str(value)
+
+
+def _moment(value: object) -> str:
+    """Return an ISO time stamp as people write it, or the text as it is."""
+    try:
+        return datetime.fromisoformat(str(value)).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    except (ValueError, OverflowError):
+        return str(value)
+
+
+def _score(value: object) -> str:
+    """Return a score with three decimals, as they are compared with each other."""
+    return f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else _plain_value(value)
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    """Return a JSON object, or an empty one where there is none."""
+    return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else {}
+
+
+def _list(value: object) -> list[Any]:
+    """Return a JSON list, or an empty one where there is none."""
+    return cast(list[Any], value) if isinstance(value, list) else []
 
 
 def _words(key: str) -> str:

@@ -92,9 +92,11 @@ class Camera:
         centre = ((low + high) / 2) @ axes
         if not perspective:
             return Camera(centre, height, yaw_deg, pitch_deg)
-        # Nearer parts grow in perspective: the margin pays for the half of the depth in front of the centre.
         distance = 5.0 * height + float(extent[2])
-        grown = height * (1 + 0.15 * float(extent[2]) / distance)
+        # Nearer parts grow in perspective, so the height is that of the point which reaches farthest out.
+        offset = np.abs(seen - (low + high) / 2) * (distance / (distance - (seen[:, 2:] - (low + high)[2] / 2)))
+        reach = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
+        grown = 2 * reach * (1 + 2 * margin)
         return Camera(centre, grown, yaw_deg, pitch_deg, distance)
 
 
@@ -194,12 +196,28 @@ def render_layers(
     Raises:
         InputError: a size or supersample that is not a small positive whole number.
     """
+    return render_series([layers], camera=camera, size=size, background=background, supersample=supersample)[0]
+
+
+def render_series(
+    pictures: Sequence[Sequence[Layer]],
+    *,
+    camera: Camera,
+    size: tuple[int, int] = (480, 560),
+    background: Colour = WHITE,
+    supersample: int = 2,
+) -> list[Image]:
+    """Return several pictures from one camera; a `Layer` that takes part in several is rasterised once.
+
+    Arguments and errors as in `render_layers`.
+    """
     _check_size(size, supersample)
-    width, height = size
-    fine = (width * supersample, height * supersample)
-    drawn = [(layer, _surfels(layer, camera, fine, supersample)) for layer in layers]
-    pieces = [(_shaded(layer, surfels), surfels, layer.opacity) for layer, surfels in drawn]
-    return _composed(pieces, size, supersample, background)
+    fine = (size[0] * supersample, size[1] * supersample)
+    pieces: dict[int, tuple[_Single, _Surfels, float]] = {}
+    for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
+        surfels = _surfels(layer, camera, fine, supersample)
+        pieces[id(layer)] = (_shaded(layer, surfels), surfels, layer.opacity)
+    return [_composed([pieces[id(layer)] for layer in layers], size, supersample, background) for layers in pictures]
 
 
 def render_maps(
@@ -421,15 +439,15 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     at = np.stack([pixel % size[0] + 0.5, pixel // size[0] + 0.5], axis=1)
     corners = screen[faces].reshape(-1, 6)[shown]
     a, b, c = ((corners[:, 2 * k : 2 * k + 2] - at).T.astype(np.float32) for k in range(3))
-    shares = [_turn(b, c), _turn(c, a), _turn(a, b)]
-    area = shares[0] + shares[1] + shares[2]
+    turns = [_turn(b, c), _turn(c, a), _turn(a, b)]
+    area = turns[0] + turns[1] + turns[2]
     back = area > 0
-    shares = [np.clip(share / np.where(area == 0, 1, area), 0, 1) for share in shares]
+    shares: list[_Single] = [_share(turn, area) for turn in turns]
     if camera.distance_mm is not None:
         nearness = -depth.astype(np.float32)[faces][shown]
-        shares = [share * nearness[:, k] for k, share in enumerate(shares)]
+        shares = [shares[k] * nearness[:, k] for k in range(3)]
     total = np.maximum(shares[0] + shares[1] + shares[2], 1e-30)
-    shares = [share / total for share in shares]
+    shares = [(part / total).astype(np.float32, copy=False) for part in shares]
     normals = (vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
     # On the screen y points down, so a triangle that faces the eye turns the negative way.
     normal = _unit(_blend(shares, normals[faces].reshape(-1, 9)[shown]) * np.where(back, -1, 1).astype(np.float32))
@@ -442,6 +460,10 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
 
 def _turn(p: _Single, q: _Single) -> _Single:
     return p[0] * q[1] - p[1] * q[0]
+
+
+def _share(part: _Single, whole: _Single) -> _Single:
+    return np.clip(part / np.where(whole == 0, np.float32(1), whole), 0, 1).astype(np.float32)
 
 
 def _blend(shares: Sequence[_Single], values: _Single) -> _Single:

@@ -130,7 +130,9 @@ class SavedFit:
 
     def summary_mm(self, stage: str, direction: str, measure: str) -> float:
         """Return a distance summary in mm, or not-a-number where the record has none."""
-        value = (self.record.get("distances_mm") or {}).get(stage, {}).get(direction, {}).get(measure)
+        value: Any = self.record.get("distances_mm")
+        for key in (stage, direction, measure):
+            value = cast(Mapping[str, Any], value).get(key) if isinstance(value, Mapping) else None
         return float("nan") if value is None else float(value)
 
     def numbers(self, key: str) -> FloatArray:
@@ -151,7 +153,7 @@ class SavedFit:
         """Return (phase, iteration, RMS in mm) in order."""
         return [
             (int(row["phase"]), int(row["iteration"]), float(row["rms_mm"]))
-            for row in self.record.get("history") or []
+            for row in cast(list[Mapping[str, Any]], self.record.get("history") or [])
             if row["rms_mm"] is not None
         ]
 

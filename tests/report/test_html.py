@@ -1,0 +1,266 @@
+import base64
+import importlib.util
+import io
+import json
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from shapespace.errors import FileError, FileFormatError, ShapespaceError
+from shapespace.report.html import LARGEST_REPORT_BYTES, require_report_extra, write_report
+
+VOID = {"meta", "link", "img", "br"}
+
+
+class Page(HTMLParser):
+    """What a browser would find in the page; it fails on tags that do not close."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.headings: list[str] = []
+        self.text: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in ("h1", "h2", "h3", "h4"):
+            self.headings.append(data)
+        if "style" not in self.open:
+            self.text.append(data)
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+    def images(self) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.tags if tag == "img"]
+
+
+@pytest.fixture
+def folder(demo_template: Path, tmp_path: Path) -> Path:
+    shutil.copytree(demo_template, tmp_path / "demo")
+    return tmp_path / "demo"
+
+
+def edit(folder: Path, change: Any, name: str = "demo.json") -> None:
+    content = json.loads((folder / name).read_text())
+    change(content)
+    (folder / name).write_text(json.dumps(content))
+
+
+@pytest.fixture
+def lean(folder: Path) -> Path:
+    """The same without fits, for tests of what else the page is made of."""
+    edit(folder, lambda demo: (demo["experiment1"].update(fits=[]), demo["experiment2"].update(cases=[])))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(demo_template: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("page") / "demo"
+    shutil.copytree(demo_template, folder)
+    path = write_report(folder)
+    assert path == folder / "report.html"
+    return path.read_text(encoding="utf-8")
+
+
+def test_the_page_needs_nothing_from_outside(page: str) -> None:
+    parsed = Page(page)
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:|//|file:)""", page)
+    assert "<script" not in page and "@import" not in page and "url(" not in page
+    for tag, attributes in parsed.tags:
+        for key in ("src", "href"):
+            value = attributes.get(key)
+            assert value is None or value.startswith(("data:", "#")), (tag, value)
+    assert len(page.encode()) <= LARGEST_REPORT_BYTES
+
+
+def test_every_section_is_made_when_everything_is_there(page: str) -> None:
+    assert 'class="broken"' not in page
+    headings = Page(page).headings
+    for wanted in ("Summary", "The paper beside this run", "Experiment 1", "Experiment 2", "Distance maps"):
+        assert wanted in headings
+    order = [headings.index(name) for name in ("Summary", "Experiment 1", "Experiment 2")]
+    assert order == sorted(order)
+
+
+def test_every_picture_can_be_decoded_has_words_for_it_and_its_own_size(page: str) -> None:
+    images = Page(page).images()
+    assert len(images) >= 15
+    for attributes in images:
+        assert len(attributes["alt"] or "") > 20
+        kind, _, data = (attributes["src"] or "").partition(",")
+        assert kind == "data:image/webp;base64"
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            assert (str(image.width), str(image.height)) == (attributes["width"], attributes["height"])
+            assert np.ptp(np.asarray(image.convert("L"))) > 100
+
+
+def test_links_within_the_page_lead_somewhere(page: str) -> None:
+    tags = Page(page).tags
+    anchors = {attributes["id"] for _, attributes in tags if "id" in attributes}
+    links = {str(attributes["href"])[1:] for tag, attributes in tags if tag == "a"}
+    assert links and links <= anchors
+
+
+def test_numbers_of_the_files_stand_in_the_page_with_units(page: str) -> None:
+    words = Page(page).words
+    for wanted in ("1.24 mm", "0.51 mm", "0.21 mm", "6 of 6", "Other expressions.", "0.938", "2026-01-02 03:04 UTC"):
+        assert wanted in words
+
+
+def test_a_simulated_scan_is_called_simulated(page: str) -> None:
+    assert "Simulated scan. It has hair." in Page(page).words
+
+
+def test_strings_from_files_stay_text(folder: Path) -> None:
+    evil = "<script>alert(1)</script>\"'>&$x^ $"
+    paths = {"file", "scan", "json", "stages", "mode_shapes", "model", "created"}
+
+    def poison(value: Any, key: str = "") -> Any:
+        if isinstance(value, str):
+            return value if key in paths else value + evil
+        if isinstance(value, list):
+            return [poison(item, key) for item in value]
+        if isinstance(value, dict):
+            return {
+                (k + evil if key in ("versions", "scores", "line_spearman", "seconds") else k): poison(item, k)
+                for k, item in value.items()
+            }
+        return value
+
+    for path in [folder / "demo.json", *folder.glob("*/fits/*.fit.json")]:
+        path.write_text(json.dumps(poison(json.loads(path.read_text()))))
+    page = write_report(folder).read_text(encoding="utf-8")
+    parsed = Page(page)
+    assert not [tag for tag, _ in parsed.tags if tag == "script"]
+    assert "<script" not in page and 'class="broken"' not in page
+    assert "anger<script>alert(1)</script>" in parsed.words
+    assert all(set(attributes) <= {"alt", "width", "height", "src"} for attributes in parsed.images())
+
+
+def test_control_characters_and_lone_surrogates_do_not_stop_the_report(lean: Path) -> None:
+    edit(lean, lambda demo: demo.update(machine="a\x00b\ud800c\u202ed"))
+    edit(lean, lambda demo: demo["experiment1"]["training_examples"][0].update(label="\u4f60\x07\ud801"))
+    page = write_report(lean).read_text(encoding="utf-8")
+    assert "\x00" not in page and "a\ufffdb\ufffdc" in page
+    assert "4 faces of one person" in page
+
+
+def test_a_section_that_fails_says_why_and_spares_the_rest(folder: Path) -> None:
+    (folder / "experiment1" / "modes.npz").unlink()
+    (folder / "experiment1" / "training" / "002.ply").write_bytes(b"not a mesh")
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert page.count('class="broken"') == 2
+    words = Page(page).words
+    assert "modes.npz: there is no such file" in words and "002.ply" in words
+    assert len(Page(page).images()) >= 12
+
+
+def test_failed_and_unreadable_fits_are_named_and_cost_only_themselves(folder: Path) -> None:
+    edit(folder, lambda demo: demo["experiment1"]["fits"][1].update(stages=None, vertex_error_mm=None, floor_mm=None))
+    failed = {"format": "shapespace fit", "status": "failed", "reason": "The scan has 3 points only.", "config": {}}
+    (folder / "experiment1" / "fits" / "anger_050.fit.json").write_text(json.dumps(failed))
+    (folder / "experiment1" / "fits" / "smile_050.fit.json").write_text('{"status": ')
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert 'class="broken"' not in page
+    words = Page(page).words
+    assert "4 of 6" in words and "Besides those that converged: 1 failed." in words
+    assert "anger_050: The scan has 3 points only." in words
+    assert "smile_050.fit.json is not JSON" in words
+    pictures = " ".join(str(attributes["alt"]) for attributes in Page(page).images())
+    assert "anger 50 %" not in pictures and "smile 50 %" not in pictures and "smile 100 %" in pictures
+
+
+@pytest.mark.parametrize("part", ["experiment1", "experiment2", "paper_table", "seconds", "versions"])
+@pytest.mark.parametrize("value", [None, 3, "text", [], {}, [None]])
+def test_a_part_of_another_kind_never_stops_the_report(folder: Path, part: str, value: Any) -> None:
+    edit(folder, lambda demo: demo.update({part: value}))
+    # The pictures are slow and not the point here.
+    for name in ("experiment1", "experiment2"):
+        shutil.rmtree(folder / name)
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert Page(page).headings.count("Experiment 1") == 1
+
+
+def test_files_outside_the_folder_are_not_read(lean: Path) -> None:
+    secret = lean.parent / "secret.ply"
+    shutil.copy(lean / "experiment1" / "training" / "000.ply", secret)
+    for name in ("../secret.ply", str(secret)):
+        edit(lean, lambda demo, name=name: demo["experiment1"]["training_examples"][0].update(file=name))
+        page = write_report(lean).read_text(encoding="utf-8")
+        assert "leads out of the folder" in page
+
+
+def test_arrays_larger_than_their_file_are_refused_before_they_are_allocated(lean: Path) -> None:
+    path = lean / "experiment1" / "modes.npz"
+    content = path.read_bytes()
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mean.npy", stream.getvalue() + b"\0" * 24)
+    page = write_report(lean).read_text(encoding="utf-8")
+    assert "is not what its header says" in page
+    path.write_bytes(content[: len(content) // 2])
+    assert "cut short" in write_report(lean).read_text(encoding="utf-8")
+
+
+def test_arrays_with_pickles_are_refused(lean: Path) -> None:
+    np.savez(lean / "experiment1" / "modes.npz", mean=np.array([{"a": 1}], dtype=object))
+    page = write_report(lean).read_text(encoding="utf-8")
+    assert "is not what its header says" in page
+
+
+def test_a_folder_without_a_demo_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"demo\.json: there is no such file"):
+        write_report(tmp_path)
+    (tmp_path / "demo.json").write_text("[1, 2]")
+    with pytest.raises(FileFormatError, match="does not hold a JSON object"):
+        write_report(tmp_path)
+    (tmp_path / "demo.json").write_text("[" * 100_000)
+    with pytest.raises(FileFormatError, match="is not JSON"):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_without_matplotlib_the_sentence_says_how_to_install_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr("shapespace.report.html.find_spec", lambda name: None if name == "matplotlib" else found(name))
+    for action in (require_report_extra, lambda: write_report(folder)):
+        with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[report\]'"):
+            action()
+
+
+def test_the_report_module_loads_without_matplotlib() -> None:
+    code = (
+        "import sys; sys.modules['matplotlib'] = None; sys.modules['PIL'] = None; import shapespace.report.html as h; "
+        "print(h.__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "shapespace.report.html", done.stderr
+
+
+def test_drawing_leaves_pyplot_alone() -> None:
+    code = "import shapespace.report.figures, sys; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

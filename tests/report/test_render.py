@@ -1,0 +1,210 @@
+import numpy as np
+import pytest
+
+from shapespace.errors import InputError
+from shapespace.report.render import Camera, Layer, covered, render, render_layers, render_maps, render_series
+from shapespace.types import FloatArray, Mesh
+
+SIZE = (57, 43)
+RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def soup(seed: int, count: int = 40) -> Mesh:
+    rng = np.random.default_rng(seed)
+    corners = np.add(rng.normal(0, 10, (count, 1, 3)), rng.normal(0, 6, (count, 3, 3)))
+    return Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+def square(z: float, half: float = 10.0, x: float = 0.0) -> Mesh:
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]) + np.array([x, 0, 0])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def ball(radius: float = 10.0, n: int = 24) -> Mesh:
+    u, v = np.meshgrid(np.linspace(0, np.pi, n), np.linspace(0, 2 * np.pi, 2 * n), indexing="ij")
+    points = radius * np.stack([np.sin(u) * np.sin(v), np.cos(u), np.sin(u) * np.cos(v)], axis=-1).reshape(-1, 3)
+    i = np.arange(n * 2 * n).reshape(n, 2 * n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    return Mesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+def brute_force(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Meet the ray of each pixel's centre with each triangle in three dimensions, knowing nothing of the screen."""
+    width, height = SIZE
+    yaw, pitch = np.radians([camera.yaw_deg, camera.pitch_deg])
+    about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    points = (about_x @ about_y @ (mesh.vertices - camera.centre).T).T
+    winner, nearest = np.full((height, width), -1), np.full((height, width), np.inf)
+    per_pixel = camera.height_mm / height
+    assert mesh.faces is not None
+    for row in range(height):
+        for column in range(width):
+            target = np.array([(column + 0.5 - width / 2) * per_pixel, (height / 2 - row - 0.5) * per_pixel, 0.0])
+            if camera.distance_mm is None:
+                origin, ray = target + np.array([0, 0, 1000.0]), np.array([0, 0, -1.0])
+            else:
+                origin = np.array([0, 0, camera.distance_mm])
+                ray = target - origin
+            for k, face in enumerate(mesh.faces):
+                a, b, c = points[face]
+                system = np.stack([b - a, c - a, -ray], axis=1)
+                if abs(np.linalg.det(system)) < 1e-9:
+                    continue
+                s, t, along = np.linalg.solve(system, origin - a)
+                if s >= 0 and t >= 0 and s + t <= 1 and along > 0 and along < nearest[row, column]:
+                    nearest[row, column], winner[row, column] = along, k
+    return winner, nearest
+
+
+@pytest.mark.parametrize("distance_mm", [None, 90.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_each_pixel_shows_the_triangle_that_its_ray_meets_first(seed: int, distance_mm: float | None) -> None:
+    mesh = soup(seed, 25)
+    camera = Camera(np.array([1.0, -2.0, 0.5]), 40.0, 25.0, -10.0, distance_mm)
+    triangle, depth = covered(mesh, camera=camera, size=SIZE)
+    expected, along = brute_force(mesh, camera)
+    assert (triangle == expected).all()
+    assert (expected >= 0).sum() > 500 and (expected < 0).sum() > 50
+    seen = expected >= 0
+    assert np.isinf(depth[~seen]).all()
+    if distance_mm is None:
+        np.testing.assert_allclose(depth[seen], along[seen] - 1000.0, atol=1e-7)
+    else:
+        np.testing.assert_allclose(-1 / depth[seen], along[seen] * distance_mm, rtol=1e-7)
+
+
+def test_triangles_that_share_edges_leave_no_gap_and_no_pixel_outside() -> None:
+    n = 23
+    x, y = np.meshgrid(np.linspace(-10, 10, n), np.linspace(-10, 10, n))
+    rng = np.random.default_rng(5)
+    points = np.stack([x.ravel(), y.ravel(), rng.normal(0, 0.5, n * n)], axis=1)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
+    mesh = Mesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+    triangle, _ = covered(mesh, camera=Camera(np.zeros(3), 40.0), size=(400, 400))
+    inside = np.zeros((400, 400), dtype=bool)
+    inside[100:300, 100:300] = True
+    assert ((triangle >= 0) == inside).all()
+
+
+def test_of_two_opaque_layers_the_nearer_one_wins_whatever_the_order() -> None:
+    camera = Camera(np.zeros(3), 30.0)
+    near, far = Layer(square(5.0, x=4.0), RED), Layer(square(-5.0, x=-4.0), BLUE)
+    one = render_layers([near, far], camera=camera, size=(60, 60))
+    other = render_layers([far, near], camera=camera, size=(60, 60))
+    assert (one == other).all()
+    assert one[30, 30, 0] > 100 > one[30, 30, 2]
+    assert one[30, 8, 2] > 100 > one[30, 8, 0]
+
+
+def test_a_half_transparent_layer_lets_the_one_behind_show() -> None:
+    camera = Camera(np.zeros(3), 30.0)
+    near, far = Layer(square(5.0), RED, opacity=0.5), Layer(square(-5.0), BLUE)
+    middle = render_layers([near, far], camera=camera, size=(20, 20))[10, 10]
+    assert middle[0] > 60 and middle[2] > 60
+    hidden = render_layers([Layer(square(5.0), RED), Layer(square(-5.0), BLUE, opacity=0.5)], camera=camera)
+    assert hidden[280, 240, 2] < 100
+
+
+def test_bands_of_a_map_are_cut_where_the_scalar_crosses_the_limit() -> None:
+    mesh = square(0.0)
+    colours = np.array([RED, BLUE])
+    camera = Camera(np.zeros(3), 30.0)
+    image = render(mesh, camera=camera, size=(300, 300), scalars=mesh.vertices[:, 0], colormap=colours, vmin=-4, vmax=8)
+    red = image[150, :, 0].astype(int) > image[150, :, 2].astype(int) + 50
+    blue = image[150, :, 2].astype(int) > image[150, :, 0].astype(int) + 50
+    assert abs(np.flatnonzero(red).max() - 169) <= 1
+    assert abs(np.flatnonzero(blue).min() - 170) <= 1
+
+
+def test_values_that_are_not_finite_are_grey() -> None:
+    mesh = square(0.0)
+    image = render(
+        mesh,
+        camera=Camera(np.zeros(3), 30.0),
+        size=(20, 20),
+        scalars=np.full(4, np.nan),
+        colormap=np.array([RED, BLUE]),
+    )
+    assert np.ptp(image[10, 10].astype(int)) <= 2
+
+
+def test_maps_of_one_view_equal_the_pictures_taken_one_by_one() -> None:
+    mesh, camera, table = ball(), Camera(np.zeros(3), 30.0), np.array([RED, BLUE])
+    ranges = [(-1.0, 1.0), (-5.0, 9.0)]
+    together = render_maps(mesh, mesh.vertices[:, 1], ranges, colormap=table, camera=camera, size=(40, 40))
+    for image, (low, high) in zip(together, ranges, strict=True):
+        alone = render(
+            mesh, camera=camera, size=(40, 40), scalars=mesh.vertices[:, 1], colormap=table, vmin=low, vmax=high
+        )
+        assert (image == alone).all()
+    a, b = Layer(mesh, RED), Layer(square(0.0), BLUE)
+    series = render_series([[a], [b], [a, b]], camera=camera, size=(40, 40))
+    for image, layers in zip(series, ([a], [b], [a, b]), strict=True):
+        assert (image == render_layers(layers, camera=camera, size=(40, 40))).all()
+
+
+def test_the_inside_of_a_surface_is_darker_than_its_outside() -> None:
+    mesh = square(0.0)
+    assert mesh.faces is not None
+    camera = Camera(np.zeros(3), 30.0)
+    front = render(mesh, camera=camera, size=(20, 20))
+    back = render(Mesh(mesh.vertices, mesh.faces[:, ::-1]), camera=camera, size=(20, 20))
+    assert back[10, 10].mean() < 0.8 * front[10, 10].mean()
+
+
+def test_points_are_drawn_as_round_discs_of_their_radius() -> None:
+    cloud = Mesh(np.array([[0.0, 0.0, 0.0]]))
+    image = render_layers(
+        [Layer(cloud, RED, point_radius_mm=5.0)], camera=Camera(np.zeros(3), 20.0), size=(100, 100), supersample=1
+    )
+    drawn = (image != 255).any(axis=2)
+    y, x = np.mgrid[:100, :100] + 0.5
+    assert (drawn == ((x - 50) ** 2 + (y - 50) ** 2 <= 25**2)).all()
+
+
+def test_framing_keeps_every_point_in_the_picture() -> None:
+    rng = np.random.default_rng(2)
+    for yaw, pitch, aspect in ((0, 0, 1.0), (40, -20, 0.7), (-75, 30, 1.8)):
+        points = rng.normal(0, 1, (300, 3)) * [80, 110, 90] + [3, -400, 70]
+        camera = Camera.framing(points, yaw_deg=yaw, pitch_deg=pitch, aspect=aspect)
+        size = (round(300 * aspect), 300)
+        image = render_layers([Layer(Mesh(points), RED, point_radius_mm=0.1)], camera=camera, size=size, supersample=1)
+        drawn = (image != 255).any(axis=2)
+        assert not (drawn[0].any() or drawn[-1].any() or drawn[:, 0].any() or drawn[:, -1].any())
+        filled = [np.ptp(np.flatnonzero(drawn.any(axis=axis))) / drawn.shape[1 - axis] for axis in (0, 1)]
+        assert max(filled) > 0.75
+
+
+def test_a_picture_is_the_same_every_time_and_its_background_is_as_asked() -> None:
+    camera = Camera.framing(ball().vertices, yaw_deg=20)
+    first, second = (render(ball(), camera=camera, size=(80, 80), background=(0.2, 0.4, 0.6)) for _ in range(2))
+    assert (first == second).all()
+    assert first[0, 0].tolist() == [51, 102, 153]
+
+
+def test_what_is_behind_the_eye_is_not_drawn() -> None:
+    image = render(square(500.0), camera=Camera(np.zeros(3), 30.0, distance_mm=100.0), size=(20, 20))
+    assert (image == 255).all()
+
+
+def test_an_empty_list_of_layers_gives_the_background() -> None:
+    assert (render_layers([], camera=Camera(np.zeros(3), 1.0), size=(5, 4)) == 255).all()
+
+
+@pytest.mark.parametrize("scalars", [np.zeros(3), np.zeros((4, 1))])
+def test_scalars_that_do_not_fit_the_vertices_are_refused(scalars: FloatArray) -> None:
+    with pytest.raises(InputError, match="4 vertices"):
+        Layer(square(0.0), scalars=scalars, colormap=np.array([RED, BLUE]))
+
+
+def test_pictures_and_cameras_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InputError, match="cannot be drawn"):
+        render(square(0.0), camera=Camera(np.zeros(3), 1.0), size=(100_000, 100_000))
+    with pytest.raises(InputError, match="positive"):
+        Camera(np.zeros(3), 0.0)
+    with pytest.raises(InputError, match="at least one point"):
+        Camera.framing(np.zeros((0, 3)))
+    with pytest.raises(InputError, match="empty"):
+        Layer(square(0.0), scalars=np.zeros(4), colormap=np.array([RED, BLUE]), vmin=1.0, vmax=1.0)
