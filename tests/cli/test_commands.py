@@ -115,7 +115,7 @@ def test_data_faces_writes_corresponding_faces_with_labels(run: Run, tmp_path: P
     assert all(np.array_equal(mesh.faces, meshes[0].faces) for mesh in meshes)
     assert not np.array_equal(meshes[0].vertices, meshes[1].vertices)
     text = run("data", "faces", "-o", tmp_path / "again", "--subjects", 1, "--seed", 3)
-    assert text.out.strip() == f"1 faces in {tmp_path / 'again'}"
+    assert text.out.strip() == f"1 face in {tmp_path / 'again'}"
     again = tmp_path / "again" / labels[0]["file"]
     assert again.read_bytes() == (folder / labels[0]["file"]).read_bytes()
 
@@ -495,3 +495,20 @@ def test_an_unknown_method_lists_the_known_ones(run: Run, world: World, tmp_path
 def test_quiet_never_shows_a_bar(run: Run, world: World, tmp_path: Path) -> None:
     outcome: Outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--quiet", "--max-iterations", 1)
     assert "%|" not in outcome.err and "\r" not in outcome.err
+
+
+def test_models_of_simulated_faces_carry_their_licence_and_provenance(run, tmp_path):
+    assert run("data", "faces", "-o", tmp_path / "faces", "--subjects", 3, "--seed", 3).code == 0
+    outcome = run("build", tmp_path / "faces", "-o", tmp_path / "model.h5", "--json")
+    assert outcome.facts["licence"] == "CC0-1.0"
+    assert "3 simulated people" in outcome.facts["provenance"]
+    own = run("build", tmp_path / "faces", "-o", tmp_path / "own.h5", "--licence", "mine", "--json")
+    assert own.facts["licence"] == "mine"
+
+
+def test_a_landmark_file_beside_the_meshes_that_is_something_else_is_said_and_left(run, tmp_path):
+    assert run("data", "faces", "-o", tmp_path / "faces", "--subjects", 3).code == 0
+    (tmp_path / "faces" / "landmarks.csv").write_text("breakfast,lunch\neggs,soup\n")
+    outcome = run("build", tmp_path / "faces", "-o", tmp_path / "model.h5")
+    assert outcome.code == 0
+    assert "cannot be used" in outcome.err
