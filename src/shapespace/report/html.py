@@ -217,8 +217,8 @@ class _Page:
         ]
         blocks = "".join(f"<div><dd>{value}</dd><dt>{_esc(text)}</dt></div>" for value, text in tiles)
         told = (
-            f"{len(first)} simulated scans of one person's expressions and {len(second)} "
-            f"{'scan' if len(second) == 1 else 'scans'} of other people were fitted."
+            f"{len(first) + len(second)} fits are reported: {len(first)} to simulated scans of one person's "
+            f"expressions, {len(second)} to scans of other people."
         )
         told += f" Besides those that converged: {rest}." if rest else ""
         doubts = [
@@ -525,14 +525,15 @@ class _Page:
 
     def case(self, case: Mapping[str, Any], *, with_model: bool) -> str:
         fit = self.fit(case["fit"])
-        kind = "Simulated scan. " if case.get("simulated") else "Real scan. "
-        note = str(case.get("note") or "")
+        kind, note = "Simulated scan. " if case.get("simulated") else "Real scan. ", str(case.get("note") or "")
+        if note.lower().startswith(("simulated", "real", "a real")):
+            kind = ""
         facts = (
             f"The model is made of {case.get('n_training', '?')} people; {case.get('modes_for_98_5', '?')} modes hold "
             "98.5 % of the variance" + (f", and {case['n_modes']} are used." if case.get("n_modes") else ".")
         )
         mark = ' class="notice"' if case.get("simulated") else ""
-        out = f"<p{mark}><strong>{_esc(kind)}</strong>{_esc(note)}</p>\n<p>{_esc(facts)}</p>\n" + _fit_table([fit])
+        out = f"<p{mark}>{_esc(kind + note)}</p>\n<p>{_esc(facts)}</p>\n" + _fit_table([fit])
         if not fit.pictured:
             return out
         label = _short(case)
