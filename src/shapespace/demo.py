@@ -43,7 +43,7 @@ from shapespace.io.files import atomic_path, make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.line_structure import disjointness, line_scores
-from shapespace.report.html import write_report
+from shapespace.report.html import require_report_extra, write_report
 from shapespace.types import FloatArray, Mesh, Similarity
 
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
@@ -105,6 +105,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
         FileError: the folder cannot be written.
         ShapespaceError: the extra `report` is not installed.
     """
+    require_report_extra()
     scale = scale or (QUICK if quick else FULL)
     make_folder(folder)
     for part in ("experiment1", "experiment2"):

@@ -12,6 +12,7 @@ the SHA-256 of their content (see `ict_files`), packed into one `.npz` (11 MB) i
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import http.client
 import importlib.resources
 import json
@@ -106,6 +107,12 @@ class Dataset:
         """How much a download moves; a good estimate where sizes are not known."""
         return sum(file.bytes or _TYPICAL_OBJ_BYTES for file in self.files)
 
+    @property
+    def sha256(self) -> str:
+        """One hash for the whole set: the SHA-256 of the names and hashes of its files, a line each."""
+        lines = sorted(f"{file.path} {file.sha256 or file.content_sha256}\n" for file in self.files)
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+
 
 def _read_registry() -> Mapping[str, Dataset]:
     text = importlib.resources.files("shapespace.datasets").joinpath("data/registry.json").read_text("utf-8")
@@ -192,6 +199,7 @@ def data_list(*, cache: Path | None = None) -> list[dict[str, object]]:
                 "citation": entry.citation,
                 "source": f"https://github.com/{entry.repository}/tree/{entry.commit}",
                 "commit": entry.commit,
+                "sha256": entry.sha256,
                 "files": len(entry.files),
                 "download_bytes": entry.download_bytes,
                 "state": "not here" if folder is None else "cache" if in_cache else "mirror",

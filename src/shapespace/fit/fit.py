@@ -22,6 +22,8 @@ from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
+_FAR_OUT = 3.0
+_FAR_OUT_BY_CHANCE = 0.01
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
 
@@ -176,7 +178,7 @@ def fit_scan(
             "version": __version__,
         },
         start=start.how,
-        notes=[f"{finding.what} {finding.action}".strip() for finding in findings],
+        notes=[*(f"{finding.what} {finding.action}".strip() for finding in findings), *_far_out(model, final.b)],
         seconds={
             "start": clock[1] - clock[0],
             "phase_1": ended[1][1] - clock[1],
@@ -185,6 +187,17 @@ def fit_scan(
         },
         model_hash=model.content_hash,
     )
+
+
+def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
+    """Say when more coefficients lie far out than chance would have it; without a prior faint modes chase details."""
+    far = int((np.abs(b) > _FAR_OUT * model.stddev).sum())
+    if far <= 1 + _FAR_OUT_BY_CHANCE * model.n_modes:
+        return []
+    return [
+        f"{far} of {model.n_modes} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
+        "details of the scan that the model does not know, so build it with fewer modes for plausible ones."
+    ]
 
 
 def _start(
