@@ -265,7 +265,11 @@ def _print_check(report: Mapping[str, Any]) -> None:
         if key not in ("file", "usable", "findings", "name"):
             _print(f"  {key}: {_short(value)}")
     for finding in report["findings"]:
-        _print(f"  {finding['level']}: {finding['what']} {finding['action']}")
+        what, action = finding["what"], finding["action"]
+        _print(
+            f"  {finding['level']}: "
+            + (f"{what[:-1]}; {action}" if finding["level"] == "refused" else f"{what} {action}")
+        )
     print("  usable" if report["usable"] else "  not usable for fitting")
 
 

@@ -117,10 +117,14 @@ def build(
             notes.append(f"Landmarks are taken from {beside}.")
         except ShapespaceError as error:
             notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
-    about = _about(files[0].parent / ABOUT)
+    abouts = {folder: _about(folder / ABOUT) for folder in dict.fromkeys(file.parent for file in files)}
+    about = abouts[files[0].parent]
     if about and not (provenance or licence):
-        provenance, licence = about
-        notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
+        if len(set(abouts.values())) == 1:
+            provenance, licence = f"{len(files)} meshes of: {about[0]}", about[1]
+            notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
+        else:
+            notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
     if modes == "auto" and len(files) < 4:
         modes = None
         notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")

@@ -512,3 +512,13 @@ def test_a_landmark_file_beside_the_meshes_that_is_something_else_is_said_and_le
     outcome = run("build", tmp_path / "faces", "-o", tmp_path / "model.h5")
     assert outcome.code == 0
     assert "cannot be used" in outcome.err
+
+
+def test_meshes_of_several_folders_do_not_take_the_licence_of_the_first(run, tmp_path):
+    for folder, seed in (("simulated", 3), ("own", 4)):
+        assert run("data", "faces", "-o", tmp_path / folder, "--subjects", 1, "--seed", seed).code == 0
+    (tmp_path / "own" / "about.json").unlink()
+    outcome = run("build", tmp_path / "simulated", tmp_path / "own", "-o", tmp_path / "m.h5", "--json")
+    assert outcome.code == 0, outcome.err
+    assert outcome.facts["licence"] == "" and "simulated people" not in outcome.facts["provenance"]
+    assert "--licence" in outcome.err

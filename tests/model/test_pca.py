@@ -184,6 +184,12 @@ def test_more_modes_than_n_minus_1_or_none_at_all_are_refused(modes: int) -> Non
         principal_components(CASES["more coordinates than shapes"], modes)
 
 
+@pytest.mark.parametrize("modes", ["Auto", "5", [3]])
+def test_modes_that_are_no_number_are_refused(modes: object) -> None:
+    with pytest.raises(InputError, match="whole number"):
+        principal_components(low_rank(6, 60, 3), modes)
+
+
 def test_two_shapes_give_one_mode_along_their_difference() -> None:
     a, b = np.arange(30.0), np.arange(30.0)[::-1].copy()
     pc = principal_components(np.stack([a, b]))

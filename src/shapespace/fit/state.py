@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, Similarity
 
-PHASES = ("phase 1", "phase 2")
-
 
 @dataclass(frozen=True, eq=False)
 class IcpState:

@@ -1,7 +1,7 @@
 """Distances between two surfaces, both ways, and their summaries in mm.
 
 A one-way average is zero for a model that has shrunk to a point of the scan, so both directions always travel
-together (`method.md` section 6b; Sariyanidi et al., IJCB 2023).
+together (Sariyanidi et al., IJCB 2023).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Generalised Procrustes: bring corresponding shapes into one pose, in a stated gauge.
 
-Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991; `method.md` section 3.1.
+Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991.
 """
 
 from __future__ import annotations
@@ -63,13 +63,20 @@ def align_in_place(
         on_iteration: called with the round and the movement of the mean in mm.
 
     Raises:
-        InputError: unknown gauge, or fewer than three vertices to align by.
+        InputError: unknown gauge, fewer than three vertices to align by, or some that do not exist.
     """
     if gauge not in ("form", "shape"):
         raise InputError(f"There is no gauge {gauge!r}; choose form (rigid) or shape (with scale).")
     chosen: IntArray | slice = slice(None) if alignment_vertices is None else alignment_vertices
     if alignment_vertices is not None and len(alignment_vertices) < 3:
         raise InputError("Alignment needs at least three vertices; give more of them, or none to use all.")
+    if alignment_vertices is not None and not (
+        0 <= np.min(alignment_vertices) <= np.max(alignment_vertices) < shapes.shape[1]
+    ):
+        raise InputError(
+            f"The vertices that carry the alignment are counted from 0 to {shapes.shape[1] - 1}, but one of those "
+            "given lies outside; check them."
+        )
     with_scale = gauge == "shape"
     sizes = [centroid_size(shape[chosen]) for shape in shapes]
     size = float(np.mean(sizes))

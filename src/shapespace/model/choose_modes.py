@@ -1,4 +1,4 @@
-"""How many modes: cross-validation on vertices that the fit did not see (`method.md` section 7.1a).
+"""How many modes: cross-validation on vertices that the fit did not see.
 
 Shares of the variance say nothing once shapes are noisy; predicting hidden vertices of unseen shapes does.
 """

@@ -72,6 +72,10 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
     if isinstance(modes, np.integer):
         modes = int(modes)
+    if modes is not None and not isinstance(cast(object, modes), (int, float)):
+        raise InputError(
+            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
+        )
     if isinstance(modes, int) and not 1 <= modes <= n - 1:
         raise InputError(
             f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "

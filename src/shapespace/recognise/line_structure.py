@@ -1,6 +1,6 @@
 """How an expression shows in coefficients: the lines of figures 9 and 10, and how far apart they lie.
 
-Definitions as in `method.md` section 6c. With v_i = (b_i - b_neutral) / stddev, samples of one expression at rising
+With v_i = (b_i - b_neutral) / stddev, samples of one expression at rising
 intensity are expected on a line through neutral, and different expressions on different lines.
 """
 
@@ -22,7 +22,8 @@ class LineScores:
 
     Args:
         r2_through_neutral: share of the summed squares that the best line through neutral explains.
-        r2_free: the same about the mean for the best line anywhere: what a line could reach at best.
+        r2_free: share of the scatter about the samples' mean that the best line anywhere explains. Its whole is smaller
+            than that of `r2_through_neutral`, so it may be the lower of the two.
         sign_consistency: share of samples on the positive side of neutral.
         spearman: rank correlation of position along the line with intensity.
         permutation_p: how often shuffled intensities correlate at least as well.

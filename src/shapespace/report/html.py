@@ -38,7 +38,7 @@ _STATUS_WORDS = {
 }
 _SCORE_WORDS = {
     "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
-    "line_r2_free": "R² of the best line that need not pass through neutral",
+    "line_r2_free": "R² of the best line anywhere, of the scatter about the mean (a smaller whole, so it may be lower)",
     "line_sign_consistency": "Share of faces on the same side of neutral",
     "line_spearman": "Rank correlation of position on the line with intensity",
     "line_permutation_p": "Its permutation p-value",
