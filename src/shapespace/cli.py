@@ -367,6 +367,8 @@ def _print_fit(record: Mapping[str, Any]) -> None:
         f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
         f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
     )
+    for note in record["notes"]:
+        print(f"  {note}")
 
 
 def _say(sentence: str) -> None:

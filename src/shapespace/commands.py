@@ -51,7 +51,9 @@ def expand(paths: Sequence[Path]) -> list[Path]:
                 found.append(path)
                 continue
             inside = sorted(
-                p for p in path.iterdir() if p.suffix.lower() in MESH_FORMATS and not p.name.startswith(".")
+                p
+                for p in path.iterdir()
+                if p.is_file() and p.suffix.lower() in MESH_FORMATS and not p.name.startswith(".")
             )
         except OSError as error:
             raise read_error(path, error) from error

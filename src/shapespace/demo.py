@@ -70,7 +70,7 @@ class DemoScale:
 
 
 FULL = DemoScale()
-QUICK = DemoScale(triangles=16_000, stop_motion_mm=2e-2)
+QUICK = DemoScale(triangles=30_000, stop_motion_mm=5e-2)
 """The quick demo keeps the paper's counts; its scans are coarser and its fits stop earlier."""
 
 

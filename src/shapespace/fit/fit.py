@@ -140,7 +140,7 @@ def fit_scan(
             if state.T_scan_model.scale < _VANISHED * start.T_scan_model.scale:
                 raise FitError(
                     f"{scan.name}: the model shrank to a point, as the plain method does when a large part of the "
-                    "scan is missing; hold the scale (scale fixed), or crop the model to what the scan shows."
+                    "scan is missing; hold the scale (--scale fixed), or crop the model to what the scan shows."
                 )
     except InputError as error:
         raise FitError(f"{scan.name}: the fit diverged ({error}); give landmarks, or crop the scan.") from error

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
@@ -23,7 +23,7 @@ STAGES = ("before", "initial", "final")
 _SHRUNK_BY_SHAPE = 0.85
 _SHRUNK_IN_ALL = 0.7
 _LEADING_SHARE = 0.9
-_IMPLAUSIBLE = 1e-6
+_IMPLAUSIBLE = 1e-5
 _CLOSE_SHARE = 0.01
 _FAR_SHARE = 0.05
 _GAP_RATIO = 4.0
@@ -152,6 +152,19 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
     leading = modes_for_variance(model.stddev**2, _LEADING_SHARE)
     z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
     # An extreme shape that lies on the scan all over is what the scan shows.
-    if z2 > chi2.isf(_IMPLAUSIBLE, leading) / leading and forward.rms > _CLOSE_SHARE * size_mm:
-        found.append(f"the shape is implausible: its main coefficients lie {np.sqrt(z2):.1f} standard deviations out")
+    if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
+        found.append(
+            f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations out on "
+            "average, where about 1 is usual"
+        )
     return found
+
+
+def _hotelling_bound(k: int, n: int) -> float:
+    """Return the mean z^2 of k coefficients that a new shape exceeds with probability `_IMPLAUSIBLE`.
+
+    The variances come from n training shapes, so the bound is Hotelling's for a new sample, not chi-square's.
+    """
+    if n <= k + 1:
+        return float("inf")
+    return float((n**2 - 1) / (n * (n - k)) * f_distribution.isf(_IMPLAUSIBLE, k, n - k))

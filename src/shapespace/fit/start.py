@@ -1,7 +1,7 @@
 """Where to begin: the scan's unit, and a pose of the mean shape from landmarks or from many rotations.
 
-`method.md` section 2 (INIT) and section 4: a centroid start holds to about 45 degrees; beyond that many rotations are
-tried coarsely at fixed scale, scored both ways with the worst matches trimmed, and the best are refined.
+A start with centroids together holds to about 45 degrees. Beyond that many rotations are tried coarsely at fixed scale,
+scored both ways with the worst matches trimmed, and the best are refined unless no rotation is clearly best.
 """
 
 from __future__ import annotations
@@ -18,13 +18,17 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
-_MODEL_POINTS = 400
-_SCAN_POINTS = 4000
+_COARSE_POINTS = (300, 4_000)
+_FINE_POINTS = (1_200, 12_000)
 _COARSE_ITERATIONS = 15
-_FINE_ITERATIONS = 30
-_REFINED = 5
+_FINE_ITERATIONS = 80
+_REFINED = 6
 _KEPT_SHARE = 0.8
-_PREFER_UPRIGHT = 0.8
+_COARSE_RATE = 5e-3
+_FINE_RATE = 5e-4
+_SAME_TURN_COSINE = 0.94
+_CLEARLY_UPRIGHT = 0.82
+_PREFER_UPRIGHT = 0.85
 _TYPICAL_COVER = 1.2
 _INCH_IS_RARE = 0.5
 
@@ -104,45 +108,77 @@ def start_from_any_pose(model: ShapeModel, scan_vertices_mm: FloatArray, *, seed
         seed: of the subsample that is searched.
     """
     rng = np.random.default_rng(seed)
-    mean, scan = _thin(model.mean_vertices, _MODEL_POINTS, rng), _thin(scan_vertices_mm, _SCAN_POINTS, rng)
-    tree = cKDTree(scan)
-    centre_model, centre_scan = model.mean_vertices.mean(axis=0), scan.mean(axis=0)
+    coarse = _Points.of(model.mean_vertices, scan_vertices_mm, _COARSE_POINTS, rng)
+    fine = _Points.of(model.mean_vertices, scan_vertices_mm, _FINE_POINTS, rng)
+    centre_model, centre_scan = model.mean_vertices.mean(axis=0), scan_vertices_mm.mean(axis=0)
     starts = list(Rotation.create_group("O").as_matrix())
     starts.sort(key=lambda R: -np.trace(R))  # no rotation first
-    coarse: list[tuple[float, Similarity]] = []
+    tried: list[tuple[float, Similarity]] = []
     for R in starts:
         T = Similarity(1.0, R, centre_scan - R @ centre_model)
-        T = _trimmed_rigid_icp(mean, tree, T, _COARSE_ITERATIONS)
-        coarse.append((_two_way_score(mean, scan, tree, T), T))
-    upright, ranked = coarse[0], sorted(coarse[1:], key=lambda item: item[0])
+        T = _trimmed_rigid_icp(coarse, T, _COARSE_ITERATIONS, _COARSE_RATE)
+        tried.append((_two_way_score(coarse, T), T))
+    upright, ranked = tried[0], sorted(tried[1:], key=lambda item: item[0])
+    others = _distinct(ranked, upright[1])[: _REFINED - 1]
+    if others and upright[0] < _CLEARLY_UPRIGHT * others[0][0]:
+        others = []
+    # Coarse points cannot tell a face from the back of a head, so the best are compared on fine ones.
     refined: list[tuple[float, Similarity]] = []
-    for _, T in [upright, *ranked[: _REFINED - 1]]:
-        T = _trimmed_rigid_icp(mean, tree, T, _FINE_ITERATIONS)
-        refined.append((_two_way_score(mean, scan, tree, T), T))
+    for _, T in [upright, *others]:
+        T = _trimmed_rigid_icp(fine, T, _FINE_ITERATIONS, _FINE_RATE)
+        refined.append((_two_way_score(fine, T), T))
     best = min(refined, key=lambda item: item[0])
     if best[0] < _PREFER_UPRIGHT * refined[0][0]:
         return Start(best[1], "rotations", best[0])
     return Start(refined[0][1], "upright", refined[0][0])
 
 
-def _trimmed_rigid_icp(points: FloatArray, tree: cKDTree, T: Similarity, iterations: int) -> Similarity:
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """A sample of the mean shape and of the scan to search on, mm."""
+
+    mean: FloatArray
+    scan: FloatArray
+    tree: cKDTree
+
+    @staticmethod
+    def of(mean: FloatArray, scan: FloatArray, counts: tuple[int, int], rng: np.random.Generator) -> _Points:
+        thinned = _thin(scan, counts[1], rng)
+        return _Points(_thin(mean, counts[0], rng), thinned, cKDTree(thinned))
+
+
+def _distinct(ranked: list[tuple[float, Similarity]], first: Similarity) -> list[tuple[float, Similarity]]:
+    """Return `ranked` without poses that turn nearly as `first` or as a better one does."""
+    kept: list[tuple[float, Similarity]] = []
+    for score, T in ranked:
+        others = [first, *(other for _, other in kept)]
+        if all(np.trace(T.rotation @ other.rotation.T) < 1 + 2 * _SAME_TURN_COSINE for other in others):
+            kept.append((score, T))
+    return kept
+
+
+def _trimmed_rigid_icp(points: _Points, T: Similarity, iterations: int, rate: float) -> Similarity:
     """Return `T` after rigid ICP that leaves out the farthest fifth of the matches (Chetverikov et al., 2002)."""
-    keep = int(np.ceil(_KEPT_SHARE * len(points)))
+    keep = int(np.ceil(_KEPT_SHARE * len(points.mean)))
+    before = np.inf
     for _ in range(iterations):
-        distance, index = tree.query(T.apply(points))
+        distance, index = points.tree.query(T.apply(points.mean))
         near = np.argpartition(distance, keep - 1)[:keep]
-        matched = np.asarray(tree.data)[np.asarray(index)[near]]
-        T = fit_similarity(points[near], matched, with_scale=False)
+        error = float(np.asarray(distance)[near].mean())
+        if error > (1 - rate) * before:
+            break
+        before = error
+        T = fit_similarity(points.mean[near], points.scan[np.asarray(index)[near]], with_scale=False)
     return T
 
 
-def _two_way_score(points: FloatArray, scan: FloatArray, tree: cKDTree, T: Similarity) -> float:
+def _two_way_score(points: _Points, T: Similarity) -> float:
     """Return the trimmed mean distance both ways, mm; of the scan only what lies within the model's reach counts."""
-    placed = T.apply(points)
-    forward = np.sort(tree.query(placed)[0])[: int(np.ceil(_KEPT_SHARE * len(placed)))]
+    placed = T.apply(points.mean)
+    forward = np.sort(points.tree.query(placed)[0])[: int(np.ceil(_KEPT_SHARE * len(placed)))]
     centre = placed.mean(axis=0)
     reach = np.linalg.norm(placed - centre, axis=1).max()
-    near = scan[np.linalg.norm(scan - centre, axis=1) <= reach]
+    near = points.scan[np.linalg.norm(points.scan - centre, axis=1) <= reach]
     if len(near) == 0:
         return float("inf")
     backward = np.sort(cKDTree(placed).query(near)[0])[: int(np.ceil(0.5 * len(near)))]

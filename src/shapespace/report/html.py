@@ -209,7 +209,7 @@ class _Page:
         tiles = [
             (
                 f"{trusted} <small>of {len(first) + len(second)}</small>",
-                "fits can be trusted: they converged and nothing speaks against them",
+                "fits converged with nothing found against them; the plain method is blind to some errors",
             ),
             (_esc(modes), "modes hold 98.5 % of the variance of one person's expressions"),
             (_mm_html(_mean(distances)), "mean closest distance of the test faces, model to scan"),
@@ -334,7 +334,7 @@ class _Page:
 
         arrays = self.folder.arrays(experiment.get("mode_shapes"))
         modes = arrays["basis5"].astype(np.float64)
-        shown = modes[: 3 if self.quick else 5]
+        shown = modes[:5]
         picture = figures.modes_figure(
             arrays["mean"].astype(np.float64), arrays["faces"], shown, title="The mean face and what each mode moves"
         )
