@@ -154,8 +154,8 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
     # An extreme shape that lies on the scan all over is what the scan shows.
     if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
         found.append(
-            f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations out on "
-            "average, where about 1 is usual"
+            f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations out "
+            "on average, where about 1 is usual"
         )
     return found
 
