@@ -16,3 +16,10 @@ def test_coefficients_far_out_are_said():
     assert any("standard deviations out" in note for note in far.notes)
     near = fit_scan(model, model.mesh(0.3 * model.stddev))
     assert not any("standard deviations out" in note for note in near.notes)
+
+
+def test_a_point_cloud_is_told_that_distances_are_to_its_points():
+    model = blob_model()
+    shape = model.mesh(0.3 * model.stddev)
+    assert any("no triangles" in note for note in fit_scan(model, Mesh(shape.vertices)).notes)
+    assert not any("no triangles" in note for note in fit_scan(model, shape).notes)

@@ -178,7 +178,11 @@ def fit_scan(
             "version": __version__,
         },
         start=start.how,
-        notes=[*(f"{finding.what} {finding.action}".strip() for finding in findings), *_far_out(model, final.b)],
+        notes=[
+            *(f"{finding.what} {finding.action}".strip() for finding in findings),
+            *_far_out(model, final.b),
+            *_no_triangles(scan),
+        ],
         seconds={
             "start": clock[1] - clock[0],
             "phase_1": ended[1][1] - clock[1],
@@ -187,6 +191,12 @@ def fit_scan(
         },
         model_hash=model.content_hash,
     )
+
+
+def _no_triangles(scan: Mesh) -> list[str]:
+    if scan.faces is not None:
+        return []
+    return ["It has no triangles, so distances are to its points and larger than to the surface they stand for."]
 
 
 def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
