@@ -6,7 +6,6 @@ left, the pupils of the average adult 62 mm apart. A face is linear in its weigh
 
 from __future__ import annotations
 
-import csv
 import functools
 import importlib.resources
 import io
@@ -23,8 +22,10 @@ import numpy.typing as npt
 
 from shapespace.datasets.loop import loop_operator
 from shapespace.errors import DataError, InputError
-from shapespace.io.files import make_folder, write_text
+from shapespace.io.files import make_folder
+from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
+from shapespace.io.tables import write_rows
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 LICENSE = "CC0-1.0"
@@ -397,14 +398,6 @@ def write_faces(
             labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))
-    _write_csv(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
-    _write_csv(folder / "landmarks.csv", ("name", "vertex"), list(faces.landmarks.items()))
+    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
+    write_landmark_indices(folder / "landmarks.csv", faces.landmarks)
     return folder
-
-
-def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    write_text(path, text.getvalue())

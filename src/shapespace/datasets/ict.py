@@ -7,10 +7,8 @@ looks along +z, and +x is the person's own left.
 
 from __future__ import annotations
 
-import csv
 import difflib
-import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -21,8 +19,10 @@ import numpy.typing as npt
 
 from shapespace.datasets import fetch, ict_files
 from shapespace.errors import DataError, InputError
-from shapespace.io.files import make_folder, write_text
+from shapespace.io.files import make_folder
+from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
+from shapespace.io.tables import write_rows
 from shapespace.types import MM_PER_UNIT, FloatArray, IntArray, Mesh, read_only
 
 Area: TypeAlias = Literal["face", "face_and_head"]
@@ -271,14 +271,6 @@ def write_people(
             rows.append((path.name, f"person_{person:03d}", name, 0.0 if name == "neutral" else 1.0))
             if progress is not None:
                 progress(len(paths), subjects * len(mixtures))
-    _write_csv(folder / "labels.csv", ("file", "subject", "expression", "intensity"), rows)
-    _write_csv(folder / "landmarks.csv", ("name", "vertex"), landmark_vertices(area).items())
+    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), rows)
+    write_landmark_indices(folder / "landmarks.csv", landmark_vertices(area))
     return paths
-
-
-def _write_csv(path: Path, header: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
