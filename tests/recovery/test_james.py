@@ -1,0 +1,30 @@
+"""The main job on a real scan: a model of 100 ICT people, fitted to James by the paper's method."""
+
+import numpy as np
+import pytest
+
+from shapespace.datasets.ict import landmark_vertices, load_ict
+from shapespace.datasets.james import load_james
+from shapespace.fit.fit import fit_scan
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.model.shape_model import ShapeModel
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_james_is_fitted_within_a_millimetre_and_a_half(shared_data, seed):
+    ict = load_ict(shared_data / "ict-facekit")
+    people = [ict.mesh(c) for c in ict.draw_people(100, seed)]
+    model = ShapeModel.fit(people, modes="auto", landmarks=landmark_vertices("face"))
+    james = load_james(shared_data / "james")
+    result = fit_scan(model, james)
+    assert result.status == "converged", result.reason
+    assert result.distances.model_to_scan.mean <= 1.5
+    assert result.distances.scan_to_model.median <= 1.5
+    # Points that a person would name lie where they should, not only somewhere on the surface.
+    named = {
+        k: p for k, p in result.surface(model).landmarks.items() if k.startswith(("leye", "reye", "nose", "mouth"))
+    }
+    fitted = np.stack(list(named.values()))
+    marked = np.stack([james.landmarks[name] for name in named])
+    assert np.linalg.norm(fitted - marked, axis=1).mean() < 6.0
+    assert np.linalg.norm(fit_similarity(fitted, marked).apply(fitted) - marked, axis=1).mean() < 5.0
