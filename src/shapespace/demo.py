@@ -150,8 +150,8 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         provenance=f"{scale.training} mixed expressions of one simulated person",
         licence=LICENSE,
     )
-    n_modes = int(np.searchsorted(everything.cumulative_variance, _PAPER_VARIANCE)) + 1
-    model = everything.truncate(n_modes)
+    n_modes = everything.modes_for_variance(_PAPER_VARIANCE)
+    model = everything.truncate(n_modes or everything.n_modes)
     model.save(home / "model.h5")
     clock.step("model of expressions")
 
@@ -264,7 +264,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
                     labelled_simulated=False,
                 )
             )  # fmt: skip
-        main_modes = bundled.truncate(int(np.searchsorted(bundled.cumulative_variance, _MAIN_MODES_SHARE)) + 1)
+        main_modes = bundled.truncate(bundled.modes_for_variance(_MAIN_MODES_SHARE) or bundled.n_modes)
         cases.append(
             _case(
                 folder, home, main_modes, "bundled_main", james, scale, clock,
@@ -308,7 +308,7 @@ def _case(
         "model_hash": model.content_hash,
         "n_training": model.n_training,
         "n_modes": model.n_modes,
-        "modes_for_98_5": int(np.searchsorted(model.cumulative_variance, _PAPER_VARIANCE)) + 1,
+        "modes_for_98_5": model.modes_for_variance(_PAPER_VARIANCE),
         "cumulative_variance": model.cumulative_variance.tolist(),
         "mode_shapes": _write_modes(folder, f"experiment2/{model_name}_modes.npz", model),
         "fit": fits[0],

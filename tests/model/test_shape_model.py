@@ -449,3 +449,13 @@ def test_the_choice_of_modes_is_the_smallest_within_one_standard_error_of_the_be
     # Hidden vertices cannot be told better than their own noise, sqrt(8 / pi) of its deviation in three dimensions.
     assert 0.5 * np.sqrt(8 / np.pi) < choice.error_mm[best] < 1.3
     assert choice.error_mm[0] > 2 * choice.error_mm[best]
+
+
+def test_modes_for_a_share_that_the_kept_modes_do_not_reach_are_none():
+    model = blob_model()
+    for share in (0.5, 0.9, float(model.cumulative_variance[-1])):
+        k = model.modes_for_variance(share)
+        assert k is not None
+        assert model.cumulative_variance[k - 1] >= share - 1e-12
+        assert k == 1 or model.cumulative_variance[k - 2] < share
+    assert model.truncate(1).modes_for_variance(0.999) is None

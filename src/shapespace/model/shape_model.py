@@ -25,6 +25,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
+_SHARE_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +184,12 @@ class ShapeModel:
     def cumulative_variance(self) -> FloatArray:
         """Share of the training variance that the first k modes hold, (K,)."""
         return np.cumsum(self.stddev**2) / self.total_variance
+
+    def modes_for_variance(self, share: float) -> int | None:
+        """Return how many modes hold `share` of the training variance; None where all kept modes hold less."""
+        if self.cumulative_variance[-1] < share - _SHARE_TOLERANCE:
+            return None
+        return int(np.searchsorted(self.cumulative_variance, share - _SHARE_TOLERANCE)) + 1
 
     @cached_property
     def content_hash(self) -> str:

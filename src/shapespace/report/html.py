@@ -528,10 +528,12 @@ class _Page:
         kind, note = "Simulated scan. " if case.get("simulated") else "Real scan. ", str(case.get("note") or "")
         if note.lower().startswith(("simulated", "real", "a real")):
             kind = ""
-        facts = (
-            f"The model is made of {case.get('n_training', '?')} people; {case.get('modes_for_98_5', '?')} modes hold "
-            "98.5 % of the variance" + (f", and {case['n_modes']} are used." if case.get("n_modes") else ".")
-        )
+        facts = f"The model is made of {case.get('n_training', '?')} people"
+        if case.get("modes_for_98_5"):
+            facts += f"; {case['modes_for_98_5']} modes hold 98.5 % of the variance"
+            facts += f", and {case['n_modes']} are used." if case.get("n_modes") else "."
+        else:
+            facts += f"; its {case.get('n_modes', '?')} modes hold less than 98.5 % of the variance."
         mark = ' class="notice"' if case.get("simulated") else ""
         out = f"<p{mark}>{_esc(kind + note)}</p>\n<p>{_esc(facts)}</p>\n" + _fit_table([fit])
         if not fit.pictured:
