@@ -21,7 +21,7 @@ from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.files import make_folder, read_bytes, read_error, write_bytes, write_text
+from shapespace.io.files import make_folder, read_bytes, read_error, remove_file, write_bytes, write_text
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -193,7 +193,7 @@ def info(path: Path) -> dict[str, Any]:
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:
     """Return the facts of a model as plain values."""
-    share = model.cumulative_variance
+    needed = {f"{share:g}": model.modes_for_variance(share) for share in (0.9, 0.95, 0.98, 0.985, 0.99)}
     return {
         "vertices": model.n_vertices,
         "triangles": 0 if model.faces is None else len(model.faces),
@@ -202,12 +202,8 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "gauge": model.gauge,
         "units": "mm",
         "extent_mm": np.ptp(model.mean_vertices, axis=0).tolist(),
-        "variance_held": float(share[-1]),
-        "modes_for_variance": {
-            f"{level:g}": int(np.searchsorted(share, level - 1e-12)) + 1
-            for level in (0.9, 0.95, 0.98, 0.985, 0.99)
-            if share[-1] >= level
-        },
+        "variance_held": float(model.cumulative_variance[-1]),
+        "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
@@ -258,7 +254,7 @@ def fit_scans(
     model = ShapeModel.load(model_path)
     make_folder(folder)
     write_bytes(folder / ".writable", b"")
-    (folder / ".writable").unlink(missing_ok=True)
+    remove_file(folder / ".writable")
     work = make_jobs(files, landmarks)
     workers = min(jobs or os.cpu_count() or 1, len(work))
     bar = progress_bar(len(work), "fitting", "scan", quiet=quiet)

@@ -34,7 +34,7 @@ from shapespace.errors import FileError, FitError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.result import Status
 from shapespace.fit.state import IcpState
-from shapespace.io.files import make_folder, sha256_of_file, write_error
+from shapespace.io.files import make_folder, remove_file, sha256_of_file
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -279,18 +279,6 @@ def make_executor(model: Path, workers: int, kind: str = "processes") -> Executo
         kind: a name of `EXECUTORS`.
     """
     return EXECUTORS[kind](model, workers)
-
-
-def remove_file(path: Path) -> None:
-    """Remove `path` if it is there.
-
-    Raises:
-        FileError: it cannot be removed.
-    """
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_error(path, error) from error
 
 
 def _earlier_record(

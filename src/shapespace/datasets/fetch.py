@@ -177,6 +177,24 @@ def data_folder(name: str | Dataset, *, cache: Path | None = None) -> Path | Non
     return None if _missing(wanted, cached) else cached
 
 
+def present_folder(name: str, what: str) -> Path:
+    """Return the verified folder of a data set that is here already; never downloads.
+
+    Args:
+        name: as in `DATASETS`.
+        what: its name for people.
+
+    Raises:
+        DataError: it is not here, or does not match its hashes.
+    """
+    if data_folder(name) is None:
+        raise DataError(
+            f"{what} is not here; run `shapespace data get {name}`, or set SHAPESPACE_DATA to a folder that holds "
+            f"{name}/."
+        )
+    return data_get(name)
+
+
 def data_list(*, cache: Path | None = None) -> list[dict[str, object]]:
     """Return the facts of every data set as plain values, with where it is: `mirror`, `cache` or `not here`.
 

@@ -195,13 +195,7 @@ def load_ict(folder: Path | None = None) -> IctFaces:
         FileError: a file cannot be read.
         FileFormatError: a file is damaged or of another topology.
     """
-    if folder is None:
-        if fetch.data_folder(NAME) is None:
-            raise DataError(
-                f"ICT-FaceKit is not here; run `shapespace data get {NAME}`, or set SHAPESPACE_DATA to a folder that "
-                f"holds {NAME}/."
-            )
-        folder = fetch.data_get(NAME)
+    folder = fetch.present_folder(NAME, "ICT-FaceKit") if folder is None else folder
     packed = _read(Path(folder))
     scale = MM_PER_UNIT["cm"]
     return IctFaces(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from shapespace.datasets import fetch
-from shapespace.errors import DataError
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.meshes import read_mesh
 from shapespace.types import Mesh
@@ -32,12 +31,6 @@ def load_james(folder: Path | None = None) -> Mesh:
         DataError: `folder` is None and James is not here or does not match its hash.
         FileError: a file cannot be read or is damaged.
     """
-    if folder is None:
-        if fetch.data_folder(NAME) is None:
-            raise DataError(
-                f"James is not here; run `shapespace data get {NAME}`, or set SHAPESPACE_DATA to a folder that holds "
-                f"{NAME}/."
-            )
-        folder = fetch.data_get(NAME)
+    folder = fetch.present_folder(NAME, "James") if folder is None else folder
     scan = read_mesh(Path(folder) / "james.obj")
     return Mesh(scan.vertices, scan.faces, read_landmarks(Path(folder) / "james.ljson"), "james")

@@ -16,7 +16,7 @@ from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import IcpState, StopRule
-from shapespace.geometry.closest import ENGINES, ClosestPointEngine, build_engine
+from shapespace.geometry.closest import ENGINES, ClosestPointEngine, build_engine, finest_engine
 from shapespace.geometry.distance import surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
@@ -152,7 +152,7 @@ def fit_scan(
         "initial": (ended[1][0].T_scan_model, ended[1][0].b),
         "final": (final.T_scan_model, final.b),
     }
-    surface_engine = build_engine(scan_mm)
+    surface_engine = engine if config.search == finest_engine(scan_mm) else build_engine(scan_mm)
     stages = {
         name: _stage(model, scan_mm, surface_engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
     }

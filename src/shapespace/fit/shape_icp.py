@@ -37,23 +37,22 @@ def shape_icp(
     Raises:
         InputError: the matches determine no similarity, or the fit has diverged.
     """
-    P, Q_bar = model.basis, model.mean
     b = np.zeros(model.n_modes) if b is None else b
     Q = model.reconstruct(b)  # eq 6
     y = T_scan_model.apply(Q)
     matched = scan.query(y)
-    rms_mm = [float(np.sqrt((matched.distance**2).mean())) / T_scan_model.scale]
+    rms_mm = [matched.rms / T_scan_model.scale]
     yield IcpState(2, 0, T_scan_model, b, rms_mm[0], np.inf)
 
     for iteration in range(1, stop.max_iterations + 1):
         c = matched.points  # step 1: closest points of the current deformed model
         T_scan_model = fit_pose(Q, c, T_scan_model, with_scale)  # step 2: eqs 8-18
         Q_matched = T_scan_model.inverse().apply(c)  # in model order and in the model's frame
-        b = P.T @ (Q_matched.ravel() - Q_bar)  # step 3: eq 19
+        b = model.project(Q_matched, align=False)  # step 3: b = P^T (Q - Q_bar), eq 19
         Q = model.reconstruct(b)  # eq 6: the deformed model
         moved, y = y, T_scan_model.apply(Q)
         matched = scan.query(y)
-        rms_mm.append(float(np.sqrt((matched.distance**2).mean())) / T_scan_model.scale)
+        rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = float(np.linalg.norm(y - moved, axis=1).max()) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)  # step 4
         yield IcpState(2, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)

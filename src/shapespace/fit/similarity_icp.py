@@ -31,7 +31,7 @@ def similarity_icp(
     Q_mean, b = model.mean_vertices, np.zeros(model.n_modes)
     p = T_scan_model.apply(Q_mean)
     matched = scan.query(p)
-    rms_mm = [_rms(matched.distance) / T_scan_model.scale]
+    rms_mm = [matched.rms / T_scan_model.scale]
     yield IcpState(1, 0, T_scan_model, b, rms_mm[0], np.inf)
 
     for iteration in range(1, stop.max_iterations + 1):
@@ -39,7 +39,7 @@ def similarity_icp(
         T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # eqs 8-18
         moved, p = p, T_scan_model.apply(Q_mean)
         matched = scan.query(p)
-        rms_mm.append(_rms(matched.distance) / T_scan_model.scale)
+        rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = float(np.linalg.norm(p - moved, axis=1).max()) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)
         yield IcpState(1, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)
@@ -53,7 +53,3 @@ def fit_pose(source: np.ndarray, target: np.ndarray, before: Similarity, with_sc
         return fit_similarity(source, target)
     rigid = fit_similarity(before.scale * source, target, with_scale=False)
     return Similarity(before.scale, rigid.rotation, rigid.translation)
-
-
-def _rms(distance: np.ndarray) -> float:
-    return float(np.sqrt((distance**2).mean()))

@@ -36,6 +36,11 @@ class ClosestPoints:
     barycentric: FloatArray | None
     vertex: IntArray
 
+    @property
+    def rms(self) -> float:
+        """Root of the mean squared distance."""
+        return float(np.sqrt((self.distance**2).mean()))
+
 
 class ClosestPointEngine(Protocol):
     """Built once a surface by `Engine(mesh)`; answers are float64 and exact."""
@@ -148,13 +153,18 @@ ENGINES: Mapping[str, Callable[[Mesh], ClosestPointEngine]] = {
 """Search engines by name; add one here and the contract test and `fit` find it."""
 
 
+def finest_engine(mesh: Mesh) -> str:
+    """Return the name of the engine for the surface itself: its triangles where there are some, else its vertices."""
+    return "vertices" if mesh.faces is None else "surface"
+
+
 def build_engine(mesh: Mesh, engine: str = "auto") -> ClosestPointEngine:
-    """Return the search structure of `mesh`: `auto` takes triangles where there are some, else vertices.
+    """Return the search structure of `mesh`: `auto` takes its `finest_engine`.
 
     Raises:
         InputError: no engine of that name.
     """
-    name = ("vertices" if mesh.faces is None else "surface") if engine == "auto" else engine
+    name = finest_engine(mesh) if engine == "auto" else engine
     if name not in ENGINES:
         raise InputError(f"There is no closest-point engine {name!r}; choose one of {', '.join(ENGINES)}.")
     return ENGINES[name](mesh)

@@ -112,6 +112,18 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def remove_file(path: Path) -> None:
+    """Remove `path` if it is there.
+
+    Raises:
+        FileError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
 def sha256_of_file(path: Path) -> str:
     """Return the hexadecimal SHA-256 of the file at `path`.
 

@@ -242,13 +242,12 @@ def aligned_grid(fits: Sequence[StagedFit], *, title: str, columns: int = 4) -> 
         )
         for fit in fits
     ]
-    captions = [f"{fit.name}: mean {_mm(fit.model_to_scan_mm['final'].mean())}" for fit in fits]
-    return _grid(
-        _rows(images, columns),
-        titles=_rows(captions, columns),
-        heading=title,
-        keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
-    )
+    keys = [("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)]
+    return _grid(_rows(images, columns), titles=_rows(_means(fits), columns), heading=title, keys=keys)
+
+
+def _means(fits: Sequence[StagedFit]) -> list[str]:
+    return [f"{fit.name}: mean {_mm(fit.model_to_scan_mm['final'].mean())}" for fit in fits]
 
 
 def distance_histograms(fit: StagedFit, *, title: str, bins: int = 50) -> Figure:
@@ -443,13 +442,8 @@ def distance_maps(fits: Sequence[StagedFit], *, title: str, columns: int = 4) ->
         )
         for fit in fits
     ]
-    captions = [f"{fit.name}: mean {_mm(fit.model_to_scan_mm['final'].mean())}" for fit in fits]
-    return _grid(
-        _rows(images, columns),
-        titles=_rows(captions, columns),
-        heading=title,
-        scale=_Scale("model to scan (mm)", "viridis", 0.0, top),
-    )
+    scale = _Scale("model to scan (mm)", "viridis", 0.0, top)
+    return _grid(_rows(images, columns), titles=_rows(_means(fits), columns), heading=title, scale=scale)
 
 
 def encode_webp(figure: Figure, *, lossless: bool = False) -> tuple[bytes, tuple[int, int]]:
