@@ -1,0 +1,226 @@
+"""Exact nearest points by a kd-tree in float64, compiled; other compiled loops may search it point by point.
+
+The tree is implicit: node n has the children 2n + 1 and 2n + 2, its 2^depth leaves share the points evenly, and all it
+stores are the points in leaf order and one tight box a node. A box is passed over when it lies farther than the best
+point so far; both distances are rounded alike, so the answer is that of brute force, and the lowest index of ties.
+Source: Friedman, Bentley and Finkel, ACM TOMS 3(3), 1977.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapespace.compiled import compiled
+from shapespace.errors import InputError
+from shapespace.types import FloatArray, IntArray
+
+_LEAF_POINTS = 8
+STACK_SIZE = 128
+"""Length of the float64 workspace that `nearest_one` and `nearest_two` need."""
+
+
+class KdArrays(NamedTuple):
+    """What a tree consists of, as compiled loops take it.
+
+    Args:
+        points: (N, 3) float64, in leaf order.
+        original: (N,) int32, the number each of `points` had when it was given.
+        place: (N,) int32, the row of `points` where each number is.
+        boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
+        depth: number of splits from the root to a leaf.
+    """
+
+    points: FloatArray
+    original: IntArray
+    place: IntArray
+    boxes: FloatArray
+    depth: int
+
+
+class KdTree:
+    """Points to be searched.
+
+    Args:
+        points: (N, 3) float64, finite, at least one; they may repeat, or lie on a line or a plane.
+
+    Raises:
+        InputError: no points, of another shape, or not finite.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+            raise InputError(f"A kd-tree needs points of the shape (N, 3), at least one, not {points.shape}.")
+        if not np.isfinite(points).all():
+            raise InputError("A kd-tree needs finite points; drop those that are not.")
+        depth = max(0, int(np.ceil(np.log2(len(points) / _LEAF_POINTS))))
+        ordered = np.array(points, dtype=np.float64, order="C")
+        index = np.arange(len(points), dtype=np.int32)
+        boxes = np.empty((2 ** (depth + 1) - 1, 6))
+        _build(ordered, index, boxes, depth)
+        place = np.empty_like(index)
+        place[index] = np.arange(len(points), dtype=np.int32)
+        self.arrays = KdArrays(ordered, index, place, boxes, depth)
+        """The tree as compiled loops take it."""
+
+    def nearest(self, queries: FloatArray, guess: IntArray | None = None) -> tuple[IntArray, FloatArray]:
+        """Return the index (M,) int32 of the point nearest to each query, and its squared distance (M,).
+
+        Args:
+            queries: (M, 3) float64, finite.
+            guess: (M,) int32 points that may be near, such as the last answers, -1 for none; they save time and
+                change nothing.
+
+        Raises:
+            InputError: shapes that do not match, or a guess that is no point.
+        """
+        queries = writable(queries)
+        guess = checked_guess(guess, len(queries), len(self.arrays.original))
+        index, squared = np.empty(len(queries), dtype=np.int32), np.empty(len(queries))
+        nearest_into(self.arrays, queries, guess, index, squared)
+        return index, squared
+
+
+def writable(queries: FloatArray) -> FloatArray:
+    """Return `queries` (M, 3) as compiled loops take them: a copy where writing is refused, which is a type of its own.
+
+    Raises:
+        InputError: another shape.
+    """
+    if queries.ndim != 2 or queries.shape[1] != 3:
+        raise InputError(f"Closest-point queries must have the shape (M, 3), not {queries.shape}.")
+    return np.require(queries, dtype=np.float64, requirements=["C", "W"])
+
+
+def checked_guess(guess: IntArray | None, queries: int, count: int) -> IntArray:
+    """Return `guess` as (M,) int32 for as many `queries`, -1 throughout for None.
+
+    Raises:
+        InputError: another shape, or an index that is not below `count`.
+    """
+    if guess is None:
+        return np.full(queries, -1, dtype=np.int32)
+    if guess.shape != (queries,) or (queries and not (guess.min() >= -1 and guess.max() < count)):
+        raise InputError(f"A guess must be one index below {count} a query, or -1 for none.")
+    return np.require(guess, dtype=np.int32, requirements=["C", "W"])
+
+
+@compiled
+def _select(points: FloatArray, index: IntArray, low: int, high: int, middle: int, axis: int) -> None:
+    """Reorder rows low to high - 1 so that none before `middle` is greater along `axis` and none after is less."""
+    last = high - 1
+    while low < last:
+        a, b, c = points[low, axis], points[(low + last) >> 1, axis], points[last, axis]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = low, last
+        while i <= j:
+            while points[i, axis] < pivot:
+                i += 1
+            while pivot < points[j, axis]:
+                j -= 1
+            if i <= j:
+                for k in range(3):
+                    points[i, k], points[j, k] = points[j, k], points[i, k]
+                index[i], index[j] = index[j], index[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            last = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@compiled
+def _build(points: FloatArray, index: IntArray, boxes: FloatArray, depth: int) -> None:
+    """Sort `points` and `index` into leaves, splitting the longest side at the median; fill `boxes`."""
+    count = len(points)
+    for level in range(depth + 1):
+        width = depth - level
+        for i in range(1 << level):
+            low, high = ((i << width) * count) >> depth, (((i + 1) << width) * count) >> depth
+            box = boxes[(1 << level) - 1 + i]
+            for k in range(3):
+                box[k], box[3 + k] = points[low, k], points[low, k]
+            for row in range(low + 1, high):
+                for k in range(3):
+                    value = points[row, k]
+                    box[k] = value if value < box[k] else box[k]
+                    box[3 + k] = value if value > box[3 + k] else box[3 + k]
+            if level < depth:
+                x, y, z = box[3] - box[0], box[4] - box[1], box[5] - box[2]
+                axis = 0 if x >= y and x >= z else (1 if y >= z else 2)
+                _select(points, index, low, high, (((2 * i + 1) << (width - 1)) * count) >> depth, axis)
+
+
+@compiled
+def box_distance(boxes: FloatArray, node: int, x: float, y: float, z: float) -> float:
+    """Return the squared distance of (x, y, z) from box `node`, never more than that of any point in it."""
+    dx, ex = boxes[node, 0] - x, x - boxes[node, 3]
+    dy, ey = boxes[node, 1] - y, y - boxes[node, 4]
+    dz, ez = boxes[node, 2] - z, z - boxes[node, 5]
+    dx, dy, dz = (dx if dx > ex else ex), (dy if dy > ey else ey), (dz if dz > ez else ez)
+    dx, dy, dz = (dx if dx > 0.0 else 0.0), (dy if dy > 0.0 else 0.0), (dz if dz > 0.0 else 0.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@compiled
+def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack: FloatArray) -> tuple[int, float]:
+    """Return the index of the point nearest to (x, y, z) and its squared distance.
+
+    Args:
+        tree: the points.
+        x: coordinates of the query,
+        y: in the unit
+        z: of the points.
+        guess: a point that may be near, or -1.
+        stack: (STACK_SIZE,) float64 workspace, one a thread.
+    """
+    points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
+    count, first_leaf = len(index), (1 << depth) - 1
+    best, squared = -1, np.inf
+    if guess >= 0:
+        row = tree.place[guess]
+        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+        best, squared = guess, dx * dx + dy * dy + dz * dz
+    node, top = 0, 0
+    while True:
+        while node < first_leaf:
+            left = 2 * node + 1
+            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
+            node = left
+            if far < near:
+                node = left + 1
+                near, far = far, near
+            if near > squared:
+                node = -1
+                break
+            if far <= squared:
+                stack[top], stack[top + 1] = 2 * left + 1 - node, far
+                top += 2
+        if node >= 0:
+            leaf = node - first_leaf
+            for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
+                dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+                d = dx * dx + dy * dy + dz * dz
+                if d < squared or (d == squared and (best < 0 or index[row] < best)):
+                    best, squared = index[row], d
+        while top > 0 and stack[top - 1] > squared:
+            top -= 2
+        if top == 0:
+            return best, squared
+        top -= 2
+        node = int(stack[top])
+
+
+@compiled
+def nearest_into(
+    tree: KdArrays, queries: FloatArray, guess: IntArray, index_out: IntArray, squared_out: FloatArray
+) -> None:
+    """Write index (M,) and squared distance (M,) of the points nearest to `queries` (M, 3) given `guess` (M,)."""
+    stack = np.empty(STACK_SIZE)
+    for i in range(len(queries)):
+        found, squared = nearest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
+        index_out[i], squared_out[i] = found, squared

@@ -1,0 +1,93 @@
+"""The kd-tree gives the answers of brute force, whatever the points and the guesses."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from shapespace.errors import InputError
+from shapespace.geometry.kdtree import KdTree
+from shapespace.types import FloatArray
+
+RNG = np.random.default_rng(0)
+
+
+def on_a_line() -> FloatArray:
+    return RNG.integers(0, 60, (200, 1)) * np.array([[1.0, 2.0, -1.0]])
+
+
+def grid() -> FloatArray:
+    return np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
+
+
+def repeated() -> FloatArray:
+    return np.repeat(RNG.standard_normal((40, 3)), 9, axis=0)
+
+
+CLOUDS = {
+    "one": np.array([[1.0, 2.0, 3.0]]),
+    "eleven": RNG.standard_normal((11, 3)),
+    "scattered": RNG.standard_normal((1_500, 3)) * [30, 1, 80],
+    "all equal": np.full((300, 3), 2.5),
+    "line": on_a_line(),
+    "grid": grid(),
+    "repeated": repeated(),
+    "far": RNG.standard_normal((500, 3)) + 1e7,
+}
+
+
+def queries(points: FloatArray) -> FloatArray:
+    size = max(np.ptp(points, axis=0).max(), 1.0)
+    near = points[RNG.integers(0, len(points), 200)]
+    return np.vstack([near, near + 0.5, near + RNG.standard_normal((200, 3)) * size, points.mean(axis=0)[None]])
+
+
+def brute_force(points: FloatArray, asked: FloatArray) -> tuple[np.ndarray, FloatArray]:
+    d = points[None] - asked[:, None]
+    squared = d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] + d[..., 2] * d[..., 2]
+    return squared.argmin(axis=1), squared.min(axis=1)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_index_and_distance_are_those_of_brute_force_to_the_last_bit_with_the_lowest_index_of_ties(name: str) -> None:
+    points = CLOUDS[name]
+    asked = queries(points)
+    want, squared_want = brute_force(points, asked)
+    tree = KdTree(points)
+    for guess in (None, want.astype(np.int32), RNG.integers(-1, len(points), len(asked)).astype(np.int32)):
+        index, squared = tree.nearest(asked, guess)
+        assert index.dtype == np.int32
+        assert np.array_equal(index, want)
+        assert np.array_equal(squared, squared_want)
+
+
+def test_a_large_cloud_agrees_with_scipy() -> None:
+    points = RNG.standard_normal((200_000, 3))
+    asked = RNG.standard_normal((2_000, 3))
+    distance, index = cKDTree(points).query(asked)
+    found, squared = KdTree(points).nearest(asked)
+    assert np.array_equal(found, index)
+    assert np.allclose(np.sqrt(squared), distance, rtol=1e-14)
+
+
+def test_points_and_queries_are_left_as_they_were_and_may_be_read_only() -> None:
+    points, asked = CLOUDS["scattered"].copy(), queries(CLOUDS["scattered"])
+    first = KdTree(points).nearest(asked)
+    points.setflags(write=False)
+    asked.setflags(write=False)
+    again = KdTree(points).nearest(asked)
+    assert np.array_equal(points, CLOUDS["scattered"])
+    assert np.array_equal(first[0], again[0])
+    assert KdTree(points).nearest(np.zeros((0, 3)))[0].shape == (0,)
+
+
+def test_bad_points_queries_and_guesses_are_refused() -> None:
+    with pytest.raises(InputError, match="at least one"):
+        KdTree(np.zeros((0, 3)))
+    with pytest.raises(InputError, match="finite"):
+        KdTree(np.array([[0.0, 0.0, np.nan]]))
+    tree = KdTree(np.zeros((4, 3)))
+    with pytest.raises(InputError, match="shape"):
+        tree.nearest(np.zeros((4, 2)))
+    for guess in (np.zeros(3, dtype=np.int32), np.array([4, 0], dtype=np.int32), np.array([-2, 0], dtype=np.int32)):
+        with pytest.raises(InputError, match="guess"):
+            tree.nearest(np.zeros((2, 3)), guess)
