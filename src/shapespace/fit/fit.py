@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import IcpState, StopRule
 from shapespace.geometry.closest import ENGINES, ClosestPointEngine, build_engine, finest_engine
-from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
@@ -156,9 +157,9 @@ def fit_scan(
     stages = {
         name: _stage(model, scan_mm, surface_engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
     }
-    clock.append(time.perf_counter())
     start_scale = start.T_scan_model.scale / mm
     status, reason = _verdict(model, stages, start_scale, ended[1][0], final, config)
+    clock.append(time.perf_counter())
     residual_variance = float((final.rms_mm**2) / 3.0)
     return FitResult(
         scan_name=scan.name,
@@ -229,9 +230,14 @@ def _start(
 def _stage(
     model: ShapeModel, scan_mm: Mesh, engine: ClosestPointEngine, T_scan_mm: Similarity, T: Similarity, b: FloatArray
 ) -> Stage:
+    return Stage(T_scan_mm @ T, b, partial(_distances, model, scan_mm, engine, T, b))
+
+
+def _distances(
+    model: ShapeModel, scan_mm: Mesh, engine: ClosestPointEngine, T: Similarity, b: FloatArray
+) -> SurfaceDistances:
     placed = Mesh(T.apply(model.reconstruct(b)), model.faces, name="model")
-    distances = surface_distances(placed, scan_mm, scan_engine=engine, mm_per_length=1.0 / T.scale)
-    return Stage(T_scan_mm @ T, b, distances)
+    return surface_distances(placed, scan_mm, scan_engine=engine, mm_per_length=1.0 / T.scale)
 
 
 def _verdict(

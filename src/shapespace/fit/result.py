@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -38,12 +39,17 @@ class Stage:
     Args:
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         b: (K,) coefficients, mm.
-        distances: to the scan and back, mm of the model's frame.
+        measure: measures the distances; it holds the scan.
     """
 
     T_scan_model: Similarity
     b: FloatArray
-    distances: SurfaceDistances
+    measure: Callable[[], SurfaceDistances] = field(repr=False)
+
+    @cached_property
+    def distances(self) -> SurfaceDistances:
+        """Distances to the scan and back, mm of the model's frame, measured when first asked for."""
+        return self.measure()
 
 
 @dataclass(frozen=True, eq=False)
