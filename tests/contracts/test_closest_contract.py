@@ -113,6 +113,24 @@ def test_answers_are_those_of_brute_force(name: str, shape: str) -> None:
     )
 
 
+@pytest.mark.parametrize("shape", MESHES)
+@pytest.mark.parametrize("name", ENGINES)
+def test_earlier_answers_nearby_change_no_distance(name: str, shape: str) -> None:
+    mesh = MESHES[shape]()
+    engine, asked = ENGINES[name](mesh), queries(mesh)
+    rng, near = np.random.default_rng(2), None
+    for step in (0.0, 30.0, 1.0, 1e-2, 1e-2, 1e-4, 1e-6, 5.0):
+        asked = asked + step * rng.standard_normal(asked.shape)
+        near = engine.query(asked, near=near)
+        fresh = engine.query(asked)
+        assert np.allclose(near.distance, fresh.distance, rtol=1e-14, atol=1e-12)
+        assert np.abs(np.linalg.norm(near.points - asked, axis=1) - fresh.distance).max() < 1e-9
+        if near.triangle is None:
+            assert np.array_equal(near.vertex, fresh.vertex)
+    with pytest.raises(InputError, match="near"):
+        engine.query(asked[:-1], near=near)
+
+
 @pytest.mark.parametrize("name", ENGINES)
 def test_a_million_millimetres_from_the_origin_costs_only_rounding(name: str) -> None:
     mesh = ball()

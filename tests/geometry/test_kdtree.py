@@ -91,3 +91,40 @@ def test_bad_points_queries_and_guesses_are_refused() -> None:
     for guess in (np.zeros(3, dtype=np.int32), np.array([4, 0], dtype=np.int32), np.array([-2, 0], dtype=np.int32)):
         with pytest.raises(InputError, match="guess"):
             tree.nearest(np.zeros((2, 3)), guess)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize("step", [1e-9, 1e-3, 0.05, 0.5])
+def test_followed_queries_have_the_answers_of_brute_force_wherever_they_wander(name: str, step: float) -> None:
+    points = CLOUDS[name]
+    tree, asked = KdTree(points), queries(points)
+    index, _ = tree.nearest(asked)
+    followed = None
+    size = max(np.ptp(points, axis=0).max(), 1.0)
+    for _ in range(8):
+        index, squared, found, followed = tree.follow(asked, index, followed)
+        want, squared_want = brute_force(points, asked)
+        assert np.array_equal(index, want)
+        assert np.array_equal(squared, squared_want)
+        assert np.array_equal(found, points[index])
+        asked = asked + step * size * RNG.standard_normal(asked.shape)
+
+
+def test_followed_queries_that_hardly_move_are_not_searched_again() -> None:
+    points = CLOUDS["scattered"]
+    tree, asked = KdTree(points), queries(points)
+    index, _, _, first = tree.follow(asked, tree.nearest(asked)[0])
+    _, _, _, second = tree.follow(asked + 1e-9, index, first)
+    kept = (second.anchor == first.anchor).all(axis=1)
+    assert kept.mean() > 0.9
+    _, _, _, third = tree.follow(asked + 40.0, index, second)
+    assert (third.anchor == asked + 40.0).all(axis=1).mean() > 0.9
+
+
+def test_a_second_nearest_point_bounds_all_but_the_first() -> None:
+    points = CLOUDS["grid"]
+    tree, asked = KdTree(points), queries(points)
+    index, _, _, followed = tree.follow(asked, np.full(len(asked), -1, dtype=np.int32))
+    d = np.linalg.norm(points[None] - asked[:, None], axis=2)
+    d[np.arange(len(asked)), index] = np.inf
+    assert np.allclose(followed.reach, d.min(axis=1), rtol=1e-14)

@@ -51,7 +51,7 @@ def shape_icp(
         b = model.project(Q_matched, align=False)  # step 3: b = P^T (Q - Q_bar), eq 19
         Q = model.reconstruct(b)  # eq 6: the deformed model
         moved, y = y, T_scan_model.apply(Q)
-        matched = scan.query(y)
+        matched = scan.query(y, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = float(np.linalg.norm(y - moved, axis=1).max()) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)  # step 4

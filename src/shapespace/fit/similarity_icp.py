@@ -38,7 +38,7 @@ def similarity_icp(
         p_prime = matched.points  # eq 7: the closest scan point of each model vertex
         T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # eqs 8-18
         moved, p = p, T_scan_model.apply(Q_mean)
-        matched = scan.query(p)
+        matched = scan.query(p, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)
         motion_mm = float(np.linalg.norm(p - moved, axis=1).max()) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)

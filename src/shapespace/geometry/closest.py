@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.surface import faces_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+if TYPE_CHECKING:
+    from shapespace.geometry.kdtree import Followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,7 @@ class ClosestPoints:
         triangle: (M,) int32 triangle they lie in, or None when vertices were searched.
         barycentric: (M, 3) weights of that triangle's corners; None when vertices were searched.
         vertex: (M,) int32 nearest vertex, or when triangles were searched, the corner with the largest weight.
+        followed: what the engine needs to answer the next query from this one.
     """
 
     points: FloatArray
@@ -35,6 +38,7 @@ class ClosestPoints:
     triangle: IntArray | None
     barycentric: FloatArray | None
     vertex: IntArray
+    followed: Followed | None = None
 
     @property
     def rms(self) -> float:
@@ -45,59 +49,65 @@ class ClosestPoints:
 class ClosestPointEngine(Protocol):
     """Built once a surface by `Engine(mesh)`; answers are float64 and exact."""
 
-    def query(self, points: FloatArray) -> ClosestPoints:
-        """Return the closest points of `points` (M, 3)."""
+    def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
+        """Return the closest points of `points` (M, 3).
+
+        Args:
+            points: (M, 3) in the frame of the surface, finite.
+            near: answers of this engine to M queries that were likely near these, such as those of the last
+                iteration; they save time and do not change the distances.
+        """
         ...
 
 
-def _checked(points: FloatArray) -> FloatArray:
+def _checked(points: FloatArray, near: ClosestPoints | None) -> FloatArray:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Closest-point queries must have the shape (M, 3), not {points.shape}.")
     if not np.isfinite(points).all():
         raise InputError("Closest-point queries must be finite; the pose or shape that made them has diverged.")
-    return np.ascontiguousarray(points)
+    if near is not None and len(near.vertex) != len(points):
+        raise InputError(f"{len(near.vertex)} answers cannot be near to {len(points)} queries.")
+    return points
 
 
 class VertexEngine:
-    """Nearest vertex, by SciPy's kd-tree; works for point clouds too."""
+    """Nearest vertex, by a kd-tree; works for point clouds too."""
 
     def __init__(self, mesh: Mesh) -> None:
+        from shapespace.geometry.kdtree import KdTree  # compiled
+
         if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
             raise MeshError(f"{mesh.name}: its vertices are missing or not finite, so it cannot be searched.")
         self._vertices = mesh.vertices
-        self._tree = cKDTree(mesh.vertices)
+        self._tree = KdTree(mesh.vertices)
 
-    def query(self, points: FloatArray) -> ClosestPoints:
+    def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the nearest vertex of each of `points` (M, 3)."""
-        distance, index = self._tree.query(_checked(points), workers=-1)
-        vertex = np.asarray(index, dtype=np.int32)
-        return ClosestPoints(self._vertices[vertex], np.asarray(distance), None, None, vertex)
+        asked = _checked(points, near)
+        if near is None:
+            vertex, squared = self._tree.nearest(asked)
+            return ClosestPoints(self._vertices[vertex], np.sqrt(squared), None, None, vertex)
+        vertex, squared, found, followed = self._tree.follow(asked, near.vertex, near.followed)
+        return ClosestPoints(found, np.sqrt(squared), None, None, vertex, followed)
 
 
 class SurfaceEngine:
-    """Closest point on the triangles themselves, by libigl's bounding-box tree."""
+    """Closest point on the triangles themselves, by a tree of boxes."""
 
     def __init__(self, mesh: Mesh) -> None:
-        import igl  # pyright: ignore[reportMissingTypeStubs]  # half of the import time of the package
+        from shapespace.geometry.bvh import TriangleTree  # compiled
 
-        self._vertices = np.array(mesh.vertices)
-        faces = faces_of(mesh)
-        if not np.isfinite(self._vertices).all():
+        self._faces = faces_of(mesh)
+        if not np.isfinite(mesh.vertices).all():
             raise MeshError(f"{mesh.name}: its vertices are not finite, so it cannot be searched.")
-        self._faces = faces.astype(np.int64)
-        self._tree = cast(Any, igl).AABB()
-        self._tree.init(self._vertices, self._faces)
+        self._tree = TriangleTree(mesh.vertices, self._faces)
 
-    def query(self, points: FloatArray) -> ClosestPoints:
+    def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the closest surface point of each of `points` (M, 3)."""
-        asked = _checked(points)
-        squared, index, closest = self._tree.squared_distance(self._vertices, self._faces, asked)
-        triangle = cast(FloatArray, index).reshape(-1).astype(np.int32)
-        points_on = cast(FloatArray, closest).reshape(-1, 3)
-        barycentric = barycentric_coordinates(points_on, *(self._vertices[self._faces[triangle, k]] for k in range(3)))
-        vertex = self._faces[triangle, barycentric.argmax(axis=1)].astype(np.int32)
-        distance = np.sqrt(cast(FloatArray, squared).reshape(-1))
-        return ClosestPoints(points_on, distance, triangle, barycentric, vertex)
+        asked = _checked(points, near)
+        triangle, barycentric, found, squared = self._tree.closest(asked, None if near is None else near.triangle)
+        vertex = self._faces[triangle, barycentric.argmax(axis=1)]
+        return ClosestPoints(found, np.sqrt(squared), triangle, barycentric, vertex)
 
 
 def barycentric_coordinates(points: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:

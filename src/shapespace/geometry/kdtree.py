@@ -16,7 +16,7 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_POINTS = 8
+_LEAF_POINTS = 12
 STACK_SIZE = 128
 """Length of the float64 workspace that `nearest_one` and `nearest_two` need."""
 
@@ -39,6 +39,24 @@ class KdArrays(NamedTuple):
     depth: int
 
 
+class Followed(NamedTuple):
+    """What lets queries that have moved a little keep their answer without a search.
+
+    A query that was nearest to point i where it was last searched, at `anchor`, and had no other point within `reach`
+    of there, is still nearest to i as long as its distance to i and its way from the anchor make less than `reach`
+    (Greenspan and Godin, 3DIM 2001).
+
+    Args:
+        second: (M,) int32, the second nearest point at the anchor, -1 where the query was never searched this way.
+        anchor: (M, 3) float64.
+        reach: (M,) float64, distance from the anchor to the second nearest point.
+    """
+
+    second: IntArray
+    anchor: FloatArray
+    reach: FloatArray
+
+
 class KdTree:
     """Points to be searched.
 
@@ -58,7 +76,7 @@ class KdTree:
         ordered = np.array(points, dtype=np.float64, order="C")
         index = np.arange(len(points), dtype=np.int32)
         boxes = np.empty((2 ** (depth + 1) - 1, 6))
-        _build(ordered, index, boxes, depth)
+        order_into_leaves(ordered, index, boxes, depth)
         place = np.empty_like(index)
         place[index] = np.arange(len(points), dtype=np.int32)
         self.arrays = KdArrays(ordered, index, place, boxes, depth)
@@ -80,6 +98,30 @@ class KdTree:
         index, squared = np.empty(len(queries), dtype=np.int32), np.empty(len(queries))
         nearest_into(self.arrays, queries, guess, index, squared)
         return index, squared
+
+    def follow(
+        self, queries: FloatArray, index: IntArray, before: Followed | None = None
+    ) -> tuple[IntArray, FloatArray, FloatArray, Followed]:
+        """Return what `nearest` does, the points themselves (M, 3), and what the next call takes as `before`.
+
+        For queries that keep moving: a few times faster than `nearest` once they move less than the points are apart.
+
+        Args:
+            queries: (M, 3) float64, finite.
+            index: (M,) int32, the last answers.
+            before: what the last call returned, if it was one of this method.
+
+        Raises:
+            InputError: shapes that do not match, or an index that is no point.
+        """
+        queries, m = writable(queries), len(queries)
+        index = checked_guess(index, m, len(self.arrays.original))
+        if before is None:
+            before = Followed(np.full(m, -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
+        after = Followed(np.empty(m, dtype=np.int32), np.empty((m, 3)), np.empty(m))
+        found, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
+        follow_into(self.arrays, queries, index, before, found, squared, points, after)
+        return found, squared, points, after
 
 
 def writable(queries: FloatArray) -> FloatArray:
@@ -134,7 +176,7 @@ def _select(points: FloatArray, index: IntArray, low: int, high: int, middle: in
 
 
 @compiled
-def _build(points: FloatArray, index: IntArray, boxes: FloatArray, depth: int) -> None:
+def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, depth: int) -> None:
     """Sort `points` and `index` into leaves, splitting the longest side at the median; fill `boxes`."""
     count = len(points)
     for level in range(depth + 1):
@@ -224,3 +266,104 @@ def nearest_into(
     for i in range(len(queries)):
         found, squared = nearest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
         index_out[i], squared_out[i] = found, squared
+
+
+@compiled
+def nearest_two(
+    tree: KdArrays, x: float, y: float, z: float, first: int, second: int, stack: FloatArray
+) -> tuple[int, float, int, float]:
+    """Return the index and the squared distance of the nearest point and of the second nearest.
+
+    Of one point alone the second is -1, infinitely far.
+
+    Args:
+        tree: the points.
+        x: coordinates of the query,
+        y: in the unit
+        z: of the points.
+        first: a point that may be near, or -1.
+        second: another one, or -1.
+        stack: (STACK_SIZE,) float64 workspace, one a thread.
+    """
+    points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
+    count, first_leaf = len(index), (1 << depth) - 1
+    best, squared, other, other_squared = -1, np.inf, -1, np.inf
+    if first >= 0:
+        row = tree.place[first]
+        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+        best, squared = first, dx * dx + dy * dy + dz * dz
+    if second >= 0 and second != first:
+        row = tree.place[second]
+        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+        other, other_squared = second, dx * dx + dy * dy + dz * dz
+        if best < 0 or other_squared < squared or (other_squared == squared and other < best):
+            best, squared, other, other_squared = other, other_squared, best, squared
+    node, top = 0, 0
+    while True:
+        while node < first_leaf:
+            left = 2 * node + 1
+            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
+            node = left
+            if far < near:
+                node = left + 1
+                near, far = far, near
+            if near > other_squared:
+                node = -1
+                break
+            if far <= other_squared:
+                stack[top], stack[top + 1] = 2 * left + 1 - node, far
+                top += 2
+        if node >= 0:
+            leaf = node - first_leaf
+            for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
+                dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+                d = dx * dx + dy * dy + dz * dz
+                if d > other_squared or index[row] == best or index[row] == other:
+                    continue
+                if d < squared or (d == squared and (best < 0 or index[row] < best)):
+                    other, other_squared = best, squared
+                    best, squared = index[row], d
+                elif d < other_squared or other < 0:
+                    other, other_squared = index[row], d
+        while top > 0 and stack[top - 1] > other_squared:
+            top -= 2
+        if top == 0:
+            return best, squared, other, other_squared
+        top -= 2
+        node = int(stack[top])
+
+
+@compiled
+def follow_into(
+    tree: KdArrays,
+    queries: FloatArray,
+    index: IntArray,
+    before: Followed,
+    index_out: IntArray,
+    squared_out: FloatArray,
+    points_out: FloatArray,
+    after: Followed,
+) -> None:
+    """Write what `KdTree.follow` returns."""
+    stack = np.empty(STACK_SIZE)
+    for i in range(len(queries)):
+        x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
+        found, second, reach = index[i], before.second[i], before.reach[i]
+        ax, ay, az = before.anchor[i, 0], before.anchor[i, 1], before.anchor[i, 2]
+        row = tree.place[found] if found >= 0 else 0
+        dx, dy, dz = tree.points[row, 0] - x, tree.points[row, 1] - y, tree.points[row, 2] - z
+        squared = dx * dx + dy * dy + dz * dz
+        dx, dy, dz = ax - x, ay - y, az - z
+        way = np.sqrt(dx * dx + dy * dy + dz * dz)
+        # Rounding must not let a tie pass for a clear case.
+        if found < 0 or np.sqrt(squared) + way >= reach * (1.0 - 1e-12):
+            found, squared, second, reach = nearest_two(tree, x, y, z, found, second, stack)
+            row, reach, ax, ay, az = tree.place[found], np.sqrt(reach), x, y, z
+        index_out[i], squared_out[i] = found, squared
+        after.second[i], after.reach[i] = second, reach
+        after.anchor[i, 0], after.anchor[i, 1], after.anchor[i, 2] = ax, ay, az
+        points_out[i, 0], points_out[i, 1], points_out[i, 2] = (
+            tree.points[row, 0],
+            tree.points[row, 1],
+            tree.points[row, 2],
+        )

@@ -1,0 +1,260 @@
+"""Exact closest points on triangles by a tree of boxes in float64, compiled; other compiled loops may search it too.
+
+The triangles are shared out by their centroids as in `kdtree`, with boxes around whole triangles. The closest point of
+one triangle is the foot on its plane if that lies inside, else on one of the edges it lies beyond (Ericson, Real-Time
+Collision Detection, 2005, section 5.1.5); a triangle without area is its three edges. Exact means up to the rounding of
+float64; of triangles that share the closest point, any may be named.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapespace.compiled import compiled
+from shapespace.errors import InputError
+from shapespace.geometry.kdtree import STACK_SIZE, box_distance, checked_guess, order_into_leaves, writable
+from shapespace.types import FloatArray, IntArray
+
+_LEAF_TRIANGLES = 4
+# Squared sine of the angle between two edges below which a triangle has no area.
+_FLAT = 1e-14
+
+
+class TriangleArrays(NamedTuple):
+    """What a tree consists of, as compiled loops take it.
+
+    Args:
+        corners: (F, 9) float64, coordinates of the three corners, in leaf order.
+        original: (F,) int32, the number each triangle had when it was given.
+        place: (F,) int32, the row of `corners` where each number is.
+        boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
+        depth: number of splits from the root to a leaf.
+    """
+
+    corners: FloatArray
+    original: IntArray
+    place: IntArray
+    boxes: FloatArray
+    depth: int
+
+
+class TriangleTree:
+    """Triangles to be searched.
+
+    Args:
+        vertices: (V, 3) float64, finite where triangles use them.
+        faces: (F, 3) int32, at least one; triangles may have no area, or repeat.
+
+    Raises:
+        InputError: no triangles, arrays of another shape, or corners that are not finite.
+    """
+
+    def __init__(self, vertices: FloatArray, faces: IntArray) -> None:
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise InputError(
+                f"A triangle tree needs vertices (V, 3) and triangles (F, 3), at least one, not {vertices.shape} and "
+                f"{faces.shape}."
+            )
+        depth = max(0, int(np.ceil(np.log2(len(faces) / _LEAF_TRIANGLES))))
+        original = np.arange(len(faces), dtype=np.int32)
+        boxes = np.empty((2 ** (depth + 1) - 1, 6))
+        vertices, faces = writable(vertices), np.require(faces, dtype=np.int32, requirements=["C", "W"])
+        middles = np.empty((len(faces), 3))
+        _middles(vertices, faces, middles)
+        if not np.isfinite(middles).all():
+            raise InputError("A triangle tree needs finite corners; drop the triangles whose corners are not.")
+        order_into_leaves(middles, original, boxes, depth)
+        del middles
+        place, corners = np.empty_like(original), np.empty((len(faces), 9))
+        _cover(vertices, faces, original, place, corners, boxes, depth)
+        self.arrays = TriangleArrays(corners, original, place, boxes, depth)
+        """The tree as compiled loops take it."""
+
+    def closest(
+        self, queries: FloatArray, guess: IntArray | None = None
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Return triangle (M,) int32, barycentric (M, 3), points (M, 3) and squared distance (M,) of closest points.
+
+        Args:
+            queries: (M, 3) float64, finite.
+            guess: (M,) int32 triangles that may be near, such as the last answers, -1 for none; they save time and
+                do not change the distance.
+
+        Raises:
+            InputError: shapes that do not match, or a guess that is no triangle.
+        """
+        queries = writable(queries)
+        guess = checked_guess(guess, len(queries), len(self.arrays.original))
+        triangle, squared = np.empty(len(queries), dtype=np.int32), np.empty(len(queries))
+        barycentric, points = np.empty((len(queries), 3)), np.empty((len(queries), 3))
+        closest_into(self.arrays, queries, guess, triangle, barycentric, points, squared)
+        return triangle, barycentric, points, squared
+
+
+@compiled
+def _middles(vertices: FloatArray, faces: IntArray, middles: FloatArray) -> None:
+    for f in range(len(faces)):
+        for k in range(3):
+            middles[f, k] = (vertices[faces[f, 0], k] + vertices[faces[f, 1], k] + vertices[faces[f, 2], k]) / 3.0
+
+
+@compiled
+def _cover(
+    vertices: FloatArray,
+    faces: IntArray,
+    original: IntArray,
+    place: IntArray,
+    corners: FloatArray,
+    boxes: FloatArray,
+    depth: int,
+) -> None:
+    """Fill `place`, `corners` and `boxes` of triangles in the order `original`, leaves first."""
+    count, first_leaf = len(original), (1 << depth) - 1
+    for leaf in range(1 << depth):
+        box = boxes[first_leaf + leaf]
+        box[:3], box[3:] = np.inf, -np.inf
+        for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
+            place[original[row]] = row
+            for corner in range(3):
+                for k in range(3):
+                    value = vertices[faces[original[row], corner], k]
+                    corners[row, 3 * corner + k] = value
+                    box[k] = value if value < box[k] else box[k]
+                    box[3 + k] = value if value > box[3 + k] else box[3 + k]
+    for node in range(first_leaf - 1, -1, -1):
+        for k in range(3):
+            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
+            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
+
+
+@compiled
+def _on_edge(
+    ax: float, ay: float, az: float, bx: float, by: float, bz: float, ex: float, ey: float, ez: float
+) -> tuple[float, float]:
+    """Return where on the edge from a to b = a + e the origin is closest, 0 to 1, and its squared distance."""
+    along, length = -(ax * ex + ay * ey + az * ez), ex * ex + ey * ey + ez * ez
+    if along <= 0.0 or length == 0.0:
+        return 0.0, ax * ax + ay * ay + az * az
+    if along >= length:
+        return 1.0, bx * bx + by * by + bz * bz
+    t = along / length
+    x, y, z = ax + t * ex, ay + t * ey, az + t * ez
+    return t, x * x + y * y + z * z
+
+
+@compiled
+def on_triangle(
+    corners: FloatArray, row: int, x: float, y: float, z: float, limit: float
+) -> tuple[float, float, float]:
+    """Return the squared distance of (x, y, z) to triangle `row`, and the weights of its second and third corner.
+
+    The distance is infinite where it is known to exceed `limit` (squared) from the triangle's plane alone.
+    """
+    # Seen from the query, so that nothing is lost far from the origin.
+    ax, ay, az = corners[row, 0] - x, corners[row, 1] - y, corners[row, 2] - z
+    ux, uy, uz = corners[row, 3] - corners[row, 0], corners[row, 4] - corners[row, 1], corners[row, 5] - corners[row, 2]
+    vx, vy, vz = corners[row, 6] - corners[row, 0], corners[row, 7] - corners[row, 1], corners[row, 8] - corners[row, 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    area = nx * nx + ny * ny + nz * nz
+    above = ax * nx + ay * ny + az * nz
+    flat = area <= _FLAT * (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
+    weight_b = weight_c = weight_a = -1.0
+    if not flat:
+        if above * above > limit * area * (1.0 + 1e-9):
+            return np.inf, 0.0, 0.0
+        weight_b = (vy * az - vz * ay) * nx + (vz * ax - vx * az) * ny + (vx * ay - vy * ax) * nz
+        weight_c = (ay * uz - az * uy) * nx + (az * ux - ax * uz) * ny + (ax * uy - ay * ux) * nz
+        weight_a = area - weight_b - weight_c
+        if weight_a >= 0.0 and weight_b >= 0.0 and weight_c >= 0.0:
+            b, c = weight_b / area, weight_c / area
+            dx, dy, dz = ax + b * ux + c * vx, ay + b * uy + c * vy, az + b * uz + c * vz
+            return dx * dx + dy * dy + dz * dz, b, c
+    bx, by, bz = corners[row, 3] - x, corners[row, 4] - y, corners[row, 5] - z
+    cx, cy, cz = corners[row, 6] - x, corners[row, 7] - y, corners[row, 8] - z
+    squared, b, c = np.inf, 0.0, 0.0
+    if weight_c < 0.0:
+        t, d = _on_edge(ax, ay, az, bx, by, bz, ux, uy, uz)
+        if d < squared:
+            squared, b, c = d, t, 0.0
+    if weight_b < 0.0:
+        t, d = _on_edge(ax, ay, az, cx, cy, cz, vx, vy, vz)
+        if d < squared:
+            squared, b, c = d, 0.0, t
+    if weight_a < 0.0:
+        t, d = _on_edge(bx, by, bz, cx, cy, cz, vx - ux, vy - uy, vz - uz)
+        if d < squared:
+            squared, b, c = d, 1.0 - t, t
+    return squared, b, c
+
+
+@compiled
+def closest_one(
+    tree: TriangleArrays, x: float, y: float, z: float, guess: int, stack: FloatArray
+) -> tuple[int, float, float, float]:
+    """Return the triangle closest to (x, y, z), the squared distance, and the weights of its second and third corner.
+
+    Args:
+        tree: the triangles.
+        x: coordinates of the query,
+        y: in the unit
+        z: of the triangles.
+        guess: a triangle that may be near, or -1.
+        stack: (STACK_SIZE,) float64 workspace, one a thread.
+    """
+    corners, boxes, depth = tree.corners, tree.boxes, tree.depth
+    count, first_leaf = len(corners), (1 << depth) - 1
+    best, squared, weight_b, weight_c = -1, np.inf, 0.0, 0.0
+    if guess >= 0:
+        best = tree.place[guess]
+        squared, weight_b, weight_c = on_triangle(corners, best, x, y, z, np.inf)
+    node, top = 0, 0
+    while True:
+        while node < first_leaf:
+            left = 2 * node + 1
+            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
+            node = left
+            if far < near:
+                node = left + 1
+                near, far = far, near
+            if near >= squared:
+                node = -1
+                break
+            if far < squared:
+                stack[top], stack[top + 1] = 2 * left + 1 - node, far
+                top += 2
+        if node >= 0:
+            leaf = node - first_leaf
+            for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
+                d, b, c = on_triangle(corners, row, x, y, z, squared)
+                if d < squared or best < 0:
+                    best, squared, weight_b, weight_c = row, d, b, c
+        while top > 0 and stack[top - 1] >= squared:
+            top -= 2
+        if top == 0:
+            return tree.original[best], squared, weight_b, weight_c
+        top -= 2
+        node = int(stack[top])
+
+
+@compiled
+def closest_into(
+    tree: TriangleArrays,
+    queries: FloatArray,
+    guess: IntArray,
+    triangle_out: IntArray,
+    barycentric_out: FloatArray,
+    points_out: FloatArray,
+    squared_out: FloatArray,
+) -> None:
+    """Write the answers to `queries` (M, 3) given `guess` (M,): what `TriangleTree.closest` returns."""
+    stack = np.empty(STACK_SIZE)
+    for i in range(len(queries)):
+        triangle, squared, b, c = closest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
+        a = max(0.0, 1.0 - b - c)
+        row = tree.place[triangle]
+        for k in range(3):
+            points_out[i, k] = a * tree.corners[row, k] + b * tree.corners[row, 3 + k] + c * tree.corners[row, 6 + k]
+        barycentric_out[i, 0], barycentric_out[i, 1], barycentric_out[i, 2] = a, b, c
+        triangle_out[i], squared_out[i] = triangle, squared
