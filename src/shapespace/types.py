@@ -113,7 +113,7 @@ class Similarity:
             raise InputError(f"The scale of a similarity must be positive and finite, not {self.scale!r}.")
         if not np.isfinite(translation).all():
             raise InputError("The translation of a similarity must be finite.")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5 and np.linalg.det(rotation) > 0):
             raise InputError("The rotation of a similarity must be orthonormal with determinant +1.")
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", rotation)
@@ -126,7 +126,9 @@ class Similarity:
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Map `points` (..., 3) from the source frame to the target frame."""
-        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+        moved = np.asarray(points, dtype=np.float64) @ (self.scale * self.rotation.T)
+        moved += self.translation
+        return moved
 
     def inverse(self) -> Similarity:
         """Return the similarity from the target frame back to the source frame."""

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
-from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.kdtree import NOTED, KdTree
 from shapespace.types import FloatArray
 
 RNG = np.random.default_rng(0)
@@ -98,11 +98,10 @@ def test_bad_points_queries_and_guesses_are_refused() -> None:
 def test_followed_queries_have_the_answers_of_brute_force_wherever_they_wander(name: str, step: float) -> None:
     points = CLOUDS[name]
     tree, asked = KdTree(points), queries(points)
-    index, _ = tree.nearest(asked)
     followed = None
     size = max(np.ptp(points, axis=0).max(), 1.0)
     for _ in range(8):
-        index, squared, found, followed = tree.follow(asked, index, followed)
+        index, squared, found, followed = tree.follow(asked, followed)
         want, squared_want = brute_force(points, asked)
         assert np.array_equal(index, want)
         assert np.array_equal(squared, squared_want)
@@ -113,18 +112,21 @@ def test_followed_queries_have_the_answers_of_brute_force_wherever_they_wander(n
 def test_followed_queries_that_hardly_move_are_not_searched_again() -> None:
     points = CLOUDS["scattered"]
     tree, asked = KdTree(points), queries(points)
-    index, _, _, first = tree.follow(asked, tree.nearest(asked)[0])
-    _, _, _, second = tree.follow(asked + 1e-9, index, first)
-    kept = (second.anchor == first.anchor).all(axis=1)
-    assert kept.mean() > 0.9
-    _, _, _, third = tree.follow(asked + 40.0, index, second)
-    assert (third.anchor == asked + 40.0).all(axis=1).mean() > 0.9
+    *_, known = tree.follow(asked)
+    tree.follow(asked + 1e-9, known)
+    assert (known.anchor == asked).all(axis=1).mean() > 0.9
+    tree.follow(asked + 40.0, known)
+    assert (known.anchor == asked + 40.0).all(axis=1).mean() > 0.9
+    with pytest.raises(InputError, match="known"):
+        tree.follow(asked[1:], known)
 
 
-def test_a_second_nearest_point_bounds_all_but_the_first() -> None:
-    points = CLOUDS["grid"]
+@pytest.mark.parametrize("name", ["grid", "scattered", "eleven", "one"])
+def test_no_point_that_is_not_noted_lies_within_reach(name: str) -> None:
+    points = CLOUDS[name]
     tree, asked = KdTree(points), queries(points)
-    index, _, _, followed = tree.follow(asked, np.full(len(asked), -1, dtype=np.int32))
+    *_, followed = tree.follow(asked)
     d = np.linalg.norm(points[None] - asked[:, None], axis=2)
-    d[np.arange(len(asked)), index] = np.inf
+    for i, rows in enumerate(followed.rows[:, :NOTED]):
+        d[i, tree.arrays.original[rows[rows >= 0]]] = np.inf
     assert np.allclose(followed.reach, d.min(axis=1), rtol=1e-14)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from shapespace.fit.similarity_icp import fit_pose
-from shapespace.fit.state import IcpState, StopRule
+from shapespace.fit.state import IcpState, StopRule, largest_motion
 from shapespace.geometry.closest import ClosestPointEngine
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
@@ -53,7 +53,7 @@ def shape_icp(
         moved, y = y, T_scan_model.apply(Q)
         matched = scan.query(y, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)
-        motion_mm = float(np.linalg.norm(y - moved, axis=1).max()) / T_scan_model.scale
+        motion_mm = largest_motion(y - moved) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)  # step 4
         yield IcpState(2, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)
         if stopped:

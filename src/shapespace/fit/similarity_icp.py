@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shapespace.fit.state import IcpState, StopRule
+from shapespace.fit.state import IcpState, StopRule, largest_motion
 from shapespace.geometry.closest import ClosestPointEngine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
@@ -40,7 +40,7 @@ def similarity_icp(
         moved, p = p, T_scan_model.apply(Q_mean)
         matched = scan.query(p, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)
-        motion_mm = float(np.linalg.norm(p - moved, axis=1).max()) / T_scan_model.scale
+        motion_mm = largest_motion(p - moved) / T_scan_model.scale
         stopped = stop.why(rms_mm, motion_mm)
         yield IcpState(1, iteration, T_scan_model, b, rms_mm[-1], motion_mm, stopped)
         if stopped:

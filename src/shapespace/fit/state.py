@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, Similarity
 
@@ -61,3 +63,8 @@ class StopRule:
             if change <= self.rate * max(rms_mm[-2], 1e-12) and motion_mm <= self.motion_mm:
                 return "rate"
         return "cap" if len(rms_mm) > self.max_iterations else None
+
+
+def largest_motion(moved: FloatArray) -> float:
+    """Return the length of the longest of `moved` (V, 3)."""
+    return float(np.sqrt(np.einsum("ij,ij->i", moved, moved).max()))

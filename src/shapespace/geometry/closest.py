@@ -87,7 +87,7 @@ class VertexEngine:
         if near is None:
             vertex, squared = self._tree.nearest(asked)
             return ClosestPoints(self._vertices[vertex], np.sqrt(squared), None, None, vertex)
-        vertex, squared, found, followed = self._tree.follow(asked, near.vertex, near.followed)
+        vertex, squared, found, followed = self._tree.follow(asked, near.followed)
         return ClosestPoints(found, np.sqrt(squared), None, None, vertex, followed)
 
 

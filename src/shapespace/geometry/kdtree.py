@@ -17,8 +17,10 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
 _LEAF_POINTS = 12
+NOTED = 2
+"""How many nearest points `follow_into` chooses from before it searches again."""
 STACK_SIZE = 128
-"""Length of the float64 workspace that `nearest_one` and `nearest_two` need."""
+"""Length of the float64 workspace that `nearest_one` and `nearest_few` need."""
 
 
 class KdArrays(NamedTuple):
@@ -40,19 +42,20 @@ class KdArrays(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """What lets queries that have moved a little keep their answer without a search.
+    """What lets queries that have moved a little find their answer without a search.
 
-    A query that was nearest to point i where it was last searched, at `anchor`, and had no other point within `reach`
-    of there, is still nearest to i as long as its distance to i and its way from the anchor make less than `reach`
-    (Greenspan and Godin, 3DIM 2001).
+    Where a query was last searched, at its anchor, its nearest points were noted, and all others were at least `reach`
+    away. So long as its distance to the nearest of those noted and its way from the anchor make less than `reach`, no
+    other point can be nearer (Greenspan and Godin, 3DIM 2001, with more points than one).
 
     Args:
-        second: (M,) int32, the second nearest point at the anchor, -1 where the query was never searched this way.
+        rows: (M, NOTED + 1) int32, rows of `KdArrays.points`, nearest to the anchor first, -1 where there are no
+            more; the last one is that at `reach`.
         anchor: (M, 3) float64.
-        reach: (M,) float64, distance from the anchor to the second nearest point.
+        reach: (M,) float64, infinite where every point is noted, 0 where the query was never searched this way.
     """
 
-    second: IntArray
+    rows: IntArray
     anchor: FloatArray
     reach: FloatArray
 
@@ -100,28 +103,28 @@ class KdTree:
         return index, squared
 
     def follow(
-        self, queries: FloatArray, index: IntArray, before: Followed | None = None
+        self, queries: FloatArray, known: Followed | None = None
     ) -> tuple[IntArray, FloatArray, FloatArray, Followed]:
-        """Return what `nearest` does, the points themselves (M, 3), and what the next call takes as `before`.
+        """Return what `nearest` does, the points themselves (M, 3), and what is to be given as `known` next time.
 
-        For queries that keep moving: a few times faster than `nearest` once they move less than the points are apart.
+        For queries that keep moving: several times faster than `nearest` once they move less than the points are apart.
 
         Args:
             queries: (M, 3) float64, finite.
-            index: (M,) int32, the last answers.
-            before: what the last call returned, if it was one of this method.
+            known: what the last call for these queries returned; None for the first. It is brought up to date in
+                place: it says what is true of the points, whatever the queries are.
 
         Raises:
-            InputError: shapes that do not match, or an index that is no point.
+            InputError: shapes that do not match.
         """
         queries, m = writable(queries), len(queries)
-        index = checked_guess(index, m, len(self.arrays.original))
-        if before is None:
-            before = Followed(np.full(m, -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
-        after = Followed(np.empty(m, dtype=np.int32), np.empty((m, 3)), np.empty(m))
+        if known is None:
+            known = Followed(np.full((m, NOTED + 1), -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
+        elif len(known.reach) != m:
+            raise InputError(f"What is known of {len(known.reach)} queries cannot serve {m}.")
         found, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
-        follow_into(self.arrays, queries, index, before, found, squared, points, after)
-        return found, squared, points, after
+        follow_into(self.arrays, queries, known, found, squared, points)
+        return found, squared, points, known
 
 
 def writable(queries: FloatArray) -> FloatArray:
@@ -269,35 +272,24 @@ def nearest_into(
 
 
 @compiled
-def nearest_two(
-    tree: KdArrays, x: float, y: float, z: float, first: int, second: int, stack: FloatArray
-) -> tuple[int, float, int, float]:
-    """Return the index and the squared distance of the nearest point and of the second nearest.
-
-    Of one point alone the second is -1, infinitely far.
+def nearest_few(
+    tree: KdArrays, x: float, y: float, z: float, limit: float, rows: IntArray, squared: FloatArray, stack: FloatArray
+) -> None:
+    """Write the rows of the nearest points and their squared distances, nearest first, the lowest index of ties.
 
     Args:
         tree: the points.
         x: coordinates of the query,
         y: in the unit
         z: of the points.
-        first: a point that may be near, or -1.
-        second: another one, or -1.
+        limit: squared distance within which there are surely as many points as `rows` takes; infinity if unknown.
+        rows: (k,) int32 to be written, -1 where there are fewer points.
+        squared: (k,) to be written, infinite there.
         stack: (STACK_SIZE,) float64 workspace, one a thread.
     """
     points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
-    count, first_leaf = len(index), (1 << depth) - 1
-    best, squared, other, other_squared = -1, np.inf, -1, np.inf
-    if first >= 0:
-        row = tree.place[first]
-        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-        best, squared = first, dx * dx + dy * dy + dz * dz
-    if second >= 0 and second != first:
-        row = tree.place[second]
-        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-        other, other_squared = second, dx * dx + dy * dy + dz * dz
-        if best < 0 or other_squared < squared or (other_squared == squared and other < best):
-            best, squared, other, other_squared = other, other_squared, best, squared
+    count, first_leaf, last = len(index), (1 << depth) - 1, len(rows) - 1
+    rows[:], squared[:] = -1, np.inf
     node, top = 0, 0
     while True:
         while node < first_leaf:
@@ -307,10 +299,10 @@ def nearest_two(
             if far < near:
                 node = left + 1
                 near, far = far, near
-            if near > other_squared:
+            if near > limit:
                 node = -1
                 break
-            if far <= other_squared:
+            if far <= limit:
                 stack[top], stack[top + 1] = 2 * left + 1 - node, far
                 top += 2
         if node >= 0:
@@ -318,17 +310,23 @@ def nearest_two(
             for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
                 dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
                 d = dx * dx + dy * dy + dz * dz
-                if d > other_squared or index[row] == best or index[row] == other:
+                if d > limit or d > squared[last]:
                     continue
-                if d < squared or (d == squared and (best < 0 or index[row] < best)):
-                    other, other_squared = best, squared
-                    best, squared = index[row], d
-                elif d < other_squared or other < 0:
-                    other, other_squared = index[row], d
-        while top > 0 and stack[top - 1] > other_squared:
+                k = last
+                while k > 0 and (
+                    d < squared[k - 1] or (d == squared[k - 1] and rows[k - 1] >= 0 and index[row] < index[rows[k - 1]])
+                ):
+                    k -= 1
+                if k == last and d == squared[last] and rows[last] >= 0 and index[row] > index[rows[last]]:
+                    continue
+                for j in range(last, k, -1):
+                    rows[j], squared[j] = rows[j - 1], squared[j - 1]
+                rows[k], squared[k] = row, d
+                limit = min(limit, squared[last])
+        while top > 0 and stack[top - 1] > limit:
             top -= 2
         if top == 0:
-            return best, squared, other, other_squared
+            return
         top -= 2
         node = int(stack[top])
 
@@ -337,33 +335,33 @@ def nearest_two(
 def follow_into(
     tree: KdArrays,
     queries: FloatArray,
-    index: IntArray,
-    before: Followed,
+    known: Followed,
     index_out: IntArray,
     squared_out: FloatArray,
     points_out: FloatArray,
-    after: Followed,
 ) -> None:
-    """Write what `KdTree.follow` returns."""
-    stack = np.empty(STACK_SIZE)
+    """Write what `KdTree.follow` returns, and into `known` what was found."""
+    points, stack, noted_squared = tree.points, np.empty(STACK_SIZE), np.empty(NOTED + 1)
     for i in range(len(queries)):
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-        found, second, reach = index[i], before.second[i], before.reach[i]
-        ax, ay, az = before.anchor[i, 0], before.anchor[i, 1], before.anchor[i, 2]
-        row = tree.place[found] if found >= 0 else 0
-        dx, dy, dz = tree.points[row, 0] - x, tree.points[row, 1] - y, tree.points[row, 2] - z
-        squared = dx * dx + dy * dy + dz * dz
-        dx, dy, dz = ax - x, ay - y, az - z
-        way = np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = known.anchor[i, 0] - x, known.anchor[i, 1] - y, known.anchor[i, 2] - z
+        way, reach = np.sqrt(dx * dx + dy * dy + dz * dz), known.reach[i]
+        best, squared = -1, np.inf
+        for k in range(NOTED):
+            row = known.rows[i, k]
+            if row < 0:
+                break
+            dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+            d = dx * dx + dy * dy + dz * dz
+            if d < squared or (d == squared and tree.original[row] < tree.original[best]):
+                best, squared = row, d
         # Rounding must not let a tie pass for a clear case.
-        if found < 0 or np.sqrt(squared) + way >= reach * (1.0 - 1e-12):
-            found, squared, second, reach = nearest_two(tree, x, y, z, found, second, stack)
-            row, reach, ax, ay, az = tree.place[found], np.sqrt(reach), x, y, z
-        index_out[i], squared_out[i] = found, squared
-        after.second[i], after.reach[i] = second, reach
-        after.anchor[i, 0], after.anchor[i, 1], after.anchor[i, 2] = ax, ay, az
-        points_out[i, 0], points_out[i, 1], points_out[i, 2] = (
-            tree.points[row, 0],
-            tree.points[row, 1],
-            tree.points[row, 2],
-        )
+        if np.sqrt(squared) + way >= reach * (1.0 - 1e-12):
+            # All that were noted lie within this, so the search may start with it.
+            far = way + reach if known.rows[i, NOTED] >= 0 else np.inf
+            nearest_few(tree, x, y, z, far * far * (1.0 + 1e-12), known.rows[i], noted_squared, stack)
+            best, squared = known.rows[i, 0], noted_squared[0]
+            known.reach[i] = np.sqrt(noted_squared[NOTED])
+            known.anchor[i, 0], known.anchor[i, 1], known.anchor[i, 2] = x, y, z
+        index_out[i], squared_out[i] = tree.original[best], squared
+        points_out[i, 0], points_out[i, 1], points_out[i, 2] = points[best, 0], points[best, 1], points[best, 2]

@@ -35,21 +35,23 @@ def fit_similarity(
         raise InputError(
             f"A similarity needs two point sets of the same shape (N, 3), not {source.shape} and {target.shape}."
         )
-    w = np.ones(len(source)) if weights is None else weights
-    if w.shape != (len(source),) or (w < 0).any() or not np.isfinite(w).all():
+    if weights is None:
+        w = np.full(len(source), 1.0 / max(len(source), 1))
+    elif weights.shape != (len(source),) or (weights < 0).any() or not np.isfinite(weights).all():
         raise InputError("The weights of a similarity must be one finite, non-negative number a point.")
-    total = w.sum()
-    if total <= 0:
+    else:
+        w = weights / max(weights.sum(), np.finfo(float).tiny)
+    if not w.any():
         raise InputError("A similarity needs at least three points with a positive weight.")
-    w = w / total
 
     mean_source, mean_target = w @ source, w @ target  # eqs 8-9
     q, q_prime = source - mean_source, target - mean_target  # eqs 10-11
-    spread = w @ (q * q).sum(axis=1)
-    if not (np.isfinite(spread) and np.isfinite(q_prime).all()):
+    weighted = q * w[:, None]
+    H = weighted.T @ q_prime  # eq 12
+    spread = np.vdot(weighted, q)
+    if not (np.isfinite(spread) and np.isfinite(H).all()):
         raise InputError("The points of a similarity must be finite.")
 
-    H = (q * w[:, None]).T @ q_prime  # eq 12
     U, D, Vt = np.linalg.svd(H)  # eq 13
     if spread <= 0 or D[1] <= _RANK_TOLERANCE * max(D[0], np.finfo(float).tiny):
         raise InputError(
