@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, cast
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csgraph
 
 from shapespace.errors import MeshError
-from shapespace.types import BoolArray, FloatArray, Mesh
-
-_Ints: TypeAlias = npt.NDArray[np.int64]
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 # Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
 _DEGENERATE = 1e-12
@@ -136,7 +133,7 @@ class _Doctor:
         self.mesh = mesh
         self.findings: list[Finding] = []
         self.vertices = mesh.vertices
-        self.faces: _Ints | None = None if mesh.faces is None else mesh.faces.astype(np.int64)
+        self.faces: IntArray | None = None if mesh.faces is None else np.array(mesh.faces)
         self.in_file = self.faces
         """The triangles in the numbering of the file, in step with `faces`."""
         self.changed = False
@@ -144,7 +141,7 @@ class _Doctor:
         self.components = self.boundary = self.non_manifold = self.inconsistent = self.turned = 0
         self.share = 1.0 if self.faces is not None else 0.0
         self.planarity = self.origin_distance = float("nan")
-        finite: BoolArray = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
+        finite = _finite(mesh.vertices)
         self.finite = finite
         if self._drop_non_finite(finite):
             self._run()
@@ -189,15 +186,15 @@ class _Doctor:
 
     def _keep_vertices(self, keep: BoolArray) -> None:
         if self.faces is not None:
-            self.faces = (np.cumsum(keep) - 1)[self.faces]
+            self.faces = (np.cumsum(keep, dtype=np.int32) - 1)[self.faces]
         self.vertices = self.vertices[keep]
 
-    def _keep_triangles(self, keep: BoolArray | _Ints) -> None:
+    def _keep_triangles(self, keep: BoolArray | IntArray) -> None:
         assert self.faces is not None and self.in_file is not None
         self.faces, self.in_file = self.faces[keep], self.in_file[keep]
 
     def _merge_vertices(self) -> None:
-        first, index = _equal_rows(self.vertices)
+        first, index = _equal_rows((self.vertices + 0.0).view(np.int64))  # 0 and -0 have other bits
         self.duplicates = len(self.vertices) - len(first)
         if self.duplicates:
             self.vertices = self.vertices[first]
@@ -208,13 +205,10 @@ class _Doctor:
             )
 
     def _drop_triangles(self) -> None:
+        from shapespace.geometry import topology  # compiled
+
         assert self.faces is not None
-        # Near the origin, so that far coordinates do not eat the digits of the areas.
-        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces]
-        edges = corners - np.roll(corners, 1, axis=1)
-        longest = np.einsum("fij,fij->fi", edges, edges).max(axis=1)
-        doubled = np.linalg.norm(np.cross(edges[:, 1], edges[:, 2]), axis=1)
-        flat = doubled <= _DEGENERATE * longest
+        flat = topology.flat_triangles(np.array(self.vertices), self.faces, _DEGENERATE)
         self.degenerate = int(flat.sum())
         if self.degenerate:
             self._keep_triangles(~flat)
@@ -286,6 +280,8 @@ class _Doctor:
             self._note("It has no triangles: a point cloud.", "Distances are measured to its points.")
 
     def _inspect_surface(self) -> None:
+        from shapespace.geometry import topology  # compiled
+
         assert self.faces is not None
         edges = _Edges(self.faces, len(self.vertices))
         self.boundary, self.non_manifold = edges.boundary, edges.non_manifold
@@ -296,11 +292,11 @@ class _Doctor:
             )
         self.inconsistent = int(edges.same_way.sum())
         self._orient(edges)
-        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-        self._turn_outward(edges, corners.mean(axis=1), normals)
-        areas = np.linalg.norm(normals, axis=1)
-        self.components, pieces = _components(len(self.vertices), self.faces[:, [0, 1]], self.faces[:, [1, 2]])
+        vertices = np.array(self.vertices)
+        middles, normals = topology.middles_and_normals(vertices, self.faces, vertices.mean(axis=0))
+        self._turn_outward(edges, middles, normals)
+        areas = _lengths(normals)
+        self.components, pieces = _components(len(self.vertices), self.faces[:, :2], self.faces[:, 1:])
         by_piece = np.bincount(pieces[self.faces[:, 0]], weights=areas)
         self.share = float(by_piece.max() / areas.sum())
         if self.components > 1:
@@ -359,7 +355,7 @@ class _Doctor:
         count, patch = edges.patches()
         closed = np.ones(count, dtype=np.bool_)
         closed[patch[edges.loose]] = False
-        areas = np.linalg.norm(normals, axis=1)
+        areas = _lengths(normals)
         area = np.bincount(patch, weights=areas, minlength=count)
         centre = np.stack(
             [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
@@ -384,8 +380,8 @@ class _Doctor:
         if not is_open.any():
             return
         weight = areas[is_open]
-        arm = middles[is_open] - np.average(middles[is_open], axis=0, weights=weight)
-        reach = float((weight * np.linalg.norm(arm, axis=1)).sum())
+        arm = middles[is_open] - weight @ middles[is_open] / weight.sum()
+        reach = float((weight * _lengths(arm)).sum())
         score = float(np.einsum("fi,fi->", normals[is_open], arm)) / reach if reach > 0 else 0.0
         if score < _REVERSED:
             self._turn(is_open)
@@ -399,8 +395,7 @@ class _Doctor:
         """Return the mesh after the repairs."""
         if not self.changed:
             return self.mesh
-        faces = None if self.faces is None else self.faces.astype(np.int32)
-        return Mesh(self.vertices, faces, self.mesh.landmarks, self.mesh.name)
+        return Mesh(self.vertices, self.faces, self.mesh.landmarks, self.mesh.name)
 
     def report(self) -> MeshReport:
         """Return what was found."""
@@ -432,63 +427,59 @@ class _Doctor:
 class _Edges:
     """The edges of triangles (F, 3): how many are boundary or non-manifold, and who meets across the others."""
 
-    def __init__(self, faces: _Ints, vertices: int) -> None:
-        start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-        key = np.minimum(start, end) * vertices + np.maximum(start, end)
-        order = np.argsort(key, kind="stable")
-        new = np.ones(len(key) + 1, dtype=np.bool_)
-        new[1:-1] = key[order[1:]] != key[order[:-1]]
-        first = np.flatnonzero(new[:-1])
-        uses = np.diff(np.flatnonzero(new))
-        owner = order // 3
+    def __init__(self, faces: IntArray, vertices: int) -> None:
+        from shapespace.geometry import topology  # compiled
+
         self.faces = len(faces)
-        self.boundary = int((uses == 1).sum())
-        self.non_manifold = int((uses > 2).sum())
-        two = first[uses == 2]
-        self.pairs: _Ints = np.stack([owner[two], owner[two + 1]], axis=1)
-        """(E, 2) the triangles that meet across each manifold edge."""
-        self.same_way: BoolArray = start[order[two]] == start[order[two + 1]]
-        """(E,) whether they run along it in the same direction, so that one of them is turned."""
-        self.loose: _Ints = owner[np.repeat(uses != 2, uses)]
-        """Triangles with an edge that is boundary or non-manifold."""
+        self.pairs, self.same_way, self.loose, self.boundary, self.non_manifold = topology.meeting_triangles(
+            faces, vertices
+        )
+        """`pairs` (E, 2) are the triangles that meet across each manifold edge, `same_way` (E,) whether they run along
+        it in the same direction, so that one of them is turned; `loose` are the triangles at all other edges."""
 
     def cut(self, seam: BoolArray) -> None:
         """Take the pairs where `seam` (E,) as not joined."""
         self.loose = np.concatenate([self.loose, self.pairs[seam].ravel()])
         self.pairs, self.same_way = self.pairs[~seam], self.same_way[~seam]
 
-    def patches(self) -> tuple[int, _Ints]:
+    def patches(self) -> tuple[int, IntArray]:
         """Return the number of patches joined by manifold edges, and (F,) the patch of each triangle."""
         return _components(self.faces, self.pairs)
 
 
-def _components(nodes: int, *links: npt.NDArray[Any]) -> tuple[int, _Ints]:
+def _components(nodes: int, *links: IntArray) -> tuple[int, IntArray]:
     """Return the number of connected components and (nodes,) the component of each; `links` are (E, 2)."""
-    ties = np.concatenate(links)
-    graph = coo_array((np.ones(len(ties), dtype=np.int8), (ties[:, 0], ties[:, 1])), shape=(nodes, nodes))
-    # SciPy has no types here.
-    label: Any = cast(Any, csgraph).connected_components(graph.tocsr(), directed=False)[1]
-    return int(label.max()) + 1 if nodes else 0, np.asarray(label, dtype=np.int64)
+    from shapespace.geometry import topology  # compiled
+
+    parent = np.arange(nodes, dtype=np.int32)
+    for ties in links:
+        topology.join(parent, np.require(ties, np.int32, ["C", "W"]))
+    return topology.labels(parent)
 
 
-def _equal_rows(rows: npt.NDArray[Any]) -> tuple[_Ints, _Ints]:
+def _equal_rows(rows: npt.NDArray[np.int64] | IntArray) -> tuple[IntArray, IntArray]:
     """Return where each different row of `rows` (N, 3) first appears, in that order, and (N,) which one each is."""
-    order = np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))
-    ranked = rows[order]
-    new = np.ones(len(rows), dtype=np.bool_)
-    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    first = order[new]
-    by_appearance = np.argsort(first)
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[by_appearance] = np.arange(len(first))
-    index = np.empty(len(rows), dtype=np.int64)
-    index[order] = rank[np.cumsum(new) - 1]
-    return first[by_appearance], index
+    from shapespace.geometry import topology  # compiled
+
+    first = topology.first_of_equal(rows)
+    is_first = first == np.arange(len(rows), dtype=np.int32)
+    return np.flatnonzero(is_first).astype(np.int32), (np.cumsum(is_first, dtype=np.int32) - 1)[first]
 
 
 def _within(inner: FloatArray, outer: FloatArray) -> bool:
     """Whether the box around `inner` lies inside the box around `outer`."""
     return bool((inner.min(axis=0) > outer.min(axis=0)).all() and (inner.max(axis=0) < outer.max(axis=0)).all())
+
+
+def _finite(vertices: FloatArray) -> BoolArray:
+    """Return (V,) whether all coordinates are finite; one pass where they are, as nearly always."""
+    if np.isfinite(vertices).all():
+        return np.ones(len(vertices), dtype=np.bool_)
+    return np.asarray(np.isfinite(vertices).all(axis=1))
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _some(count: int, one: str, many: str) -> str:

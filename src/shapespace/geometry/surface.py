@@ -48,11 +48,10 @@ def vertex_areas(mesh: Mesh) -> FloatArray:
 
 def boundary_edges(faces: IntArray) -> IntArray:
     """Return the edges (E, 2) that belong to exactly one triangle."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    base = int(faces.max()) + 1 if len(faces) else 1
-    keys, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
-    single = keys[counts == 1]
-    return np.stack([single // base, single % base], axis=1).astype(np.int32)
+    from shapespace.geometry.topology import single_edges  # compiled
+
+    vertices = int(faces.max()) + 1 if len(faces) else 0
+    return single_edges(np.require(faces, np.int32, ["C", "W"]), vertices)
 
 
 def boundary_vertices(mesh: Mesh) -> BoolArray:

@@ -1,0 +1,197 @@
+"""What the mesh doctor asks of a surface, compiled, in linear time and little memory: equal rows, edges, pieces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.compiled import compiled
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+# Insertion sort is quickest for the few edges of a usual vertex, and quadratic for the hub of a fan.
+_FEW = 48
+
+
+@compiled
+def first_of_equal(rows: npt.NDArray[Any]) -> IntArray:
+    """Return (N,) int32, for each of `rows` (N, 3) integers the first row that equals it."""
+    size = 16
+    while size < 2 * len(rows):
+        size *= 2
+    table = np.full(size, -1, dtype=np.int32)
+    first = np.empty(len(rows), dtype=np.int32)
+    for i in range(len(rows)):
+        key = np.uint64(rows[i, 0]) * np.uint64(0x9E3779B97F4A7C15)
+        key = (key ^ (key >> np.uint64(29)) ^ np.uint64(rows[i, 1])) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ (key >> np.uint64(32)) ^ np.uint64(rows[i, 2])) * np.uint64(0x94D049BB133111EB)
+        at = np.int64((key ^ (key >> np.uint64(31))) & np.uint64(size - 1))
+        while True:
+            j = table[at]
+            if j < 0:
+                table[at] = i
+                first[i] = i
+                break
+            if rows[i, 0] == rows[j, 0] and rows[i, 1] == rows[j, 1] and rows[i, 2] == rows[j, 2]:
+                first[i] = j
+                break
+            at = (at + 1) & (size - 1)
+    return first
+
+
+@compiled
+def sorted_edges(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.int64], IntArray, IntArray]:
+    """Return the edges of `faces` (F, 3) sorted by lower vertex, then upper, then triangle.
+
+    Args:
+        faces: indices below `vertices`.
+        vertices: how many there are.
+
+    Returns:
+        (V + 1,) where the edges of each lower vertex start; (3F,) the upper vertex of each; (3F,) which side of which
+        triangle it is: side k of triangle f, from corner k to the next, is 3 f + k.
+    """
+    start = np.zeros(vertices + 1, dtype=np.int64)
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, k - 2]
+            start[(a if a < b else b) + 1] += 1
+    for v in range(vertices):
+        start[v + 1] += start[v]
+    upper, side = np.empty(3 * len(faces), dtype=np.int32), np.empty(3 * len(faces), dtype=np.int32)
+    filled = start[:-1].copy()
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, k - 2]
+            low, high = (a, b) if a < b else (b, a)
+            upper[filled[low]], side[filled[low]] = high, 3 * f + k
+            filled[low] += 1
+    for v in range(vertices):
+        low, high = start[v], start[v + 1]
+        if high - low > _FEW:
+            order = np.argsort(upper[low:high], kind="mergesort")
+            upper[low:high], side[low:high] = upper[low:high][order], side[low:high][order]
+            continue
+        for i in range(low + 1, high):
+            u, s, j = upper[i], side[i], i
+            while j > low and upper[j - 1] > u:
+                upper[j], side[j] = upper[j - 1], side[j - 1]
+                j -= 1
+            upper[j], side[j] = u, s
+    return start, upper, side
+
+
+@compiled
+def single_edges(faces: IntArray, vertices: int) -> IntArray:
+    """Return the edges (E, 2), lower vertex first and sorted, that belong to exactly one of `faces` (F, 3)."""
+    start, upper, _ = sorted_edges(faces, vertices)
+    count = 0
+    found = np.empty((len(upper), 2), dtype=np.int32)
+    for v in range(vertices):
+        for i in range(start[v], start[v + 1]):
+            before = i > start[v] and upper[i - 1] == upper[i]
+            after = i + 1 < start[v + 1] and upper[i + 1] == upper[i]
+            if not (before or after):
+                found[count, 0], found[count, 1] = v, upper[i]
+                count += 1
+    return found[:count].copy()
+
+
+@compiled
+def meeting_triangles(faces: IntArray, vertices: int) -> tuple[IntArray, BoolArray, IntArray, int, int]:
+    """Return who meets whom across the edges of `faces` (F, 3).
+
+    Returns:
+        (E, 2) the triangles that meet across each edge of exactly two; (E,) whether both run along it in the same
+        direction, so that one is turned; (L,) the triangles at all other edges, one for each side; the number of edges
+        of one triangle; the number of edges of more than two.
+    """
+    start, upper, side = sorted_edges(faces, vertices)
+    pairs, same_way = np.empty((len(upper) // 2, 2), dtype=np.int32), np.empty(len(upper) // 2, dtype=np.bool_)
+    loose = np.empty(len(upper), dtype=np.int32)
+    met = left = single = many = 0
+    for v in range(vertices):
+        i = start[v]
+        while i < start[v + 1]:
+            j = i + 1
+            while j < start[v + 1] and upper[j] == upper[i]:
+                j += 1
+            if j - i == 2:
+                a, b = side[i], side[i + 1]
+                pairs[met, 0], pairs[met, 1] = a // 3, b // 3
+                same_way[met] = faces[a // 3, a % 3] == faces[b // 3, b % 3]
+                met += 1
+            else:
+                single += j - i == 1
+                many += j - i > 2
+                for n in range(i, j):
+                    loose[left] = side[n] // 3
+                    left += 1
+            i = j
+    return pairs[:met].copy(), same_way[:met].copy(), loose[:left].copy(), single, many
+
+
+@compiled
+def _root(parent: IntArray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@compiled
+def join(parent: IntArray, links: IntArray) -> None:
+    """Join the sets of `parent` (N,), at first 0 to N - 1, that `links` (E, 2) tie; each set's least is its root."""
+    for i in range(len(links)):
+        a, b = _root(parent, links[i, 0]), _root(parent, links[i, 1])
+        if a < b:
+            parent[b] = a
+        else:
+            parent[a] = b
+
+
+@compiled
+def labels(parent: IntArray) -> tuple[int, IntArray]:
+    """Return how many sets `parent` (N,) holds, and (N,) int32 the set of each, numbered in order of appearance."""
+    count = 0
+    label = np.empty(len(parent), dtype=np.int32)
+    for i in range(len(parent)):
+        root = _root(parent, i)
+        if root == i:
+            label[i] = count
+            count += 1
+        else:
+            label[i] = label[root]
+    return count, label
+
+
+@compiled
+def flat_triangles(vertices: FloatArray, faces: IntArray, tolerance: float) -> BoolArray:
+    """Return (F,) whether twice the area of a triangle is at most `tolerance` times its longest edge squared."""
+    flat = np.empty(len(faces), dtype=np.bool_)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        wx, wy, wz = vx - ux, vy - uy, vz - uz
+        longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz)
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        flat[f] = np.sqrt(nx * nx + ny * ny + nz * nz) <= tolerance * longest
+    return flat
+
+
+@compiled
+def middles_and_normals(vertices: FloatArray, faces: IntArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return (F, 3) centroids of triangles less `centre`, and (F, 3) normals as long as their areas."""
+    middles, normals = np.empty((len(faces), 3)), np.empty((len(faces), 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        normals[f, 0], normals[f, 1] = (uy * vz - uz * vy) / 2, (uz * vx - ux * vz) / 2
+        normals[f, 2] = (ux * vy - uy * vx) / 2
+        middles[f, 0] = vertices[a, 0] - centre[0] + (ux + vx) / 3
+        middles[f, 1] = vertices[a, 1] - centre[1] + (uy + vy) / 3
+        middles[f, 2] = vertices[a, 2] - centre[2] + (uz + vz) / 3
+    return middles, normals
