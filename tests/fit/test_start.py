@@ -65,7 +65,7 @@ def test_a_mask_is_found_in_almost_any_pose() -> None:
     scan, true = mask(sphere(2500, 0.7)[0], Z), fit_similarity(model.mean_vertices, mask(d, Z)).rotation
     for R in turns(12, seed=5):
         start = start_from_any_pose(model, scan @ R.T + [300.0, -100.0, 50.0], seed=0)
-        assert start.T_scan_model.scale == 1.0
+        assert start.T_scan_model.scale == pytest.approx(1.0, abs=0.1)
         off.append(angle_deg(start.T_scan_model.rotation @ (R @ true).T))
     # Upside down it is nearly the same oval, and upright wins where nothing speaks clearly against it.
     assert sum(angle < WITHIN_DEG for angle in off) >= 10, off

@@ -1,36 +1,27 @@
-"""Where to begin: the scan's unit, and a pose of the mean shape from landmarks or from many rotations.
+"""Where to begin: the scan's unit, and a pose of the model from landmarks or from anywhere.
 
-A start with centroids together holds to about 45 degrees. Beyond that many rotations are tried coarsely at fixed scale,
-scored both ways with the worst matches trimmed, and the best are refined unless no rotation is clearly best.
+A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
+rotations are tried (`any_pose`), and what they reach with the leading modes free is compared both ways.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from shapespace.errors import FitError, InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
-_COARSE_POINTS = (300, 4_000)
-_FINE_POINTS = (1_200, 12_000)
-_COARSE_ITERATIONS = 15
-_FINE_ITERATIONS = 80
-_REFINED = 6
-_KEPT_SHARE = 0.8
-_COARSE_RATE = 5e-3
-_FINE_RATE = 5e-4
-_SAME_TURN_COSINE = 0.94
-_CLEARLY_UPRIGHT = 0.82
-_PREFER_UPRIGHT = 0.85
+_PREFER_UPRIGHT = 0.93
+_SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
 _TYPICAL_COVER = 1.2
 _INCH_IS_RARE = 0.5
+_PLAUSIBLE_COVER = (0.45, 2.6)
+_LIKELIER_BY_FAR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,32 +31,48 @@ class Start:
     Args:
         T_scan_model: from the model's frame to the scan's frame in mm.
         how: `landmarks`, `upright` (no rotation), `rotations` (another of the rotations tried was better), `given`.
-        score_mm: two-way trimmed distance of the mean shape there, mm; not-a-number for landmarks and `given`.
+        score_mm: two-way capped distance of the adapted model there, mm of the model; not-a-number for landmarks and
+            `given`.
+        b: (K',) coefficients of the leading modes found there, mm; (0,) where none were.
+        runner_up_score_mm: `score_mm` of the best pose that is another one; infinite where none was tried.
+        alternatives: up to three such other poses, best first, without alternatives of their own.
     """
 
     T_scan_model: Similarity
     how: str
     score_mm: float
+    b: FloatArray = field(default_factory=lambda: np.zeros(0))
+    runner_up_score_mm: float = float("inf")
+    alternatives: tuple[Start, ...] = ()
 
 
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
     """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
 
+    Where two units are about as likely by size, such as centimetres and inches, the one wins in which the model fits
+    the scan better from anywhere.
+
     Raises:
         FitError: no unit brings the sizes within a factor of five.
     """
     ratio = _size(scan.vertices) / _size(model.mean_vertices)
-    penalty = {
-        unit: abs(np.log(ratio * mm / _TYPICAL_COVER)) + (_INCH_IS_RARE if unit == "inch" else 0.0)
-        for unit, mm in MM_PER_UNIT.items()
-    }
-    unit = min(penalty, key=lambda name: penalty[name])
-    if not 0.2 < ratio * MM_PER_UNIT[unit] < 5.0:
+    with np.errstate(divide="ignore"):
+        penalty = {
+            unit: abs(float(np.log(ratio * mm / _TYPICAL_COVER))) + (_INCH_IS_RARE if unit == "inch" else 0.0)
+            for unit, mm in MM_PER_UNIT.items()
+        }
+    best, second = sorted(penalty, key=lambda name: penalty[name])[:2]
+    if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
         raise FitError(
             f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit, or crop it to "
             "what the model shows."
         )
-    return unit
+    low, high = _PLAUSIBLE_COVER
+    if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
+        return best
+    centred = scan.vertices - np.median(scan.vertices, axis=0)
+    found = {unit: start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0) for unit in (best, second)}
+    return min(found, key=lambda unit: found[unit].score_mm)
 
 
 def start_from_landmarks(
@@ -96,97 +103,36 @@ def start_from_landmarks(
     return Start(T, "landmarks", float("nan"))
 
 
-def start_from_any_pose(model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int) -> Start:
-    """Return the best pose of the mean shape over no rotation and the 23 other rotations of the cube.
+def start_from_any_pose(
+    model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int, with_scale: bool | None = None
+) -> Start:
+    """Return the best pose over all rotations, with the leading modes adapted, and the best of the others.
 
-    The scale stays 1 here: a scale that is free finds it cheapest to vanish. No rotation wins unless another is
-    clearly better, since scans mostly come upright and a smooth skull fits a face from behind.
+    A scan that clearly fits without a rotation is not searched further. Another rotation wins only when it is clearly
+    better, since scans mostly come upright and some objects look the same from several sides.
 
     Args:
-        model: its mean shape is placed.
-        scan_vertices_mm: (S, 3).
+        model: what is placed.
+        scan_vertices_mm: (S, 3), at least one.
         seed: of the subsample that is searched.
+        with_scale: whether the pose has a free scale; None goes by the model's gauge.
     """
-    rng = np.random.default_rng(seed)
-    coarse = _Points.of(model.mean_vertices, scan_vertices_mm, _COARSE_POINTS, rng)
-    fine = _Points.of(model.mean_vertices, scan_vertices_mm, _FINE_POINTS, rng)
-    centre_model, centre_scan = model.mean_vertices.mean(axis=0), scan_vertices_mm.mean(axis=0)
-    starts = list(Rotation.create_group("O").as_matrix())
-    starts.sort(key=lambda R: -np.trace(R))  # no rotation first
-    tried: list[tuple[float, Similarity]] = []
-    for R in starts:
-        T = Similarity(1.0, R, centre_scan - R @ centre_model)
-        T = _trimmed_rigid_icp(coarse, T, _COARSE_ITERATIONS, _COARSE_RATE)
-        tried.append((_two_way_score(coarse, T), T))
-    upright, ranked = tried[0], sorted(tried[1:], key=lambda item: item[0])
-    others = _distinct(ranked, upright[1])[: _REFINED - 1]
-    if others and upright[0] < _CLEARLY_UPRIGHT * others[0][0]:
-        others = []
-    # Coarse points cannot tell a face from the back of a head, so the best are compared on fine ones.
-    refined: list[tuple[float, Similarity]] = []
-    for _, T in [upright, *others]:
-        T = _trimmed_rigid_icp(fine, T, _FINE_ITERATIONS, _FINE_RATE)
-        refined.append((_two_way_score(fine, T), T))
-    best = min(refined, key=lambda item: item[0])
-    if best[0] < _PREFER_UPRIGHT * refined[0][0]:
-        return Start(best[1], "rotations", best[0])
-    return Start(refined[0][1], "upright", refined[0][0])
+    from shapespace.fit.any_pose import search  # numba takes a while to import
 
-
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """A sample of the mean shape and of the scan to search on, mm."""
-
-    mean: FloatArray
-    scan: FloatArray
-    tree: cKDTree
-
-    @staticmethod
-    def of(mean: FloatArray, scan: FloatArray, counts: tuple[int, int], rng: np.random.Generator) -> _Points:
-        thinned = _thin(scan, counts[1], rng)
-        return _Points(_thin(mean, counts[0], rng), thinned, cKDTree(thinned))
-
-
-def _distinct(ranked: list[tuple[float, Similarity]], first: Similarity) -> list[tuple[float, Similarity]]:
-    """Return `ranked` without poses that turn nearly as `first` or as a better one does."""
-    kept: list[tuple[float, Similarity]] = []
-    for score, T in ranked:
-        others = [first, *(other for _, other in kept)]
-        if all(np.trace(T.rotation @ other.rotation.T) < 1 + 2 * _SAME_TURN_COSINE for other in others):
-            kept.append((score, T))
-    return kept
-
-
-def _trimmed_rigid_icp(points: _Points, T: Similarity, iterations: int, rate: float) -> Similarity:
-    """Return `T` after rigid ICP that leaves out the farthest fifth of the matches (Chetverikov et al., 2002)."""
-    keep = int(np.ceil(_KEPT_SHARE * len(points.mean)))
-    before = np.inf
-    for _ in range(iterations):
-        distance, index = points.tree.query(T.apply(points.mean))
-        near = np.argpartition(distance, keep - 1)[:keep]
-        error = float(np.asarray(distance)[near].mean())
-        if error > (1 - rate) * before:
+    scaled = model.gauge == "shape" if with_scale is None else with_scale
+    upright, poses = search(model, scan_vertices_mm, with_scale=scaled, seed=seed)
+    turned = [float(np.trace(upright.T_scan_model.rotation @ pose.T_scan_model.rotation.T)) for pose in poses]
+    starts = [
+        Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)
+        for pose, trace in zip(poses, turned, strict=True)
+    ]
+    for i, start in enumerate(starts):
+        if start.how == "upright" and starts[0].score_mm > _PREFER_UPRIGHT * start.score_mm:
+            starts.insert(0, starts.pop(i))
             break
-        before = error
-        T = fit_similarity(points.mean[near], points.scan[np.asarray(index)[near]], with_scale=False)
-    return T
-
-
-def _two_way_score(points: _Points, T: Similarity) -> float:
-    """Return the trimmed mean distance both ways, mm; of the scan only what lies within the model's reach counts."""
-    placed = T.apply(points.mean)
-    forward = np.sort(points.tree.query(placed)[0])[: int(np.ceil(_KEPT_SHARE * len(placed)))]
-    centre = placed.mean(axis=0)
-    reach = np.linalg.norm(placed - centre, axis=1).max()
-    near = points.scan[np.linalg.norm(points.scan - centre, axis=1) <= reach]
-    if len(near) == 0:
-        return float("inf")
-    backward = np.sort(cKDTree(placed).query(near)[0])[: int(np.ceil(0.5 * len(near)))]
-    return 0.5 * float(forward.mean() + backward.mean())
-
-
-def _thin(points: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
+    best, others = starts[0], tuple(starts[1:])
+    runner_up = min((other.score_mm for other in others), default=float("inf"))
+    return replace(best, runner_up_score_mm=runner_up, alternatives=others)
 
 
 def _size(points: FloatArray) -> float:
