@@ -14,7 +14,7 @@ import numpy as np
 
 from shapespace.compiled import compiled
 from shapespace.errors import InputError
-from shapespace.geometry.kdtree import STACK_SIZE, box_distance, checked_guess, order_into_leaves, writable
+from shapespace.geometry.kdtree import STACK_SIZE, box_distance, checked_guess, order_into_leaves, start_at, writable
 from shapespace.types import FloatArray, IntArray
 
 _LEAF_TRIANGLES = 4
@@ -206,10 +206,11 @@ def closest_one(
     corners, boxes, depth = tree.corners, tree.boxes, tree.depth
     count, first_leaf = len(corners), (1 << depth) - 1
     best, squared, weight_b, weight_c = -1, np.inf, 0.0, 0.0
+    node, top = 0, 0
     if guess >= 0:
         best = tree.place[guess]
         squared, weight_b, weight_c = on_triangle(corners, best, x, y, z, np.inf)
-    node, top = 0, 0
+        node, top = start_at(boxes, best, count, depth, x, y, z, squared, stack)
     while True:
         while node < first_leaf:
             left = 2 * node + 1

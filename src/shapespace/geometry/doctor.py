@@ -356,25 +356,8 @@ class _Doctor:
         closed = np.ones(count, dtype=np.bool_)
         closed[patch[edges.loose]] = False
         areas = _lengths(normals)
-        area = np.bincount(patch, weights=areas, minlength=count)
-        centre = np.stack(
-            [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
-        )
-        outward = np.einsum("fi,fi->f", normals, middles - centre[patch])
-        volume = np.bincount(patch, weights=outward, minlength=count) / 3
-        inside_out = closed & (volume < 0)
-        biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
-        for k in np.flatnonzero(inside_out):
-            # The wall of a cavity rightly looks inward.
-            if k != biggest and _within(middles[patch == k], middles[patch == biggest]):
-                inside_out[k] = False
-        if inside_out.any():
-            self._turn(inside_out[patch])
-            normals[inside_out[patch]] *= -1
-            self._fixed(
-                f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out.",
-                "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed.",
-            )
+        if closed.any():
+            self._turn_closed_outward(closed, patch, areas, middles, normals)
         # Patches of one scan come from one scanner, so the open ones are judged and turned together.
         is_open = ~closed[patch]
         if not is_open.any():
@@ -389,6 +372,31 @@ class _Doctor:
             self._fixed(
                 "The normals of the open surface point to its inside, so its winding looks reversed.",
                 "Its winding is reversed.",
+            )
+
+    def _turn_closed_outward(
+        self, closed: BoolArray, patch: IntArray, areas: FloatArray, middles: FloatArray, normals: FloatArray
+    ) -> None:
+        from shapespace.geometry import topology  # compiled
+
+        count = len(closed)
+        area = np.bincount(patch, weights=areas, minlength=count)
+        centre = np.stack(
+            [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
+        )
+        outward = np.einsum("fi,fi->f", normals, middles - centre[patch])
+        volume = np.bincount(patch, weights=outward, minlength=count) / 3
+        biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
+        low, high = topology.boxes_of(middles, patch, count)
+        # The wall of a cavity rightly looks inward.
+        cavity = (low > low[biggest]).all(axis=1) & (high < high[biggest]).all(axis=1)
+        inside_out = closed & (volume < 0) & ~cavity
+        if inside_out.any():
+            self._turn(inside_out[patch])
+            normals[inside_out[patch]] *= -1
+            self._fixed(
+                f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out.",
+                "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed.",
             )
 
     def repaired(self) -> Mesh:
@@ -464,11 +472,6 @@ def _equal_rows(rows: npt.NDArray[np.int64] | IntArray) -> tuple[IntArray, IntAr
     first = topology.first_of_equal(rows)
     is_first = first == np.arange(len(rows), dtype=np.int32)
     return np.flatnonzero(is_first).astype(np.int32), (np.cumsum(is_first, dtype=np.int32) - 1)[first]
-
-
-def _within(inner: FloatArray, outer: FloatArray) -> bool:
-    """Whether the box around `inner` lies inside the box around `outer`."""
-    return bool((inner.min(axis=0) > outer.min(axis=0)).all() and (inner.max(axis=0) < outer.max(axis=0)).all())
 
 
 def _finite(vertices: FloatArray) -> BoolArray:

@@ -65,6 +65,7 @@ class KdTree:
 
     Args:
         points: (N, 3) float64, finite, at least one; they may repeat, or lie on a line or a plane.
+            A query looks at every repeat of its nearest point, so thousands of repeats are better merged before.
 
     Raises:
         InputError: no points, of another shape, or not finite.
@@ -212,6 +213,33 @@ def box_distance(boxes: FloatArray, node: int, x: float, y: float, z: float) -> 
 
 
 @compiled
+def start_at(
+    boxes: FloatArray,
+    row: int,
+    count: int,
+    depth: int,
+    x: float,
+    y: float,
+    z: float,
+    squared: float,
+    stack: FloatArray,
+) -> tuple[int, int]:
+    """Return the leaf of `row`, of `count` rows, and the top of `stack`, which gets what else may lie within `squared`.
+
+    Half of the boxes that a search from the root would measure, and hardly a branch that goes wrong.
+    """
+    leaf = (((row + 1) << depth) - 1) // count + (1 << depth) - 1
+    top = 0
+    for level in range(1, depth + 1):
+        beside = (((leaf + 1) >> (depth - level)) ^ 1) - 1
+        d = box_distance(boxes, beside, x, y, z)
+        if d <= squared:
+            stack[top], stack[top + 1] = beside, d
+            top += 2
+    return leaf, top
+
+
+@compiled
 def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack: FloatArray) -> tuple[int, float]:
     """Return the index of the point nearest to (x, y, z) and its squared distance.
 
@@ -226,11 +254,12 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
     points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
     count, first_leaf = len(index), (1 << depth) - 1
     best, squared = -1, np.inf
+    node, top = 0, 0
     if guess >= 0:
         row = tree.place[guess]
         dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
         best, squared = guess, dx * dx + dy * dy + dz * dz
-    node, top = 0, 0
+        node, top = start_at(boxes, row, count, depth, x, y, z, squared, stack)
     while True:
         while node < first_leaf:
             left = 2 * node + 1
@@ -273,7 +302,15 @@ def nearest_into(
 
 @compiled
 def nearest_few(
-    tree: KdArrays, x: float, y: float, z: float, limit: float, rows: IntArray, squared: FloatArray, stack: FloatArray
+    tree: KdArrays,
+    x: float,
+    y: float,
+    z: float,
+    limit: float,
+    start: int,
+    rows: IntArray,
+    squared: FloatArray,
+    stack: FloatArray,
 ) -> None:
     """Write the rows of the nearest points and their squared distances, nearest first, the lowest index of ties.
 
@@ -283,6 +320,7 @@ def nearest_few(
         y: in the unit
         z: of the points.
         limit: squared distance within which there are surely as many points as `rows` takes; infinity if unknown.
+        start: row of a point that may be near, or -1.
         rows: (k,) int32 to be written, -1 where there are fewer points.
         squared: (k,) to be written, infinite there.
         stack: (STACK_SIZE,) float64 workspace, one a thread.
@@ -291,6 +329,8 @@ def nearest_few(
     count, first_leaf, last = len(index), (1 << depth) - 1, len(rows) - 1
     rows[:], squared[:] = -1, np.inf
     node, top = 0, 0
+    if start >= 0:
+        node, top = start_at(boxes, start, count, depth, x, y, z, limit, stack)
     while True:
         while node < first_leaf:
             left = 2 * node + 1
@@ -359,7 +399,7 @@ def follow_into(
         if np.sqrt(squared) + way >= reach * (1.0 - 1e-12):
             # All that were noted lie within this, so the search may start with it.
             far = way + reach if known.rows[i, NOTED] >= 0 else np.inf
-            nearest_few(tree, x, y, z, far * far * (1.0 + 1e-12), known.rows[i], noted_squared, stack)
+            nearest_few(tree, x, y, z, far * far * (1.0 + 1e-12), known.rows[i, 0], known.rows[i], noted_squared, stack)
             best, squared = known.rows[i, 0], noted_squared[0]
             known.reach[i] = np.sqrt(noted_squared[NOTED])
             known.anchor[i, 0], known.anchor[i, 1], known.anchor[i, 2] = x, y, z

@@ -195,3 +195,14 @@ def middles_and_normals(vertices: FloatArray, faces: IntArray, centre: FloatArra
         middles[f, 1] = vertices[a, 1] - centre[1] + (uy + vy) / 3
         middles[f, 2] = vertices[a, 2] - centre[2] + (uz + vz) / 3
     return middles, normals
+
+
+@compiled
+def boxes_of(points: FloatArray, label: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return (count, 3) lowest and highest coordinates of the `points` (N, 3) with each `label` (N,)."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    for i in range(len(points)):
+        for k in range(3):
+            low[label[i], k] = min(low[label[i], k], points[i, k])
+            high[label[i], k] = max(high[label[i], k], points[i, k])
+    return low, high
