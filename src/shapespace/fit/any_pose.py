@@ -68,6 +68,8 @@ _SAME_TURN, _SAME_PLACE = math.cos(math.radians(20.0)), 0.3
 _OTHER_TURN = math.cos(math.radians(40.0))
 _CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
 _SURE = 0.85
+_CLEARLY_WORSE, _WORTH = 0.93, 0.05
+_MORE_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,8 @@ class Pose:
 def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int) -> tuple[Pose, list[Pose]]:
     """Return the pose that begins from no rotation, and distinct poses, best first, from everywhere.
 
-    Where no rotation is clearly right, nothing more than its likeliest confusions is tried.
+    Where no rotation is clearly right, nothing more than its likeliest confusions is tried; where another one is not
+    clearly better, it comes first.
 
     Args:
         model: the shape space.
@@ -103,8 +106,8 @@ def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool,
     if sides.is_close(upright):
         flipped = sides.flips(upright)
         if upright.score_mm <= _CLEARLY_BETTER * min(pose.score_mm for pose in flipped):
-            return upright, _distinct([upright, *sorted(flipped, key=_score)], 4, _OTHER_TURN)
-    return upright, sides.everywhere(upright)
+            return upright, _best_distinct([upright, *flipped])
+    return upright, sides.upright_unless_clearly_worse(upright, sides.everywhere(upright))
 
 
 def _score(pose: Pose) -> float:
@@ -229,11 +232,26 @@ class _Sides:
         poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
         poses = sorted([upright, *poses], key=_score)
         poses = [self._again(LONG, pose) for pose in poses[: FINE.kept]] + poses[FINE.kept :]
-        found = _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
-        if len(found) > 1 and found[0].score_mm > _SURE * found[1].score_mm:
-            poses += [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *coarse[MIDDLE.kept : 2 * MIDDLE.kept]]]
-            found = _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
+        found = _best_distinct(poses)
+        if not _is_sure(found):
+            late = coarse[MIDDLE.kept : 2 * MIDDLE.kept]
+            poses = poses[: FINE.kept] + [self._again(LONG, pose) for pose in [*poses[FINE.kept :], *late]]
+            found = _best_distinct(poses)
+        # A large part missing lets the model slide for long before it locks in.
+        for _ in range(_MORE_ROUNDS):
+            if _is_sure(found):
+                break
+            found = _best_distinct([self._again(LONG, pose) for pose in found[: FINE.kept]] + found[FINE.kept :])
         return found
+
+    def upright_unless_clearly_worse(self, upright: Pose, found: list[Pose]) -> list[Pose]:
+        """Return `found` with the pose nearest to `upright` first, unless the best is clearly better."""
+        limit = max(found[0].score_mm / _CLEARLY_WORSE, found[0].score_mm + _WORTH * _CAP * self.model.size)
+        near = [pose for pose in found if len(_distinct([upright, pose], 2, _SAME_TURN)) == 1]
+        first = min([upright, *near], key=_score)
+        if first.score_mm > limit:
+            return found
+        return _distinct([first, *found], LONG.kept, _OTHER_TURN)
 
     def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return two poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's."""
@@ -279,6 +297,14 @@ class _Sides:
         return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
 
 
+def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
+    return _distinct(sorted(poses, key=_score), LONG.kept, _OTHER_TURN)
+
+
+def _is_sure(found: Sequence[Pose]) -> bool:
+    return len(found) < 2 or found[0].score_mm <= _SURE * found[1].score_mm
+
+
 def _distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
     """Return up to `limit` of `poses`, without those that turn as an earlier one does."""
     R = np.stack([pose.T_scan_model.rotation for pose in poses])
@@ -306,14 +332,19 @@ def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
     some = points[:: max(1, len(points) // 4000)]
     low, high = np.quantile(some, [0.005, 0.995], axis=0)
     low, high = np.maximum(points.min(axis=0), low - size), np.minimum(points.max(axis=0), high + size)
-    cell = max(cell, float(np.prod(high - low + cell) / _MAX_THINNING_CELLS) ** (1 / 3))
+    cell = max(cell, _edge(high - low + cell, _MAX_THINNING_CELLS))
     dims = (np.ceil((high - low) / cell) + 1).astype(np.int32)
     return kernels.one_in_each_cell(points, low - 0.5 * cell, cell, dims)
 
 
+def _edge(sides: FloatArray, cells: int) -> float:
+    """Return the edge of the cubes of which a box of `sides` (3,) holds `cells`."""
+    return float(sides.prod() / cells) ** (1 / 3)
+
+
 def _near_grid(points: FloatArray, size: float) -> kernels.NearGrid:
     low, high = points.min(axis=0) - _MARGIN * size, points.max(axis=0) + _MARGIN * size
-    cell = max(_GRID_CELL * size, float(np.prod(high - low) / _MAX_CELLS) ** (1 / 3))
+    cell = max(_GRID_CELL * size, _edge(high - low, _MAX_CELLS))
     dims = (np.ceil((high - low) / cell) + 1).astype(np.int32)
     return kernels.NearGrid(kernels.near_grid(points, low, cell, dims), low, cell)
 

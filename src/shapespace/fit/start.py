@@ -16,12 +16,12 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
-_PREFER_UPRIGHT = 0.93
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
 _TYPICAL_COVER = 1.2
 _INCH_IS_RARE = 0.5
 _PLAUSIBLE_COVER = (0.45, 2.6)
-_LIKELIER_BY_FAR = 1.0
+_LIKELIER_BY_FAR = 0.5
+_STANDS_OUT = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class Start:
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
     """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
 
-    Where two units are about as likely by size, such as centimetres and inches, the one wins in which the model fits
-    the scan better from anywhere.
+    Where two units are about as likely by size, as centimetres and inches are for a part of a face, the likelier one in
+    which a pose of the model stands out wins, else the one in which the model fits better.
 
     Raises:
         FitError: no unit brings the sizes within a factor of five.
@@ -71,8 +71,14 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
         return best
     centred = scan.vertices - np.median(scan.vertices, axis=0)
-    found = {unit: start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0) for unit in (best, second)}
-    return min(found, key=lambda unit: found[unit].score_mm)
+    found: dict[str, float] = {}
+    for unit in (best, second):
+        start = start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0)
+        # In a wrong unit no pose stands out from the others.
+        if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
+            return unit
+        found[unit] = start.score_mm
+    return min(found, key=lambda unit: found[unit])
 
 
 def start_from_landmarks(
@@ -126,10 +132,6 @@ def start_from_any_pose(
         Start(pose.T_scan_model, "upright" if trace > _SAME_TURN_TRACE else "rotations", pose.score_mm, pose.b)
         for pose, trace in zip(poses, turned, strict=True)
     ]
-    for i, start in enumerate(starts):
-        if start.how == "upright" and starts[0].score_mm > _PREFER_UPRIGHT * start.score_mm:
-            starts.insert(0, starts.pop(i))
-            break
     best, others = starts[0], tuple(starts[1:])
     runner_up = min((other.score_mm for other in others), default=float("inf"))
     return replace(best, runner_up_score_mm=runner_up, alternatives=others)
