@@ -29,7 +29,7 @@ from statistics import fmean, median
 from typing import Any
 
 import peers
-from cases import CASES, FAILED_MM, PEOPLE, Bench, Case, Scan, Split, Target, error_mm, floor_mm, surface_figures
+from cases import CASES, FAILED_MM, PEOPLE, Bench, Case, Scan, Split, Target, error_mm, run, surface_figures
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
@@ -76,8 +76,9 @@ def run_task(task: Task) -> Record:
     scan = _bench.scan(case, task.index)
     model = _bench.model(case.model, task.modes)
     record: Record = {**dataclasses.asdict(task), "model": case.model, "coefficients": model.n_modes}
-    if scan.truth is not None:
-        record["floor_mm"] = floor_mm(model, scan)
+    floor = _bench.floor_mm(case, task.index, task.modes)
+    if floor is not None:
+        record["floor_mm"] = floor
     cpu, wall = time.process_time(), time.perf_counter()
     try:
         if task.method in peers.PEERS:
@@ -414,4 +415,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

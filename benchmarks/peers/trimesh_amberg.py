@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from peers import prealigned
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -15,7 +16,8 @@ NEEDS = ("trimesh", "rtree")
 def fit(mean: Mesh, model: ShapeModel, scan: Mesh, T_scan_model: Similarity) -> tuple[FloatArray, float]:
     import trimesh
 
-    source, target = (trimesh.Trimesh(np.array(m.vertices), np.array(m.faces), process=False) for m in (mean, scan))
     began = time.process_time()
+    placed = prealigned(model, scan, T_scan_model)
+    source, target = (trimesh.Trimesh(np.array(m.vertices), np.array(m.faces), process=False) for m in (placed, scan))
     vertices = trimesh.registration.nricp_amberg(source, target)
     return np.asarray(vertices, dtype=np.float64), time.process_time() - began
