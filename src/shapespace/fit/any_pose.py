@@ -47,7 +47,7 @@ class Step(NamedTuple):
         return np.geomspace(self.widest * size, self.narrowest * size, self.iterations)
 
 
-# Chosen on simulated scans of other people than any test's; the benchmark of starts has the outcome.
+# Chosen on simulated scans of other people than those of the tests.
 GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, kept=1)
 FLIPS = Step(points=120, widest=0.3, narrowest=0.06, iterations=8, modes=3, kept=1)
 COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, kept=30)
