@@ -359,7 +359,8 @@ def _off(rng: np.random.Generator) -> Similarity:
 def _anywhere(rng: np.random.Generator) -> Similarity:
     """Return any rotation, far from the origin, in one of the units, at the person's own size."""
     mm = rng.choice(sorted(MM_PER_UNIT.values()))
-    return Similarity(1.0 / mm, Rotation.random(rng=rng).as_matrix(), rng.uniform(-1000, 1000, 3) / mm)
+    rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    return Similarity(1.0 / mm, rotation, rng.uniform(-1000, 1000, 3) / mm)
 
 
 def _roughly_upright(rng: np.random.Generator) -> Similarity:
