@@ -49,7 +49,7 @@ class Step(NamedTuple):
 
 # Chosen on simulated scans of other people than those of the tests.
 GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, kept=1)
-FLIPS = Step(points=120, widest=0.3, narrowest=0.06, iterations=8, modes=3, kept=1)
+FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, kept=1)
 COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, kept=30)
 RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, kept=24)
 MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, kept=5)
