@@ -259,8 +259,8 @@ def report(facts: Mapping[str, Any], records: Sequence[Record]) -> str:
     lines += [
         "",
         f"Error: mean distance of all vertices to their true places, mm. Failed: over {FAILED_MM:g} mm, or no result; "
-        "silent: failed but not doubted. CPU: median of a fit, one BLAS thread, first compilation included where it "
-        "falls in.",
+        "silent: failed but not doubted, as peers never are. CPU: median of a fit, one BLAS thread, first compilation "
+        "included where it falls in.",
         "",
     ]
     main = [
