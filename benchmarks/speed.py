@@ -34,6 +34,8 @@ from tqdm import tqdm
 
 from shapespace.fit.fit import METHODS, FitConfig, fit_scan
 from shapespace.fit.result import FitResult
+from shapespace.fit.shape_icp import shape_icp
+from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.geometry.closest import ENGINES, build_engine
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
@@ -61,8 +63,10 @@ def contenders(model: ShapeModel, scan: Scan, turned: Scan) -> dict[str, Fit]:
         return lambda: paper_numpy.fit(model.mean_vertices, model.basis, scan.mesh.vertices, *at, **stop)
 
     def loop() -> object:
-        config = FitConfig(method="paper")
-        return list(METHODS["paper"](model, build_engine(scan.mesh, config.search), start, config))
+        engine, T = build_engine(scan.mesh, "vertices"), start
+        for state in similarity_icp(model, engine, T, FitConfig().stop_rule()):
+            T = state.T_scan_model
+        return list(shape_icp(model, engine, T, FitConfig().stop_rule()))
 
     def ours(method: str, on: Scan = scan, **more: Any) -> Fit:
         return lambda: fit_scan(model, on.mesh, FitConfig(method=method, **more), T_scan_model=on.start)
