@@ -163,10 +163,15 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("model", type=Path, metavar="MODEL.h5")
     sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    sub.add_argument("--method", default="paper", metavar="NAME", help="paper: the paper's modified ICP (default)")
+    sub.add_argument(
+        "--method",
+        default="robust",
+        metavar="NAME",
+        help="robust (default): pose and shape together, from both directions; paper: the paper's modified ICP",
+    )
     sub.add_argument("--unit", choices=_UNITS, default="auto", help="of the scans (default: found)")
-    sub.add_argument("--search", choices=("vertices", "surface"), default="vertices",
-                     help="closest points among the scan's vertices (the paper) or on its triangles")  # fmt: skip
+    sub.add_argument("--search", choices=("auto", "vertices", "surface"), default="auto",
+                     help="for --method paper: among the scan's vertices (auto) or on its triangles")  # fmt: skip
     sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
                      help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
     sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")

@@ -329,7 +329,7 @@ def _fit_all(
     make_folder(home / "scans")
     for name, scan in scans.items():
         write_mesh(home / "scans" / f"{name}.ply", scan.scan if isinstance(scan, SimulatedScan) else scan)
-    config = FitConfig(stop_motion_mm=scale.stop_motion_mm)
+    config = FitConfig(method="paper", stop_motion_mm=scale.stop_motion_mm)
 
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")

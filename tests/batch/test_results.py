@@ -142,7 +142,9 @@ def test_a_full_disk_leaves_the_old_table(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_model_of_points_gives_a_point_cloud(tmp_path: Path) -> None:
     model = blob_model(vertices=200)
     points = type(model)(model.mean, model.basis, model.stddev, model.total_variance, model.n_training)
-    result = fit_scan(points, Mesh(raw_scan(np.zeros(5)).scan.vertices, name="cloud"), FitConfig(max_iterations=3))
+    result = fit_scan(
+        points, Mesh(raw_scan(np.zeros(5)).scan.vertices, name="cloud"), FitConfig(method="paper", max_iterations=3)
+    )
     write_fitted_mesh(tmp_path / "p.fitted.ply", result, points)
     write_stages(tmp_path / "p.npz", result, points)
     assert read_mesh(tmp_path / "p.fitted.ply").faces is None

@@ -274,7 +274,7 @@ def test_the_record_holds_the_keys_of_the_contract(fitted: Path, world: World) -
     assert record["scan"] == {"name": "scan_0.ply", "hash": sha256_of_file(world.scan)}
     assert record["model"] == {"name": "model.h5", "hash": model.content_hash}
     assert record["status"] == "converged" and record["reason"].endswith(".")
-    assert record["method"] == "paper"
+    assert record["method"] == "robust"
     assert record["config"]["version"] == __version__ and "seed" in record["config"]
     assert record["mm_per_scan_unit"] == 1.0
     T = record["T_scan_model"]
@@ -479,7 +479,9 @@ def test_a_cap_on_iterations_is_a_status_of_its_own(run: Run, world: World, tmp_
 
 
 def test_the_surface_search_and_a_held_scale_are_in_the_record(run: Run, world: World, tmp_path: Path) -> None:
-    outcome = run("fit", world.model, world.scan, "-o", tmp_path, "--search", "surface", "--scale", "fixed")
+    outcome = run(
+        "fit", world.model, world.scan, "-o", tmp_path, "--method", "paper", "--search", "surface", "--scale", "fixed"
+    )
     assert outcome.code == 0, outcome.err
     record = record_of(tmp_path)
     assert record["config"]["search"] == "surface" and record["config"]["scale_in_effect"] == "fixed"

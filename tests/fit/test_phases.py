@@ -210,7 +210,9 @@ def test_the_cap_holds_and_is_told(model: ShapeModel) -> None:
     raw = raw_scan(Z)
     states = both_phases(model, raw.scan, Similarity.identity(), StopRule(1e-15, 1e-15, 4))
     assert [(s.phase, s.iteration, s.stopped) for s in states if s.stopped] == [(1, 4, "cap"), (2, 4, "cap")]
-    result = fit_scan(model, raw.scan, FitConfig(max_iterations=4, unit="mm"), T_scan_model=Similarity.identity())
+    result = fit_scan(
+        model, raw.scan, FitConfig(method="paper", max_iterations=4, unit="mm"), T_scan_model=Similarity.identity()
+    )
     assert result.status == "max_iterations"
     assert "4 iterations" in result.reason
     assert result.iterations == {"phase_1": 4, "phase_2": 4}
@@ -225,7 +227,7 @@ def test_stopping_rules_that_cannot_stop_are_refused(rule: dict[str, float]) -> 
 def test_the_plain_method_loses_scale_when_much_is_missing_and_says_so(model: ShapeModel) -> None:
     """The energy is zero for a model of no size on one scan point; with half of the surface gone it slides there."""
     raw = raw_scan(Z, keep=0.0)
-    result = fit_scan(model, raw.scan, FitConfig(unit="mm"), T_scan_model=Similarity.identity())
+    result = fit_scan(model, raw.scan, FitConfig(method="paper", unit="mm"), T_scan_model=Similarity.identity())
     scale, forward = result.T_scan_model.scale, result.distances.model_to_scan
     error_mm = np.linalg.norm(result.surface(model).vertices - raw.truth, axis=1).mean()
     assert scale < 0.5
@@ -238,13 +240,15 @@ def test_the_plain_method_loses_scale_when_much_is_missing_and_says_so(model: Sh
 
 def test_a_model_that_shrinks_to_a_point_is_an_error_that_says_so(model: ShapeModel) -> None:
     with pytest.raises(FitError, match=r"raw\.ply: .*shrank to a point"):
-        fit_scan(model, raw_scan(Z, keep=0.3).scan, FitConfig(unit="mm"), T_scan_model=Similarity.identity())
+        fit_scan(
+            model, raw_scan(Z, keep=0.3).scan, FitConfig(method="paper", unit="mm"), T_scan_model=Similarity.identity()
+        )
 
 
 @pytest.mark.parametrize("keep", [-0.6, -0.2, 0.2])
 @pytest.mark.parametrize("scale", ["free", "fixed"])
 def test_no_scan_with_a_large_part_missing_passes_for_good(model: ShapeModel, keep: float, scale: str) -> None:
-    config = FitConfig(unit="mm", scale=scale)
+    config = FitConfig(method="paper", unit="mm", scale=scale)
     try:
         result = fit_scan(model, raw_scan(Z, keep=keep).scan, config, T_scan_model=Similarity.identity())
     except FitError:
@@ -255,7 +259,7 @@ def test_no_scan_with_a_large_part_missing_passes_for_good(model: ShapeModel, ke
 def test_a_complete_scan_is_not_doubtful(model: ShapeModel) -> None:
     raw = raw_scan(Z, similarity(8, 15.0, 1.0), noise_mm=0.2)
     told: list[IcpState] = []
-    result = fit_scan(model, raw.scan, on_state=told.append)
+    result = fit_scan(model, raw.scan, FitConfig(method="paper"), on_state=told.append)
     assert (result.status, result.method) == ("converged", "paper")
     assert list(result.history) == told
     assert result.mm_per_scan_unit == 1.0

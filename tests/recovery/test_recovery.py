@@ -10,7 +10,7 @@ from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate
 from shapespace.fit.fit import FitConfig, FitResult, fit_scan
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 FACTORS = np.random.default_rng(11).uniform(-1.2, 1.2, (4, 5))
@@ -31,7 +31,12 @@ def test_known_blobs_are_recovered_from_noisy_scans(search: str, typical_mm: flo
     errors, b_errors = [], []
     for z in FACTORS:
         raw = raw_scan(z, T, vertices=6000, model_vertices=1500, noise_mm=0.2)
-        result = fit_scan(model, raw.scan, FitConfig(unit="mm", search=search, max_iterations=150))
+        result = fit_scan(
+            model,
+            raw.scan,
+            FitConfig(method="paper", unit="mm", search=search, max_iterations=150),
+            T_scan_model=Similarity.identity(),
+        )
         error, floor = errors_mm(model, result, raw.truth)
         errors.append(error - floor)
         assert result.status in ("converged", "max_iterations"), result.reason

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.errors import FitError, InputError
 from shapespace.fit.result import FitResult, Stage, Status, doubts, posterior_stddev
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.settings import RobustSettings
 from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
-from shapespace.fit.state import IcpState, StopRule
-from shapespace.geometry.closest import ENGINES, ClosestPointEngine, build_engine, finest_engine
+from shapespace.fit.state import Fitted, IcpState, StopRule
+from shapespace.geometry.closest import ENGINES, ClosestPointEngine
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
@@ -31,61 +34,107 @@ _VANISHED = 0.05
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Settings of a fit; the defaults are the paper's method as corrected.
+    """Settings of a fit.
 
     Args:
-        method: a name of `METHODS`.
+        method: a name of `METHODS`: `robust`, or `paper` for the paper's method as corrected.
+        modes: how many coefficients to report, from the first; None for all. The robust method fits with all in any
+            case; the paper's fits with these alone.
         unit: of the scan: a name of `MM_PER_UNIT`, or `auto` to find it.
-        search: `vertices` (the paper's closest points) or `surface` (closest points on the triangles).
+        search: of the paper's method: `vertices` (its closest points, `auto`) or `surface` (closest points on the
+            triangles). The robust method always searches the surface.
         scale: `free` fits a similarity, `fixed` a rigid motion; `auto` goes by the model's gauge.
         stop_rate: the paper's tau: stop when the RMS changes by at most this share,
         stop_motion_mm: and no vertex moves more than this, mm of the model's frame.
         max_iterations: cap of each phase.
         seed: of the subsample that the start is searched on.
+        robust: settings of the robust method.
 
     Raises:
-        InputError: a name that does not exist.
+        InputError: a name that does not exist, or a number of modes below one.
     """
 
-    method: str = "paper"
+    method: str = "robust"
+    modes: int | None = None
     unit: str = "auto"
-    search: str = "vertices"
+    search: str = "auto"
     scale: Literal["auto", "free", "fixed"] = "auto"
     stop_rate: float = 1e-4
     stop_motion_mm: float = 1e-3
     max_iterations: int = 500
     seed: int = 0
+    robust: RobustSettings = field(default_factory=RobustSettings)
 
     def __post_init__(self) -> None:
         for value, choices, what in (
             (self.method, METHODS, "method"),
             (self.unit, ["auto", *MM_PER_UNIT], "unit"),
-            (self.search, ENGINES, "search"),
+            (self.search, ["auto", *ENGINES], "search"),
             (self.scale, ("auto", "free", "fixed"), "scale"),
         ):
             if value not in choices:
                 raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
+        if self.method == "robust" and self.search != "auto":
+            raise InputError(
+                "The robust method always searches the scan's surface; leave search out, or use the paper's."
+            )
+        if self.modes is not None and self.modes < 1:
+            raise InputError(f"A fit must report at least one mode, not {self.modes}.")
         self.stop_rule()
 
     def stop_rule(self) -> StopRule:
-        """Return the stopping rule of both phases."""
+        """Return the stopping rule of both phases of the paper's method."""
         return StopRule(self.stop_rate, self.stop_motion_mm, self.max_iterations)
 
 
+Method: TypeAlias = Callable[[ShapeModel, ScanTarget, Similarity, FitConfig], Generator[IcpState, None, Fitted]]
+"""(model, scan, start, config) -> the states it goes through, and where it ended."""
+
+
 def paper_method(
-    model: ShapeModel, scan: ClosestPointEngine, T_scan_model: Similarity, config: FitConfig
-) -> Iterator[IcpState]:
+    model: ShapeModel, scan: ScanTarget, T_scan_model: Similarity, config: FitConfig
+) -> Generator[IcpState, None, Fitted]:
     """Yield the states of the paper's modified ICP: phase 1, then phase 2 from where it ended."""
-    stop, with_scale = config.stop_rule(), fits_scale(model, config)
-    for state in similarity_icp(model, scan, T_scan_model, stop, with_scale=with_scale):
+    model = model if config.modes is None else model.truncate(config.modes)
+    stop, with_scale, engine = (
+        config.stop_rule(),
+        fits_scale(model, config),
+        scan.search("vertices" if config.search == "auto" else config.search),
+    )
+    state = None
+    for state in similarity_icp(model, engine, T_scan_model, stop, with_scale=with_scale):
         T_scan_model = state.T_scan_model
         yield state
-    yield from shape_icp(model, scan, T_scan_model, stop, with_scale=with_scale)
+    for state in shape_icp(model, engine, T_scan_model, stop, with_scale=with_scale):
+        yield state
+    assert state is not None
+    return Fitted(
+        T_scan_model=state.T_scan_model,
+        b=state.b,
+        b_stddev=posterior_stddev(model, float(state.rms_mm**2) / 3.0),
+        vertices_scan_mm=state.T_scan_model.apply(model.reconstruct(state.b)),
+        rms_mm=state.rms_mm,
+    )
 
 
-METHODS: Mapping[str, Callable[[ShapeModel, ClosestPointEngine, Similarity, FitConfig], Iterator[IcpState]]] = {
-    "paper": paper_method,
-}
+def robust_method(
+    model: ShapeModel, scan: ScanTarget, T_scan_model: Similarity, config: FitConfig
+) -> Generator[IcpState, None, Fitted]:
+    """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together."""
+    from shapespace.fit.robust import robust_icp  # compiled
+
+    return robust_icp(
+        model,
+        scan,
+        T_scan_model,
+        config.robust,
+        with_scale=fits_scale(model, config),
+        modes=config.modes,
+        max_iterations=config.max_iterations,
+    )
+
+
+METHODS: Mapping[str, Method] = {"robust": robust_method, "paper": paper_method}
 """Fitting methods by name: each yields states, and the last of each phase is where that phase ended."""
 
 
@@ -108,7 +157,7 @@ def fit_scan(
     Args:
         model: the shape space.
         scan: a mesh or point cloud, in its own frame and unit.
-        config: settings; None for the paper's method.
+        config: settings; None for the defaults.
         landmarks: name -> (3,) in the scan's frame and unit, to start from; None to use none.
         T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
         on_state: called with each state of the loop, for progress bars and viewers.
@@ -119,6 +168,19 @@ def fit_scan(
         InputError: the search needs triangles that the scan lacks.
     """
     config = config or FitConfig()
+    # Products this small go slower by several threads, and many fits at a time share the cores anyway.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _fit_scan(model, scan, config, landmarks, T_scan_model, on_state)
+
+
+def _fit_scan(
+    model: ShapeModel,
+    scan: Mesh,
+    config: FitConfig,
+    landmarks: Mapping[str, FloatArray] | None,
+    T_scan_model: Similarity | None,
+    on_state: Callable[[IcpState], None] | None,
+) -> FitResult:
     clock = [time.perf_counter()]
     scan, findings = repair(scan)
     unit = find_unit(model, scan) if config.unit == "auto" else config.unit
@@ -126,14 +188,16 @@ def fit_scan(
     centre = np.median(scan.vertices, axis=0)
     T_mm_scan = Similarity(mm, np.eye(3), -mm * centre)  # near the origin, where float64 is finest
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
-    engine = build_engine(scan_mm, config.search)
+    target = ScanTarget(scan_mm)
     start = _start(model, scan_mm, T_mm_scan, landmarks, T_scan_model, config)
     clock.append(time.perf_counter())
 
     history: list[IcpState] = []
     ended: dict[int, tuple[IcpState, float]] = {}
     try:
-        for state in METHODS[config.method](model, engine, start.T_scan_model, config):
+        states = METHODS[config.method](model, target, start.T_scan_model, config)
+        while True:
+            state = next(states)
             history.append(state)
             ended[state.phase] = (state, time.perf_counter())
             if on_state is not None:
@@ -143,33 +207,32 @@ def fit_scan(
                     f"{scan.name}: the model shrank to a point, as the plain method does when a large part of the "
                     "scan is missing; hold the scale (--scale fixed), or crop the model to what the scan shows."
                 )
+    except StopIteration as end:
+        fitted: Fitted = end.value
     except InputError as error:
         raise FitError(f"{scan.name}: the fit diverged ({error}); give landmarks, or crop the scan.") from error
 
     before = Similarity(1.0, np.eye(3), scan_mm.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0))
-    final = ended[2][0]
     moments = {
         "before": (before, np.zeros(model.n_modes)),
         "initial": (ended[1][0].T_scan_model, ended[1][0].b),
-        "final": (final.T_scan_model, final.b),
+        "final": (fitted.T_scan_model, fitted.b),
     }
-    surface_engine = engine if config.search == finest_engine(scan_mm) else build_engine(scan_mm)
     stages = {
-        name: _stage(model, scan_mm, surface_engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
+        name: _stage(model, scan_mm, target.engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
     }
     start_scale = start.T_scan_model.scale / mm
-    status, reason = _verdict(model, stages, start_scale, ended[1][0], final, config)
+    status, reason = _verdict(model, stages, start_scale, ended[1][0], ended[2][0], config)
     clock.append(time.perf_counter())
-    residual_variance = float((final.rms_mm**2) / 3.0)
     return FitResult(
         scan_name=scan.name,
         status=status,
         reason=reason,
         T_scan_model=stages["final"].T_scan_model,
         mm_per_scan_unit=mm,
-        b=final.b,
-        b_stddev=posterior_stddev(model, residual_variance),
-        z=final.b / model.stddev,
+        b=fitted.b,
+        b_stddev=fitted.b_stddev,
+        z=fitted.b / model.stddev[: len(fitted.b)],
         stages=stages,
         history=history,
         method=config.method,
@@ -181,7 +244,7 @@ def fit_scan(
         start=start.how,
         notes=[
             *(f"{finding.what} {finding.action}".strip() for finding in findings),
-            *_far_out(model, final.b),
+            *_far_out(model, fitted.b),
             *_no_triangles(scan),
         ],
         seconds={
@@ -202,11 +265,11 @@ def _no_triangles(scan: Mesh) -> list[str]:
 
 def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
     """Say when more coefficients lie far out than chance would have it; without a prior faint modes chase details."""
-    far = int((np.abs(b) > _FAR_OUT * model.stddev).sum())
-    if far <= 1 + _FAR_OUT_BY_CHANCE * model.n_modes:
+    far = int((np.abs(b) > _FAR_OUT * model.stddev[: len(b)]).sum())
+    if far <= 1 + _FAR_OUT_BY_CHANCE * len(b):
         return []
     return [
-        f"{far} of {model.n_modes} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
+        f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
         "details of the scan that the model does not know, so build it with fewer modes for plausible ones."
     ]
 
@@ -224,7 +287,7 @@ def _start(
     if landmarks:
         placed = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         return start_from_landmarks(model, placed, scan_mm.name, with_scale=fits_scale(model, config))
-    return start_from_any_pose(model, scan_mm.vertices, seed=config.seed)
+    return start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=fits_scale(model, config))
 
 
 def _stage(
@@ -253,7 +316,12 @@ def _verdict(
         return "doubtful", f"Do not trust this fit: {'; '.join(against)}."
     if "cap" in (phase_1.stopped, phase_2.stopped):
         which = "phase 1" if phase_1.stopped == "cap" else "phase 2"
-        return "max_iterations", f"{which.capitalize()} was cut off after {config.max_iterations} iterations."
+        iterations = (phase_1 if phase_1.stopped == "cap" else phase_2).iteration
+        return "max_iterations", f"{which.capitalize()} was cut off after {iterations} iterations."
+    if config.method == "robust":
+        return "converged", (
+            f"Pose and shape stood still: the parts that match lie {phase_2.rms_mm:.2f} mm (RMS) from the scan."
+        )
     return "converged", (
         f"The RMS closest distance stood still at {phase_2.rms_mm:.2f} mm: it changed by less than "
         f"{config.stop_rate:g} of itself and no vertex moved more than {config.stop_motion_mm:g} mm."

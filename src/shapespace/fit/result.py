@@ -155,7 +155,7 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
             f"half of the scan lies over {backward.median:.1f} mm from the model, while half of the model lies within "
             f"{forward.median:.1f} mm of the scan"
         )
-    leading = modes_for_variance(model.stddev**2, _LEADING_SHARE)
+    leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
     z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
     # An extreme shape that lies on the scan all over is what the scan shows.
     if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,6 +32,27 @@ class IcpState:
     rms_mm: float
     motion_mm: float
     stopped: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Where a method ended, in the scan's mm frame.
+
+    Args:
+        T_scan_model: from the model's frame to the scan's mm frame.
+        b: (K,) coefficients, mm.
+        b_stddev: (K,) their standard deviation, mm.
+        vertices_scan_mm: (V, 3) the fitted surface in the scan's mm frame; it may leave the span of the model.
+        rms_mm: RMS distance of the matched vertices from the scan, mm of the model's frame.
+        evidence: what the verdict goes by, by name.
+    """
+
+    T_scan_model: Similarity
+    b: FloatArray
+    b_stddev: FloatArray
+    vertices_scan_mm: FloatArray
+    rms_mm: float
+    evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,204 @@
+"""The loops of the robust fit, compiled: normals, the walk to the closest point of a moving model, and its rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.compiled import compiled
+from shapespace.geometry.bvh import on_triangle
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+Float32Array = npt.NDArray[np.float32]
+
+
+@compiled
+def normals_into(vertices: FloatArray, faces: IntArray, corners: FloatArray, normals: FloatArray) -> None:
+    """Write the corners (F, 9) of all triangles and the area-weighted unit normals (V, 3) of the vertices."""
+    normals[:] = 0.0
+    for f in range(len(faces)):
+        for k in range(3):
+            for axis in range(3):
+                corners[f, 3 * k + axis] = vertices[faces[f, k], axis]
+        ux, uy, uz = corners[f, 3] - corners[f, 0], corners[f, 4] - corners[f, 1], corners[f, 5] - corners[f, 2]
+        vx, vy, vz = corners[f, 6] - corners[f, 0], corners[f, 7] - corners[f, 1], corners[f, 8] - corners[f, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for k in range(3):
+            v = faces[f, k]
+            normals[v, 0] += nx
+            normals[v, 1] += ny
+            normals[v, 2] += nz
+    for v in range(len(normals)):
+        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        if length > 0.0:
+            for axis in range(3):
+                normals[v, axis] /= length
+
+
+@compiled
+def walk_into(
+    points: FloatArray,
+    vertex: IntArray,
+    vertices: FloatArray,
+    corners: FloatArray,
+    faces: IntArray,
+    ring_start: IntArray,
+    ring: IntArray,
+    fan_start: IntArray,
+    fan: IntArray,
+    triangle: IntArray,
+    weights: FloatArray,
+) -> None:
+    """Find the closest model point of each of `points` (M, 3) by walking over the edges from the last answer.
+
+    Downhill from vertex to vertex, then over the triangles around the one where the walk ends. It can end in a local
+    minimum, so whoever calls it begins with exact answers where the model has moved far.
+
+    Args:
+        points: (M, 3).
+        vertex: (M,) where each walk starts, and then where it ended.
+        vertices: (V, 3) of the model in the frame of `points`.
+        corners: (F, 9) its triangles.
+        faces: (F, 3).
+        ring_start: (V + 1,) where the neighbours of each vertex start in
+        ring: (R,).
+        fan_start: (V + 1,) where the triangles around each vertex start in
+        fan: (3F,).
+        triangle: (M,) to be written.
+        weights: (M, 3) barycentric, to be written.
+    """
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        v = vertex[i]
+        dx, dy, dz = vertices[v, 0] - x, vertices[v, 1] - y, vertices[v, 2] - z
+        squared, here = dx * dx + dy * dy + dz * dz, -1
+        while here != v:
+            here = v
+            for at in range(ring_start[here], ring_start[here + 1]):
+                w = ring[at]
+                dx, dy, dz = vertices[w, 0] - x, vertices[w, 1] - y, vertices[w, 2] - z
+                d = dx * dx + dy * dy + dz * dz
+                if d < squared:
+                    squared, v = d, w
+        vertex[i] = v
+        best, b, c, found = -1, 0.0, 0.0, np.inf
+        for at in range(fan_start[v], fan_start[v + 1]):
+            d, wb, wc = on_triangle(corners, fan[at], x, y, z, found)
+            if d < found or best < 0:
+                best, found, b, c = fan[at], d, wb, wc
+        triangle[i] = best
+        weights[i, 0], weights[i, 1], weights[i, 2] = max(0.0, 1.0 - b - c), b, c
+
+
+@compiled
+def meet_into(
+    points: FloatArray,
+    point_normals: FloatArray,
+    triangle: IntArray,
+    weights: FloatArray,
+    vertices: FloatArray,
+    normals: FloatArray,
+    faces: IntArray,
+    rim: BoolArray,
+    residual: FloatArray,
+    distance: FloatArray,
+    cosine: FloatArray,
+    covered: BoolArray,
+) -> None:
+    """Compare each point with the model point it was matched to.
+
+    Args:
+        points: (M, 3) in the model's frame.
+        point_normals: (M, 3) unit normals there, zero where unknown.
+        triangle: (M,) of the model,
+        weights: (M, 3) barycentric.
+        vertices: (V, 3) of the model,
+        normals: (V, 3) its unit normals.
+        faces: (F, 3).
+        rim: (V,) True on the model's border.
+        residual: (M,) to be written: how far the model lies beyond the point along the model's normal.
+        distance: (M,) to be written.
+        cosine: (M,) to be written: between the normals; 1 where the point has none.
+        covered: (M,) to be written: False where the match lies on the border, so that the model ends there.
+    """
+    for i in range(len(points)):
+        a, b, c = faces[triangle[i], 0], faces[triangle[i], 1], faces[triangle[i], 2]
+        wa, wb, wc = weights[i, 0], weights[i, 1], weights[i, 2]
+        along, squared, length, dot, known = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            n = wa * normals[a, k] + wb * normals[b, k] + wc * normals[c, k]
+            e = wa * vertices[a, k] + wb * vertices[b, k] + wc * vertices[c, k] - points[i, k]
+            along += n * e
+            squared += e * e
+            length += n * n
+            dot += n * point_normals[i, k]
+            known += point_normals[i, k] ** 2
+        length = np.sqrt(length) if length > 0.0 else 1.0
+        residual[i], distance[i] = along / length, np.sqrt(squared)
+        cosine[i] = dot / length if known > 0.0 else 1.0
+        covered[i] = (wa > 1e-9 and not rim[a]) or (wb > 1e-9 and not rim[b]) or (wc > 1e-9 and not rim[c])
+
+
+@compiled
+def gather_into(
+    triangle: IntArray,
+    barycentric: FloatArray,
+    faces: IntArray,
+    w: FloatArray,
+    residual: FloatArray,
+    weight_at: FloatArray,
+    pull_at: FloatArray,
+) -> None:
+    """Add the weights w (M,) and weighted residuals of matched points to the model vertices that carry them."""
+    for i in range(len(triangle)):
+        if w[i] > 0.0:
+            for k in range(3):
+                v, share = faces[triangle[i], k], w[i] * barycentric[i, k]
+                weight_at[v] += share
+                pull_at[v] += share * residual[i]
+
+
+@compiled
+def rows_into(
+    vertices: FloatArray,
+    normals: FloatArray,
+    basis: Float32Array,
+    modes: int,
+    weight_at: FloatArray,
+    pull_at: FloatArray,
+    rows: Float32Array,
+    gradient: FloatArray,
+) -> int:
+    """Write the weighted rows of the normal equations and the gradient; return how many rows there are.
+
+    Row j is sqrt(weight_j) n_j^T [ -[x_j]x | I | x_j | P_j ]: how the model's vertex moves along its normal with each
+    parameter.
+
+    Args:
+        vertices: (V, 3) model vertices x,
+        normals: (V, 3) their unit normals.
+        basis: (V, 3, C) modes, float32.
+        modes: how many of them count.
+        weight_at: (V,) weight of each vertex,
+        pull_at: (V,) its weighted residual.
+        rows: (V, 7 + C) float32 to be written.
+        gradient: (7 + C,) to be added to.
+    """
+    count = 0
+    for j in range(len(vertices)):
+        if weight_at[j] <= 0.0:
+            continue
+        nx, ny, nz = normals[j, 0], normals[j, 1], normals[j, 2]
+        x, y, z = vertices[j, 0], vertices[j, 1], vertices[j, 2]
+        row, root, pull = rows[count], np.float32(np.sqrt(weight_at[j])), pull_at[j]
+        pose = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz, nx * x + ny * y + nz * z)
+        for k in range(7):
+            row[k] = root * np.float32(pose[k])
+            gradient[k] += pull * pose[k]
+        fx, fy, fz, p = np.float32(nx), np.float32(ny), np.float32(nz), np.float32(pull)
+        for k in range(modes):
+            along = fx * basis[j, 0, k] + fy * basis[j, 1, k] + fz * basis[j, 2, k]
+            row[7 + k] = root * along
+            gradient[7 + k] += np.float64(p * along)
+        count += 1
+    return count

@@ -1,0 +1,166 @@
+"""A shape model made ready for a fit: modes at hand, a surface that moves in place, closest points by walking."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.fit.kernels import Float32Array, meet_into, normals_into, walk_into
+from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.surface import boundary_vertices
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Who neighbours whom on the model's surface.
+
+    Args:
+        faces: (F, 3) int32.
+        ring_start: (V + 1,) where each vertex's neighbours start in `ring`.
+        ring: (R,) vertices.
+        fan_start: (V + 1,) where each vertex's triangles start in `fan`.
+        fan: (3F,) triangles.
+        rim: (V,) True on the border of the surface.
+        used: indices of the vertices that some triangle has.
+    """
+
+    faces: IntArray
+    ring_start: IntArray
+    ring: IntArray
+    fan_start: IntArray
+    fan: IntArray
+    rim: BoolArray
+    used: IntArray
+
+    @staticmethod
+    def of(mesh: Mesh) -> Topology:
+        """Return the topology of `mesh`, which must have triangles."""
+        assert mesh.faces is not None
+        faces = np.array(mesh.faces)
+        count = len(mesh.vertices)
+        flat = faces.ravel()
+        order = np.argsort(flat, kind="stable")
+        fan_start = np.zeros(count + 1, dtype=np.int32)
+        np.cumsum(np.bincount(flat, minlength=count), out=fan_start[1:])
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+        keys = np.unique(np.concatenate([edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]]))
+        ring_start = np.zeros(count + 1, dtype=np.int32)
+        np.cumsum(np.bincount(keys // count, minlength=count), out=ring_start[1:])
+        return Topology(
+            faces,
+            ring_start,
+            (keys % count).astype(np.int32),
+            fan_start,
+            (order // 3).astype(np.int32),
+            boundary_vertices(mesh),
+            np.unique(flat).astype(np.int32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedModel:
+    """What a fit needs of a model and every fit with it shares.
+
+    Args:
+        model: the shape space.
+        topology: of its surface.
+        modes: (V, 3, K) float32 basis vectors: the rows of the normal equations are made from them.
+    """
+
+    model: ShapeModel
+    topology: Topology
+    modes: Float32Array
+
+
+_PREPARED: weakref.WeakKeyDictionary[ShapeModel, PreparedModel] = weakref.WeakKeyDictionary()
+
+
+def prepare(model: ShapeModel) -> PreparedModel:
+    """Return `model` ready for the robust fit; it is prepared once and then kept as long as the model lives.
+
+    Raises:
+        InputError: it has no triangles, so it has no normals.
+    """
+    if model not in _PREPARED:
+        if model.faces is None:
+            raise InputError(
+                "The robust method needs a model with triangles; this one has none, so use --method paper."
+            )
+        modes = np.ascontiguousarray(model.basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
+        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes)
+    return _PREPARED[model]
+
+
+class MovingSurface:
+    """The model's surface while it is fitted, in the model's frame (mm)."""
+
+    def __init__(self, topology: Topology, mean_vertices: FloatArray, modes: Float32Array) -> None:
+        self.topology = topology
+        self.modes = modes
+        self._mean = mean_vertices
+        self.vertices = np.array(mean_vertices)
+        self.normals = np.empty_like(self.vertices)
+        self._corners = np.empty((len(topology.faces), 9))
+        self._refresh()
+
+    def _refresh(self) -> None:
+        normals_into(self.vertices, self.topology.faces, self._corners, self.normals)
+
+    def deform(self, b: FloatArray) -> None:
+        """Take the shape with coefficients `b` (k,) mm."""
+        k = len(b)
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        moved = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)
+        np.add(self._mean, moved.reshape(-1, 3), out=self.vertices)
+        self._refresh()
+
+    def nearest_vertices(self, points: FloatArray) -> IntArray:
+        """Return the vertex (M,) nearest to each of `points` (M, 3), exactly."""
+        used = self.topology.used
+        return used[KdTree(self.vertices[used]).nearest(points)[0]]
+
+    def walk(self, points: FloatArray, vertex: IntArray) -> tuple[IntArray, FloatArray]:
+        """Return triangle (M,) and barycentric weights (M, 3) of the closest points; `vertex` (M,) is updated."""
+        triangle, weights = np.empty(len(points), dtype=np.int32), np.empty((len(points), 3))
+        t = self.topology
+        walk_into(
+            points,
+            vertex,
+            self.vertices,
+            self._corners,
+            t.faces,
+            t.ring_start,
+            t.ring,
+            t.fan_start,
+            t.fan,
+            triangle,
+            weights,
+        )
+        return triangle, weights
+
+    def meet(
+        self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and what is no rim."""
+        residual, distance, cosine = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
+        covered = np.empty(len(points), dtype=np.bool_)
+        meet_into(
+            points,
+            point_normals,
+            triangle,
+            weights,
+            self.vertices,
+            self.normals,
+            self.topology.faces,
+            self.topology.rim,
+            residual,
+            distance,
+            cosine,
+            covered,
+        )
+        return residual, distance, cosine, covered

@@ -1,0 +1,354 @@
+"""Phase 2 as we would do it: pose and shape at once, from both directions, robustly, with the prior.
+
+One iteration minimises, over a small change of the pose and over the coefficients b, in the model's frame,
+
+    sum_i w_i r_i^2 / sigma^2  +  sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2
+
+where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992). Matches go both
+ways: each scan point to the closest point of the moving surface, and each model vertex to the closest point of the
+scan. Those on a border, with normals that disagree, or far off for the spread of the rest count little or nothing
+(Zhang, Yao and Deng, PAMI 2022). The second term is the prior (Blanz et al., 2004); the third keeps a scale that the
+scan hardly shows. Few modes are free at first and all in the end; where the scan then shows a shape that the model
+cannot make, the modes of `residual` join in, so that what the model lacks does not bend what it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from shapespace.errors import FitError
+from shapespace.fit.kernels import Float32Array, gather_into, rows_into
+from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
+from shapespace.fit.residual import residual_modes
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.settings import Level, RobustSettings
+from shapespace.fit.state import Fitted, IcpState
+from shapespace.fit.weights import WEIGHTS, spread
+from shapespace.geometry.closest import ClosestPoints, on_boundary
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
+
+POSE = 7
+"""Pose parameters come first: rotation, translation, scale."""
+_DAMPING = 1e-7
+_FIXED = 1e12
+_MOTION_STRIDE = 7
+_FEWEST_MATCHES = 30
+_FLICKER = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Scan points matched to the moving surface, (M,) each; residuals and distances in mm of the model's frame."""
+
+    triangle: IntArray
+    barycentric: FloatArray
+    residual: FloatArray
+    distance: FloatArray
+    allowed: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class VertexMatches:
+    """Model vertices matched to the scan, (M,) each; residuals and distances in mm of the model's frame."""
+
+    vertex: IntArray
+    residual: FloatArray
+    distance: FloatArray
+    allowed: BoolArray
+
+
+class JointFit:
+    """Pose and coefficients on their way, with the surface they make and its matches.
+
+    Args:
+        prepared: the model.
+        target: the scan.
+        settings: of the method.
+        T_scan_model: the start, in the scan's mm frame.
+        with_scale: False holds the scale of the start.
+    """
+
+    def __init__(
+        self,
+        prepared: PreparedModel,
+        target: ScanTarget,
+        settings: RobustSettings,
+        T_scan_model: Similarity,
+        *,
+        with_scale: bool,
+    ) -> None:
+        self.prepared, self.target, self.settings, self.with_scale = prepared, target, settings, with_scale
+        self.T, self._start_scale = T_scan_model, T_scan_model.scale
+        self.stddev = np.array(prepared.model.stddev)
+        self.b = np.zeros(len(self.stddev))
+        self.surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
+        self.sigma_mm = self.rms_mm = self.motion_mm = float("inf")
+        self.hessian = np.zeros((0, 0))
+        self.seen_at = self.pull_at = np.zeros(0)
+        self.scan: Matches | None = None
+        self.vertices: VertexMatches | None = None
+        self._winding = 0.0
+        self._points = self._asked = self._walks = np.zeros(0, dtype=np.int32)
+        self._near: ClosestPoints | None = None
+
+    def add_modes(self, modes: Float32Array, stddev: FloatArray) -> None:
+        """Go on with `modes` (V, 3, K + R), the first K those it has, and the `stddev` (R,) mm of the others."""
+        self.stddev = np.concatenate([self.stddev, stddev])
+        self.b = np.concatenate([self.b, np.zeros(len(stddev))])
+        self.surface = MovingSurface(self.prepared.topology, self.prepared.model.mean_vertices, modes)
+        self.surface.deform(self.b)
+
+    def begin(self, level: Level) -> None:
+        """Draw the points that `level` matches, and search them afresh."""
+        rng = np.random.default_rng(self.settings.seed)
+        self._points = _some(np.arange(len(self.target.mesh.vertices), dtype=np.int32), level.scan_points, rng)
+        self._asked = _some(self.surface.topology.used, level.vertices, rng)
+        self._near, self._walks = None, self.surface.nearest_vertices(self._in_model(self._points)[0])
+
+    def _in_model(self, points: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return `points` of the scan in the model's frame with their normals."""
+        T, target = self.T, self.target
+        q = ((target.mesh.vertices[points] - T.translation) @ T.rotation) / T.scale
+        return q, target.normals[points] @ T.rotation
+
+    def match(self) -> None:
+        """Match scan points to the moving surface, and its vertices to the scan."""
+        q, n = self._in_model(self._points)
+        triangle, weights = self.surface.walk(q, self._walks)
+        residual, distance, cosine, covered = self.surface.meet(q, n, triangle, weights)
+        if self._winding == 0.0:
+            # A scan wound the wrong way round has all its normals reversed.
+            self._winding = 1.0 if np.median(cosine[covered] if covered.any() else cosine) >= 0 else -1.0
+        agree = self._winding * cosine > self.settings.normal_cosine
+        self.scan = Matches(triangle, weights, residual, distance, covered & agree)
+
+        T, asked = self.T, self._asked
+        x, n = self.surface.vertices[asked], self.surface.normals[asked]
+        self._near = near = self.target.engine.query(T.apply(x), self._near)
+        to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
+        allowed = ~on_boundary(near, self.target.mesh, self.target.rim)
+        if self.target.mesh.faces is not None:
+            n_scan = self.target.normals_at(near) @ T.rotation
+            cosine = self._winding * np.einsum("md,md->m", n, n_scan)
+            allowed &= cosine > self.settings.normal_cosine * np.linalg.norm(n_scan, axis=1)
+        residual, distance = np.einsum("md,md->m", to_scan, n), near.distance / T.scale
+        self.vertices = VertexMatches(asked, residual, distance, allowed)
+        self.rms_mm = float(np.sqrt((distance[allowed] ** 2).mean())) if allowed.any() else float("inf")
+
+    def weigh(self) -> tuple[FloatArray, FloatArray]:
+        """Return the weights of the matches of scan points and of vertices, by the spread of the residuals."""
+        s, scan, vertices = self.settings, self.scan, self.vertices
+        assert scan is not None and vertices is not None
+        counted = np.concatenate([scan.residual[scan.allowed], vertices.residual[vertices.allowed]])
+        if len(counted) < _FEWEST_MATCHES:
+            raise FitError(
+                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks, or "
+                "check that it shows what the model does."
+            )
+        self.sigma_mm = max(spread(counted), s.least_spread_mm)
+        weight, width = WEIGHTS[s.weight], s.width * self.sigma_mm
+        far = s.reach * width + s.reach_mm
+        w = weight(scan.residual, width) * weight(scan.distance, far) * scan.allowed
+        v = weight(vertices.residual, width) * weight(vertices.distance, far) * vertices.allowed
+        return w, s.vertex_share * v
+
+    def step(self, modes: int) -> None:
+        """Do one Gauss-Newton step on the pose and the first `modes` coefficients."""
+        self.match()
+        w, v = self.weigh()
+        s, surface, scan, vertices = self.settings, self.surface, self.scan, self.vertices
+        assert scan is not None and vertices is not None
+        # Each vertex collects the weight and pull of the matches it carries; the Hessian is lumped there.
+        seen_at, pull_at = np.zeros(len(surface.vertices)), np.zeros(len(surface.vertices))
+        gather_into(scan.triangle, scan.barycentric, surface.topology.faces, w, scan.residual, seen_at, pull_at)
+        self.seen_at = seen_at.copy()
+        seen_at[vertices.vertex] += v
+        pull_at[vertices.vertex] += v * vertices.residual
+
+        rows, gradient = np.empty((len(seen_at), POSE + modes), dtype=np.float32), np.zeros(POSE + modes)
+        count = rows_into(surface.vertices, surface.normals, surface.modes, modes, seen_at, pull_at, rows, gradient)
+        hessian = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)
+        rho = s.prior * self.sigma_mm**2
+        precision = rho / self.stddev[:modes] ** 2
+        index = np.arange(POSE, POSE + modes)
+        hessian[index, index] += precision
+        gradient[POSE:] += precision * self.b[:modes]
+        if self.with_scale:
+            hessian[6, 6] += rho / s.scale_stddev**2
+            gradient[6] += rho / s.scale_stddev**2 * np.log(self.T.scale / self._start_scale)
+        else:
+            hessian[6, 6], gradient[6] = _FIXED * (hessian[6, 6] + 1.0), 0.0
+        self.hessian = hessian
+        self._take(-_solve(hessian, gradient, self.target.mesh.name), modes)
+
+    def _take(self, delta: FloatArray, modes: int) -> None:
+        T, x = self.T, self.surface.vertices
+        before = T.apply(x[::_MOTION_STRIDE])
+        turn = np.asarray(Rotation.from_rotvec(delta[:3]).as_matrix())
+        self.T = Similarity(
+            T.scale * float(np.exp(delta[6])), T.rotation @ turn, T.scale * (T.rotation @ delta[3:6]) + T.translation
+        )
+        if modes:
+            self.b[:modes] += delta[POSE:]
+            self.surface.deform(self.b)
+        after = self.T.apply(self.surface.vertices[::_MOTION_STRIDE])
+        self.motion_mm = float(np.linalg.norm(after - before, axis=1).max()) / T.scale
+
+    def state(self, phase: int, iteration: int, stopped: str | None = None) -> IcpState:
+        """Return where the fit is."""
+        b = self.b[: self.prepared.model.n_modes].copy()
+        return IcpState(phase, iteration, self.T, b, self.rms_mm, self.motion_mm, stopped)
+
+    def unexplained(self) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is no noise.
+
+        Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
+        say of the same vertex is the variance of the shape that the model leaves.
+        """
+        self.match()
+        w, _ = self.weigh()
+        scan, faces = self.scan, self.surface.topology.faces
+        assert scan is not None
+        half = np.random.default_rng(self.settings.seed).random(len(w)) < 0.5
+        seen, pull = np.zeros((2, len(self.surface.vertices))), np.zeros((2, len(self.surface.vertices)))
+        for i, part in enumerate((half, ~half)):
+            gather_into(scan.triangle, scan.barycentric, faces, w * part, scan.residual, seen[i], pull[i])
+        both = np.minimum(seen[0], seen[1])
+        mean = pull / np.maximum(seen, 1e-12)
+        return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))
+
+
+def robust_icp(
+    model: ShapeModel,
+    target: ScanTarget,
+    T_scan_model: Similarity,
+    settings: RobustSettings,
+    *,
+    with_scale: bool = True,
+    modes: int | None = None,
+    max_iterations: int = 500,
+) -> Generator[IcpState, None, Fitted]:
+    """Yield the start and each iteration, and return where they ended.
+
+    Args:
+        model: mean and modes, with triangles.
+        target: the scan in its mm frame.
+        T_scan_model: the start.
+        settings: of the method.
+        with_scale: False holds the scale of the start.
+        modes: how many coefficients to report; None for all. The fit uses all in any case: modes left out of the fit
+            bend those that stay.
+        max_iterations: cap of each phase.
+
+    Raises:
+        InputError: the model has no triangles.
+        FitError: hardly anything matches, or the fit diverged.
+    """
+    prepared = prepare(model)
+    fit = JointFit(prepared, target, settings, T_scan_model, with_scale=with_scale)
+    fit.begin(settings.levels[0])
+    fit.match()
+    left_mm2 = 0.0
+    phase, iteration, state = 1, 0, fit.state(1, 0)
+    for number, level in enumerate((*settings.levels, settings.beyond)):
+        if number == len(settings.levels):
+            left_mm2 = fit.unexplained()
+            if left_mm2 < max(settings.beyond_share * fit.sigma_mm**2, settings.beyond_mm**2):
+                break
+            extra = residual_modes(model, settings.residual)
+            fit.add_modes(extra.modes, extra.stddev)
+        free = len(fit.b) if level.modes is None else min(level.modes, len(fit.b))
+        if free and phase == 1:
+            yield replace(state, stopped=state.stopped or "rate")
+            phase, iteration, state = 2, 0, fit.state(2, 0)
+        fit.begin(level)
+        for _ in range(level.iterations):
+            if iteration >= max_iterations:
+                state = replace(state, stopped="cap")
+                break
+            yield replace(state, stopped=None)
+            fit.step(free)
+            iteration += 1
+            settled = fit.motion_mm < level.stop_motion_mm
+            # Where parts of the scan match now one way and now another, the last bit of motion never ends.
+            still = fit.motion_mm < _FLICKER * level.stop_motion_mm
+            state = fit.state(phase, iteration, "rate" if still else "cap")
+            if settled:
+                break
+    yield state
+    T, b = in_span(model, fit.surface.vertices, fit.T, modes or model.n_modes, with_scale=with_scale)
+    covariance = fit.sigma_mm**2 * np.linalg.inv(fit.hessian)
+    variance = covariance.diagonal()[POSE : POSE + len(b)]
+    return Fitted(
+        T_scan_model=T,
+        b=b,
+        b_stddev=np.sqrt(np.minimum(variance, model.stddev[: len(b)] ** 2)),
+        vertices_scan_mm=fit.T.apply(fit.surface.vertices),
+        rms_mm=fit.rms_mm,
+        evidence={
+            "spread_mm": fit.sigma_mm,
+            "beyond_model_mm": float(np.sqrt(max(left_mm2, 0.0))),
+            "seen_share": float((fit.seen_at > 0).mean()),
+        },
+    )
+
+
+def in_span(
+    model: ShapeModel, vertices: FloatArray, T_scan_model: Similarity, modes: int, *, with_scale: bool
+) -> tuple[Similarity, FloatArray]:
+    """Return pose and first `modes` coefficients of the model's surface nearest to `vertices`, in least squares.
+
+    Args:
+        model: the shape space.
+        vertices: (V, 3) in the model's order, in its frame.
+        T_scan_model: pose of that frame in the scan's; changed by what the modes left out would have done.
+        modes: how many.
+        with_scale: False keeps the scale.
+    """
+    x, P = model.mean_vertices, model.basis[:, :modes]
+    pose = np.zeros((len(x), 3, POSE if with_scale else POSE - 1))
+    pose[:, :, :3] = -_cross(x)
+    pose[:, :, 3:6] = np.eye(3)
+    if with_scale:
+        pose[:, :, 6] = x
+    pose = pose.reshape(-1, pose.shape[2])
+    # P is orthonormal, so the modes drop out and the pose is what is left to solve for.
+    outside = pose - P @ (P.T @ pose)
+    moved = (vertices - x).ravel()
+    turn: FloatArray = np.asarray(np.linalg.lstsq(outside, moved - P @ (P.T @ moved), rcond=1e-6)[0], dtype=np.float64)
+    small = Similarity(
+        float(np.exp(turn[6])) if with_scale else 1.0, np.asarray(Rotation.from_rotvec(turn[:3]).as_matrix()), turn[3:6]
+    )
+    b = P.T @ (small.inverse().apply(vertices) - x).ravel()
+    return T_scan_model @ small, b
+
+
+def _cross(x: FloatArray) -> FloatArray:
+    """Return (V, 3, 3) matrices that do the cross product with each of x (V, 3)."""
+    out = np.zeros((len(x), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
+    return out - out.transpose(0, 2, 1)
+
+
+def _solve(hessian: FloatArray, gradient: FloatArray, name: str) -> FloatArray:
+    """Solve the normal equations, scaled to a unit diagonal and hardly damped."""
+    diagonal = np.sqrt(np.maximum(hessian.diagonal(), 1e-30))
+    scaled = hessian / np.outer(diagonal, diagonal)
+    scaled[np.diag_indices_from(scaled)] += _DAMPING
+    try:
+        factor = cho_factor(scaled, lower=True, overwrite_a=True)
+        return np.asarray(cho_solve(factor, gradient / diagonal)) / diagonal
+    except (LinAlgError, ValueError) as error:
+        raise FitError(
+            f"{name}: the fit diverged; give landmarks, or crop the scan to what the model shows."
+        ) from error
+
+
+def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:
+    return index if count is None or count >= len(index) else np.sort(rng.choice(index, count, replace=False))

@@ -1,0 +1,86 @@
+"""Every setting of the robust method, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ResidualSettings:
+    """How far a shape may leave its model.
+
+    Args:
+        count: modes beside the model's own, at most.
+        range_share: over what share of the model's size (RMS distance from its centre) the covariance is damped.
+        local_share: variance of the local modes as a share of the model's own.
+        mirror_share: the same of the mirrored modes, for means that are their own mirror image.
+    """
+
+    count: int = 300
+    range_share: float = 1.6
+    local_share: float = 0.03
+    mirror_share: float = 1.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """One step from coarse to fine.
+
+    Args:
+        modes: how many are free; None for all; 0 is phase 1.
+        scan_points: how many points of the scan are matched; None for all.
+        vertices: how many of the model's vertices are matched; None for all.
+        iterations: at most.
+        stop_motion_mm: it ends when no vertex moves more than this, mm.
+    """
+
+    modes: int | None
+    scan_points: int | None
+    vertices: int | None
+    iterations: int
+    stop_motion_mm: float
+
+
+@dataclass(frozen=True)
+class RobustSettings:
+    """Settings of the robust method; the defaults were chosen by `benchmarks/sweep.py` on people of their own.
+
+    Args:
+        levels: from coarse to fine; the first without modes is phase 1.
+        beyond: the level that follows where the model cannot make the shape.
+        residual: the modes that it adds.
+        beyond_share: it follows when what the model leaves is this share of the residuals' variance, and
+        beyond_mm: this large (RMS), mm.
+        weight: a name of `WEIGHTS`.
+        width: scale of the weights in units of the residuals' spread.
+        least_spread_mm: the spread is not taken for less than this, mm.
+        normal_cosine: matches whose normals disagree more than this are left out.
+        reach: matches farther than this many widths and
+        reach_mm: this, mm, count little.
+        vertex_share: weight of a vertex's match beside that of a scan point's.
+        prior: how many matches tell as much as one independent one.
+        scale_stddev: of log s about the start.
+        seed: of the subsamples.
+    """
+
+    levels: tuple[Level, ...] = (
+        Level(0, 2_000, 1_500, 3, 2.0),
+        Level(10, 2_500, 2_000, 4, 1.0),
+        Level(40, 4_000, 3_000, 3, 0.5),
+        Level(None, 6_000, 4_000, 6, 0.1),
+        Level(None, 20_000, 1_500, 15, 0.03),
+    )
+    beyond: Level = Level(None, 8_000, 4_000, 10, 0.1)
+    residual: ResidualSettings = field(default_factory=ResidualSettings)
+    beyond_share: float = 0.2
+    beyond_mm: float = 0.05
+    weight: str = "welsch"
+    width: float = 2.5
+    least_spread_mm: float = 0.02
+    normal_cosine: float = 0.4
+    reach: float = 4.0
+    reach_mm: float = 2.0
+    vertex_share: float = 0.3
+    prior: float = 1.0
+    scale_stddev: float = 0.15
+    seed: int = 0

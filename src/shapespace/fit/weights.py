@@ -1,0 +1,37 @@
+"""How much a match counts, by its residual: robust weights of which one is chosen by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from shapespace.types import FloatArray
+
+
+def welsch(residual: FloatArray, scale: float) -> FloatArray:
+    """Return exp(-r^2 / (2 scale^2)): what lies far off counts nothing (Zhang, Yao and Deng, PAMI 2022)."""
+    return np.exp(-0.5 * (residual / scale) ** 2)
+
+
+def geman_mcclure(residual: FloatArray, scale: float) -> FloatArray:
+    """Return (scale^2 / (scale^2 + r^2))^2, with heavier tails than Welsch's (Zhou, Park and Koltun, ECCV 2016)."""
+    return (scale**2 / (scale**2 + residual**2)) ** 2
+
+
+def huber(residual: FloatArray, scale: float) -> FloatArray:
+    """Return 1 up to `scale` and scale / |r| beyond: nothing is ever left out (Huber, 1964)."""
+    return scale / np.maximum(np.abs(residual), scale)
+
+
+WEIGHTS: Mapping[str, Callable[[FloatArray, float], FloatArray]] = {
+    "welsch": welsch,
+    "geman_mcclure": geman_mcclure,
+    "huber": huber,
+}
+"""Weights by name: residual (M,) and its scale, both mm -> (M,) in [0, 1], falling from 1 at 0."""
+
+
+def spread(residual: FloatArray) -> float:
+    """Return the standard deviation that the median of |residual| (M,) stands for, whatever the outliers are."""
+    return 1.4826 * float(np.median(np.abs(residual))) if len(residual) else float("inf")

@@ -1,0 +1,30 @@
+"""What every robust weight must do; a new entry of WEIGHTS is tested by being there."""
+
+import numpy as np
+import pytest
+
+from shapespace.fit.weights import WEIGHTS, spread
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_a_weight_is_one_at_no_residual_and_falls_the_same_for_both_signs(name: str) -> None:
+    residual = np.linspace(0.0, 20.0, 400)
+    w = WEIGHTS[name](residual, 1.5)
+    assert w[0] == pytest.approx(1.0)
+    assert (np.diff(w) <= 0).all() and (w >= 0).all()
+    assert w[-1] < 0.1
+    np.testing.assert_array_equal(w, WEIGHTS[name](-residual, 1.5))
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_a_weight_has_no_unit_of_its_own(name: str) -> None:
+    residual = np.linspace(-5.0, 5.0, 101)
+    np.testing.assert_allclose(WEIGHTS[name](residual, 0.7), WEIGHTS[name](10 * residual, 7.0))
+
+
+def test_the_spread_is_the_standard_deviation_of_noise_whatever_a_third_of_outliers_does() -> None:
+    rng = np.random.default_rng(0)
+    noise = 0.3 * rng.standard_normal(20_000)
+    assert spread(noise) == pytest.approx(0.3, rel=0.03)
+    noise[:4_000] = 50.0
+    assert spread(noise) < 0.45
