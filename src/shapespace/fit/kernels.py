@@ -51,8 +51,9 @@ def walk_into(
 ) -> None:
     """Find the closest model point of each of `points` (M, 3) by walking over the edges from the last answer.
 
-    Downhill from vertex to vertex, then over the triangles around the one where the walk ends. It can end in a local
-    minimum, so whoever calls it begins with exact answers where the model has moved far.
+    A point that still lies over its triangle stays there. Else downhill from vertex to vertex, then over the triangles
+    around the one where the walk ends. It can end in a local minimum, so whoever calls it begins with exact answers
+    where the model has moved far.
 
     Args:
         points: (M, 3).
@@ -64,11 +65,16 @@ def walk_into(
         ring: (R,).
         fan_start: (V + 1,) where the triangles around each vertex start in
         fan: (3F,).
-        triangle: (M,) to be written.
+        triangle: (M,) the last answers, -1 for none, and then the new ones.
         weights: (M, 3) barycentric, to be written.
     """
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if triangle[i] >= 0:
+            found, b, c = on_triangle(corners, triangle[i], x, y, z, np.inf)
+            if b > 0.0 and c > 0.0 and b + c < 1.0:
+                weights[i, 0], weights[i, 1], weights[i, 2] = 1.0 - b - c, b, c
+                continue
         v = vertex[i]
         dx, dy, dz = vertices[v, 0] - x, vertices[v, 1] - y, vertices[v, 2] - z
         squared, here = dx * dx + dy * dy + dz * dz, -1

@@ -70,11 +70,15 @@ class PreparedModel:
         model: the shape space.
         topology: of its surface.
         modes: (V, 3, K) float32 basis vectors: the rows of the normal equations are made from them.
+        pose: (3V, 7) what a small rotation, translation and scaling do to the mean.
+        pose_in_span: (K, 7) what of that the modes can do.
     """
 
     model: ShapeModel
     topology: Topology
     modes: Float32Array
+    pose: FloatArray
+    pose_in_span: FloatArray
 
 
 _PREPARED: weakref.WeakKeyDictionary[ShapeModel, PreparedModel] = weakref.WeakKeyDictionary()
@@ -92,8 +96,19 @@ def prepare(model: ShapeModel) -> PreparedModel:
                 "The robust method needs a model with triangles; this one has none, so use --method paper."
             )
         modes = np.ascontiguousarray(model.basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
-        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes)
+        pose = _small_poses(model.mean_vertices)
+        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.basis.T @ pose)
     return _PREPARED[model]
+
+
+def _small_poses(x: FloatArray) -> FloatArray:
+    """Return (3V, 7): how x (V, 3) moves by a rotation about each axis, a translation along each, and a scaling."""
+    pose = np.zeros((len(x), 3, 7))
+    pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
+    pose[:, :, :3] -= pose[:, :, :3].transpose(0, 2, 1)
+    pose[:, :, 3:6] = np.eye(3)
+    pose[:, :, 6] = x
+    return pose.reshape(-1, 7)
 
 
 class MovingSurface:
@@ -119,14 +134,13 @@ class MovingSurface:
         np.add(self._mean, moved.reshape(-1, 3), out=self.vertices)
         self._refresh()
 
-    def nearest_vertices(self, points: FloatArray) -> IntArray:
-        """Return the vertex (M,) nearest to each of `points` (M, 3), exactly."""
-        used = self.topology.used
-        return used[KdTree(self.vertices[used]).nearest(points)[0]]
+    def vertex_tree(self) -> KdTree:
+        """Return a tree of the vertices as they are now that some triangle has: entry i is vertex `used[i]`."""
+        return KdTree(self.vertices[self.topology.used])
 
-    def walk(self, points: FloatArray, vertex: IntArray) -> tuple[IntArray, FloatArray]:
-        """Return triangle (M,) and barycentric weights (M, 3) of the closest points; `vertex` (M,) is updated."""
-        triangle, weights = np.empty(len(points), dtype=np.int32), np.empty((len(points), 3))
+    def walk(self, points: FloatArray, vertex: IntArray, triangle: IntArray) -> FloatArray:
+        """Bring `vertex` and `triangle` (M,) of the closest points up to date; return their weights (M, 3)."""
+        weights = np.empty((len(points), 3))
         t = self.topology
         walk_into(
             points,
@@ -141,7 +155,7 @@ class MovingSurface:
             triangle,
             weights,
         )
-        return triangle, weights
+        return weights
 
     def meet(
         self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray

@@ -30,6 +30,7 @@ from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.weights import WEIGHTS, spread
 from shapespace.geometry.closest import ClosestPoints, on_boundary
+from shapespace.geometry.kdtree import KdTree
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
@@ -40,6 +41,8 @@ _FIXED = 1e12
 _MOTION_STRIDE = 7
 _FEWEST_MATCHES = 30
 _FLICKER = 10.0
+_IN_SPAN = 1e-9
+"""What is left of a pose parameter outside the modes is rounding below this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +97,11 @@ class JointFit:
         self.scan: Matches | None = None
         self.vertices: VertexMatches | None = None
         self._winding = 0.0
-        self._points = self._asked = self._walks = np.zeros(0, dtype=np.int32)
+        self._asked = self._walks = self._triangles = np.zeros(0, dtype=np.int32)
+        self._points_mm = self._normals = np.zeros((0, 3))
+        self._tree: KdTree | None = None
+        self._tree_fits = False
+        self._engine = target.vertex_engine
         self._near: ClosestPoints | None = None
 
     def add_modes(self, modes: Float32Array, stddev: FloatArray) -> None:
@@ -105,22 +112,28 @@ class JointFit:
         self.surface.deform(self.b)
 
     def begin(self, level: Level) -> None:
-        """Draw the points that `level` matches, and search them afresh."""
-        rng = np.random.default_rng(self.settings.seed)
-        self._points = _some(np.arange(len(self.target.mesh.vertices), dtype=np.int32), level.scan_points, rng)
+        """Draw the points that `level` matches, and say where to look for them first."""
+        rng, target = np.random.default_rng(self.settings.seed), self.target
+        points = _some(np.arange(len(target.mesh.vertices), dtype=np.int32), level.scan_points, rng)
+        self._points_mm, self._normals = target.mesh.vertices[points], target.normals[points]
         self._asked = _some(self.surface.topology.used, level.vertices, rng)
-        self._near, self._walks = None, self.surface.nearest_vertices(self._in_model(self._points)[0])
+        self._engine, self._near = target.engine if level.triangles else target.vertex_engine, None
+        # The surface changes little from level to level, and what it does the walks make up for.
+        if self._tree is None or (level.modes is None and not self._tree_fits):
+            self._tree, self._tree_fits = self.surface.vertex_tree(), level.modes is None
+        self._walks = self.surface.topology.used[self._tree.nearest(self._in_model()[0])[0]]
+        self._triangles = np.full_like(self._walks, -1)
 
-    def _in_model(self, points: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return `points` of the scan in the model's frame with their normals."""
-        T, target = self.T, self.target
-        q = ((target.mesh.vertices[points] - T.translation) @ T.rotation) / T.scale
-        return q, target.normals[points] @ T.rotation
+    def _in_model(self) -> tuple[FloatArray, FloatArray]:
+        """Return the drawn points of the scan in the model's frame with their normals."""
+        T = self.T
+        return ((self._points_mm - T.translation) @ T.rotation) / T.scale, self._normals @ T.rotation
 
     def match(self) -> None:
         """Match scan points to the moving surface, and its vertices to the scan."""
-        q, n = self._in_model(self._points)
-        triangle, weights = self.surface.walk(q, self._walks)
+        q, n = self._in_model()
+        triangle = self._triangles
+        weights = self.surface.walk(q, self._walks, triangle)
         residual, distance, cosine, covered = self.surface.meet(q, n, triangle, weights)
         if self._winding == 0.0:
             # A scan wound the wrong way round has all its normals reversed.
@@ -130,7 +143,7 @@ class JointFit:
 
         T, asked = self.T, self._asked
         x, n = self.surface.vertices[asked], self.surface.normals[asked]
-        self._near = near = self.target.engine.query(T.apply(x), self._near)
+        self._near = near = self._engine.query(T.apply(x), self._near)
         to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
         allowed = ~on_boundary(near, self.target.mesh, self.target.rim)
         if self.target.mesh.faces is not None:
@@ -282,7 +295,10 @@ def robust_icp(
             if settled:
                 break
     yield state
-    T, b = in_span(model, fit.surface.vertices, fit.T, modes or model.n_modes, with_scale=with_scale)
+    wanted = model.n_modes if modes is None else min(modes, model.n_modes)
+    T, b = fit.T, fit.b
+    if len(b) > wanted:
+        T, b = in_span(prepared, fit.surface.vertices, T, wanted, with_scale=with_scale)
     covariance = fit.sigma_mm**2 * np.linalg.inv(fit.hessian)
     variance = covariance.diagonal()[POSE : POSE + len(b)]
     return Fitted(
@@ -300,40 +316,31 @@ def robust_icp(
 
 
 def in_span(
-    model: ShapeModel, vertices: FloatArray, T_scan_model: Similarity, modes: int, *, with_scale: bool
+    prepared: PreparedModel, vertices: FloatArray, T_scan_model: Similarity, modes: int, *, with_scale: bool
 ) -> tuple[Similarity, FloatArray]:
     """Return pose and first `modes` coefficients of the model's surface nearest to `vertices`, in least squares.
 
     Args:
-        model: the shape space.
+        prepared: the model.
         vertices: (V, 3) in the model's order, in its frame.
         T_scan_model: pose of that frame in the scan's; changed by what the modes left out would have done.
         modes: how many.
         with_scale: False keeps the scale.
     """
-    x, P = model.mean_vertices, model.basis[:, :modes]
-    pose = np.zeros((len(x), 3, POSE if with_scale else POSE - 1))
-    pose[:, :, :3] = -_cross(x)
-    pose[:, :, 3:6] = np.eye(3)
-    if with_scale:
-        pose[:, :, 6] = x
-    pose = pose.reshape(-1, pose.shape[2])
-    # P is orthonormal, so the modes drop out and the pose is what is left to solve for.
-    outside = pose - P @ (P.T @ pose)
-    moved = (vertices - x).ravel()
-    turn: FloatArray = np.asarray(np.linalg.lstsq(outside, moved - P @ (P.T @ moved), rcond=1e-6)[0], dtype=np.float64)
+    model, free = prepared.model, POSE if with_scale else POSE - 1
+    pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
+    moved = (vertices - model.mean_vertices).ravel()
+    # The modes are orthonormal, so they drop out of the normal equations and the pose is left.
+    normal = pose.T @ pose - inside.T @ inside
+    unit = 1.0 / np.linalg.norm(pose, axis=0)
+    pull = pose.T @ moved - inside.T @ (model.basis[:, :modes].T @ moved)
+    value, vector = np.linalg.eigh(normal * np.outer(unit, unit))
+    kept = value > _IN_SPAN
+    turn = unit * (vector[:, kept] @ ((vector[:, kept].T @ (unit * pull)) / value[kept]))
     small = Similarity(
         float(np.exp(turn[6])) if with_scale else 1.0, np.asarray(Rotation.from_rotvec(turn[:3]).as_matrix()), turn[3:6]
     )
-    b = P.T @ (small.inverse().apply(vertices) - x).ravel()
-    return T_scan_model @ small, b
-
-
-def _cross(x: FloatArray) -> FloatArray:
-    """Return (V, 3, 3) matrices that do the cross product with each of x (V, 3)."""
-    out = np.zeros((len(x), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
-    return out - out.transpose(0, 2, 1)
+    return T_scan_model @ small, model.project(small.inverse().apply(vertices), align=False)[:modes]
 
 
 def _solve(hessian: FloatArray, gradient: FloatArray, name: str) -> FloatArray:

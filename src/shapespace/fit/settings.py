@@ -30,6 +30,7 @@ class Level:
         modes: how many are free; None for all; 0 is phase 1.
         scan_points: how many points of the scan are matched; None for all.
         vertices: how many of the model's vertices are matched; None for all.
+        triangles: those vertices are matched to the scan's triangles; False for its nearest vertices, which is faster.
         iterations: at most.
         stop_motion_mm: it ends when no vertex moves more than this, mm.
     """
@@ -37,6 +38,7 @@ class Level:
     modes: int | None
     scan_points: int | None
     vertices: int | None
+    triangles: bool
     iterations: int
     stop_motion_mm: float
 
@@ -64,13 +66,13 @@ class RobustSettings:
     """
 
     levels: tuple[Level, ...] = (
-        Level(0, 2_000, 1_500, 3, 2.0),
-        Level(10, 2_500, 2_000, 4, 1.0),
-        Level(40, 4_000, 3_000, 3, 0.5),
-        Level(None, 6_000, 4_000, 6, 0.1),
-        Level(None, 20_000, 1_500, 15, 0.03),
+        Level(0, 1_500, 1_000, False, 2, 2.0),
+        Level(10, 1_500, 1_000, False, 4, 2.0),
+        Level(40, 2_500, 1_500, False, 2, 1.0),
+        Level(None, 5_000, 2_000, False, 6, 0.2),
+        Level(None, 20_000, 1_500, True, 15, 0.05),
     )
-    beyond: Level = Level(None, 8_000, 4_000, 10, 0.1)
+    beyond: Level = Level(None, 8_000, 4_000, True, 10, 0.1)
     residual: ResidualSettings = field(default_factory=ResidualSettings)
     beyond_share: float = 0.2
     beyond_mm: float = 0.05
