@@ -14,21 +14,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
-from shapespace.geometry.closest import ClosestPoints, build_engine
+from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
 _CENTRES = 40
 _FIELD_SHARE = 0.999
-_VARIANCE_SHARE = 0.995
-_MOST_PRODUCTS = 1_300
+_MOST_PRODUCTS = 600
+_BLOCK = 250
 _LEAST_VALUE = 1e-8
+_MIRROR_POINTS = 1_000
 _MIRROR_ITERATIONS = 30
+_MIRROR_STOP = 1e-5
+"""The search for a mirror ends when the RMS falls by less than this share of the mean's size."""
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
 
@@ -58,63 +62,93 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
 
 
 def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    x = model.mean_vertices
-    fields = _smooth_fields(x, settings.range_share * _size_mm(x)).astype(np.float32)
-    own = np.asarray(prepare(model).modes).reshape(3 * len(x), -1)
-    scaled = own * model.stddev.astype(np.float32)
+    x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
+    modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
-    sources = [scaled] if mirror is None else [scaled, mirror(scaled)]
-    strong = int(np.searchsorted(model.cumulative_variance / model.cumulative_variance[-1], _VARIANCE_SHARE)) + 1
-    strong = min(strong, max(1, _MOST_PRODUCTS // (len(sources) * fields.shape[1])))
-    local = np.float32(np.sqrt(settings.local_share))
-    parts = [_products(source[:, :strong], local * fields) for source in sources]
-    if mirror is not None:
-        parts.append(np.float32(np.sqrt(settings.mirror_share)) * sources[1])
-    outside = np.concatenate(parts, axis=1)
-    outside -= own @ (own.T @ outside)
-    value, vector = np.linalg.eigh(np.asarray(outside.T @ outside, dtype=np.float64))
-    order = np.argsort(value)[::-1][: settings.count]
-    order = order[value[order] > _LEAST_VALUE * value[order[0]]]
-    extra = outside @ (vector[:, order] / np.sqrt(value[order])).astype(np.float32)
-    together = np.concatenate([own, extra], axis=1).reshape(len(x), 3, -1)
-    return ResidualModes(np.ascontiguousarray(together), np.sqrt(value[order]))
+    sources = [modes] if mirror is None else [modes, mirror(modes)]
+    fields = _smooth_fields(x, settings.range_share * _size_mm(x))
+    mode, at = _strongest(model.stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS // len(sources))
+    field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
+    mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
+
+    def products(rows: slice) -> Float32Array:
+        """Return (3M, C) the local modes, and the mirrored ones, at some vertices."""
+        parts = [np.take(source[rows], mode, axis=2) for source in sources]
+        for part in parts:
+            part *= field[rows, None]
+        parts += [mirrored * source[rows] for source in sources[1:]]
+        return np.concatenate(parts, axis=2).reshape(3 * len(parts[0]), -1)
+
+    # All at once they are ten times as large as the model; block by block they are nothing.
+    blocks = _blocks(len(x))
+    own = [modes[rows].reshape(-1, len(stddev)) for rows in blocks]
+    inside = np.asarray(sum(P.T @ products(rows) for P, rows in zip(own, blocks, strict=True)))
+    gram = np.zeros((inside.shape[1], inside.shape[1]))
+    for P, rows in zip(own, blocks, strict=True):
+        outside = products(rows) - P @ inside
+        gram += outside.T @ outside
+    value, vector = eigh(gram, overwrite_a=True, subset_by_index=(max(0, len(gram) - settings.count), len(gram) - 1))
+    value, vector = value[::-1], vector[:, ::-1]
+    kept = value > _LEAST_VALUE * value[0]
+    stddev_mm = np.sqrt(value[kept])
+    mix = (vector[:, kept] / stddev_mm).astype(np.float32)
+    inside = inside @ mix
+    together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
+    together[:, :, : modes.shape[2]] = modes
+    for P, rows in zip(own, blocks, strict=True):
+        together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
+    return ResidualModes(together, stddev_mm)
 
 
-def _products(modes: Float32Array, fields: Float32Array) -> Float32Array:
-    """Return each of `modes` (3V, k) times each of `fields` (V, m) as (3V, k m)."""
-    k, (v, m) = modes.shape[1], fields.shape
-    return (modes.reshape(v, 3, k)[:, :, :, None] * fields[:, None, None, :]).reshape(3 * v, k * m)
+def _strongest(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:
+    """Return mode and field of the `count` products with the most variance, of modes (K,) and fields (m,) of a size."""
+    strength = np.outer(stddev, size)
+    order = np.argsort(strength, axis=None)[::-1][:count]
+    mode, field = np.unravel_index(order, strength.shape)
+    return mode.astype(np.int32), field.astype(np.int32)
 
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
-    """Return what turns fields (3V, k) on the mean into their mirror images; None if the mean is not symmetric."""
+    """Return what turns fields (V, 3, k) on the mean into their mirror images; None if the mean is not symmetric."""
     x = model.mean_vertices
-    centre = x.mean(axis=0)
     mean = model.mesh()
-    engine = build_engine(mean)
-    best: tuple[float, FloatArray, ClosestPoints] | None = None
+    assert mean.faces is not None
+    engine, size = build_engine(mean), _size_mm(x)
+    centre = x.mean(axis=0)
+    some = x[:: max(1, len(x) // _MIRROR_POINTS)] - centre
+    best = (np.inf, np.eye(3), Similarity.identity())
     for axis in np.linalg.svd(x - centre, full_matrices=False)[2]:
         flip = np.eye(3) - 2.0 * np.outer(axis, axis)
-        flipped = (x - centre) @ flip.T + centre
-        T, near = Similarity.identity(), None
+        flipped = some @ flip.T + centre
+        T, near, rms = Similarity.identity(), engine.query(flipped), np.inf
         for _ in range(_MIRROR_ITERATIONS):
-            near = engine.query(T.apply(flipped), near)
+            if rms - near.rms < _MIRROR_STOP * size:
+                break
+            rms = near.rms
             T = fit_similarity(flipped, near.points, with_scale=False)
-        near = engine.query(T.apply(flipped), near)
-        if best is None or near.rms < best[0]:
-            best = (near.rms, T.rotation @ flip, near)
-    assert best is not None and mean.faces is not None
-    rms, turn, at = best
-    if rms > _SYMMETRIC_SHARE * _size_mm(x) or at.triangle is None or at.barycentric is None:
+            near = engine.query(T.apply(flipped), near)
+        if near.rms < best[0]:
+            best = (near.rms, flip, T)
+    rms, flip, T = best
+    if rms > _SYMMETRIC_SHARE * size:
         return None
-    corners, weights, turn = mean.faces[at.triangle], at.barycentric.astype(np.float32), turn.astype(np.float32)
+    at = engine.query(T.apply((x - centre) @ flip.T + centre))
+    assert at.triangle is not None and at.barycentric is not None
+    corners, weights = mean.faces[at.triangle], at.barycentric.astype(np.float32)
+    turn = (T.rotation @ flip).astype(np.float32)
 
     def mirrored(field: Float32Array) -> Float32Array:
-        at_vertices = field.reshape(len(x), 3, -1)
-        there = sum(weights[:, c, None, None] * at_vertices[corners[:, c]] for c in range(3))
-        return np.einsum("de,vek->vdk", turn.T, there).reshape(3 * len(x), -1)
+        out = np.empty_like(field)
+        for rows in _blocks(len(x)):
+            there = sum(weights[rows, c, None, None] * field[corners[rows, c]] for c in range(3))
+            np.matmul(turn.T, there, out=out[rows])
+        return out
 
     return mirrored
+
+
+def _blocks(count: int) -> list[slice]:
+    return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
 
 
 def _size_mm(x: FloatArray) -> float:
@@ -122,10 +156,14 @@ def _size_mm(x: FloatArray) -> float:
 
 
 def _smooth_fields(x: FloatArray, range_mm: float) -> FloatArray:
-    """Return (V, m) fields f with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2): 1 at no distance, 0 far off."""
+    """Return (V, m) fields f with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2), but for their mean.
+
+    A constant field times a mode is that mode, which the model and its mirror image have already.
+    """
     centres = x[_spread_out(x, _CENTRES)]
     bumps = np.exp(-((x[:, None] - centres) ** 2).sum(axis=2) / (0.5 * range_mm**2))
     bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
+    bumps -= bumps.mean(axis=0)
     left, value, _ = np.linalg.svd(bumps, full_matrices=False)
     m = int(np.searchsorted(np.cumsum(value**2) / (value**2).sum(), _FIELD_SHARE)) + 1
     return left[:, :m] * value[:m]
