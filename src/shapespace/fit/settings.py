@@ -86,3 +86,50 @@ class RobustSettings:
     prior: float = 1.0
     scale_stddev: float = 0.15
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class DenseSettings:
+    """Settings of the dense stage; lengths are mm of the model's frame.
+
+    Args:
+        range_share: over what share of the model's size (RMS distance from its centre) the field is smooth.
+        amplitude: its standard deviation in units of what the fit left unexplained.
+        least_unexplained_mm: where less is left (RMS), there is only the field of details.
+        rounds: of matching and solving.
+        fine_range_share: over what share of the size the field of details is smooth.
+        fine_amplitude_mm: its standard deviation: finer noise is followed, coarser noise is not.
+        fine_rounds: of matching and solving for the details.
+        scan_points: how many points of the scan are matched at most.
+        vertex_share: weight of a vertex's match beside that of a scan point's.
+        weight: a name of `WEIGHTS`.
+        width: scale of the weights in units of the residuals' spread.
+        normal_cosine: matches whose normals disagree more than this are left out.
+        reach: matches farther than this many widths and
+        reach_mm: this count little.
+        least_noise_mm: the scan's noise is not taken for less than this.
+        turn_cosine: no triangle turns further than this.
+        tolerance: of the solver, as a share of the pull.
+        iterations: of the solver, at most.
+        seed: of the subsamples.
+    """
+
+    range_share: float = 1.0
+    amplitude: float = 10.0
+    least_unexplained_mm: float = 0.03
+    rounds: int = 3
+    fine_range_share: float = 0.05
+    fine_amplitude_mm: float = 0.2
+    fine_rounds: int = 2
+    scan_points: int = 40_000
+    vertex_share: float = 0.3
+    weight: str = "welsch"
+    width: float = 2.5
+    normal_cosine: float = 0.4
+    reach: float = 4.0
+    reach_mm: float = 2.0
+    least_noise_mm: float = 0.02
+    turn_cosine: float = 0.2
+    tolerance: float = 1e-2
+    iterations: int = 150
+    seed: int = 0
