@@ -73,6 +73,13 @@ def test_they_hold_the_variance_of_the_whole_covariance() -> None:
     np.testing.assert_allclose(made.stddev[:10], np.sqrt(np.linalg.eigvalsh(C)[::-1][:10]), rtol=0.05)
 
 
+def test_the_strongest_products_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = blob_model(400)
+    monkeypatch.setattr(residual, "_MOST_PRODUCTS", 45)
+    made = residual._make(model, SETTINGS)
+    assert share_held(made, covariance(model, SETTINGS, mirrored=False)) > 0.97
+
+
 def test_a_mean_that_is_its_own_mirror_image_gets_the_mirrored_modes() -> None:
     model = symmetric_model()
     assert residual._mirror(model) is not None

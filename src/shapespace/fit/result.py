@@ -8,17 +8,17 @@ from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri  # scipy.stats would cost every start half a second
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
 from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
-"""Stages whose distances are kept: centroids aligned, after phase 1, after phase 2."""
+"""Stages of every fit: centroids aligned, after phase 1, after phase 2. `dense` follows where it was asked for."""
 
 # Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
 _SHRUNK_BY_SHAPE = 0.85
@@ -40,11 +40,15 @@ class Stage:
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         b: (K,) coefficients, mm.
         measure: measures the distances; it holds the scan.
+        vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
+        seen: (V,) False where such a surface has only the model to go by; else None.
     """
 
     T_scan_model: Similarity
     b: FloatArray
     measure: Callable[[], SurfaceDistances] = field(repr=False)
+    vertices: FloatArray | None = None
+    seen: BoolArray | None = None
 
     @cached_property
     def distances(self) -> SurfaceDistances:
@@ -65,7 +69,7 @@ class FitResult:
         b: (K,) coefficients, mm.
         b_stddev: (K,) their standard deviation by the model's own noise, mm; not calibrated, mostly too small.
         z: (K,) b in standard deviations of the model.
-        stages: the surface at each of `STAGES`.
+        stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
         history: every state the loop went through, in the scan's mm frame.
         method: the method that ran.
         config: every setting in effect, with the software version.
@@ -108,9 +112,9 @@ class FitResult:
     def surface(self, model: ShapeModel, stage: str = "final") -> Mesh:
         """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order."""
         at = self.stages[stage]
-        mesh = model.mesh(at.b)
-        landmarks = {name: at.T_scan_model.apply(point) for name, point in mesh.landmarks.items()}
-        return Mesh(at.T_scan_model.apply(mesh.vertices), mesh.faces, landmarks, name=self.scan_name)
+        vertices = at.T_scan_model.apply(model.reconstruct(at.b)) if at.vertices is None else at.vertices
+        landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
+        return Mesh(vertices, model.faces, landmarks, name=self.scan_name)
 
 
 def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
@@ -173,4 +177,4 @@ def _hotelling_bound(k: int, n: int) -> float:
     """
     if n <= k + 1:
         return float("inf")
-    return float((n**2 - 1) / (n * (n - k)) * f_distribution.isf(_IMPLAUSIBLE, k, n - k))
+    return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))
