@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.fit.weights import WEIGHTS, spread
+from shapespace.fit.weights import WEIGHTS, spread, tails
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
@@ -28,3 +28,11 @@ def test_the_spread_is_the_standard_deviation_of_noise_whatever_a_third_of_outli
     assert spread(noise) == pytest.approx(0.3, rel=0.03)
     noise[:4_000] = 50.0
     assert spread(noise) < 0.45
+
+
+def test_tails_are_one_for_noise_and_more_with_outliers() -> None:
+    rng = np.random.default_rng(1)
+    noise = 0.3 * rng.standard_normal(20_000)
+    assert tails(noise, spread(noise)) == pytest.approx(1.0, rel=0.03)
+    noise[:2_500] *= 10
+    assert tails(noise, spread(noise)) > 1.5

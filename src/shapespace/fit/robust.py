@@ -28,7 +28,7 @@ from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.weights import WEIGHTS, spread
+from shapespace.fit.weights import WEIGHTS, spread, tails
 from shapespace.geometry.closest import ClosestPoints, on_boundary
 from shapespace.geometry.kdtree import KdTree
 from shapespace.model.shape_model import ShapeModel
@@ -165,11 +165,13 @@ class JointFit:
                 "check that it shows what the model does."
             )
         self.sigma_mm = max(spread(counted), s.least_spread_mm)
-        weight, width = WEIGHTS[s.weight], s.width * self.sigma_mm
+        weight = WEIGHTS[s.weight]
+        width = self.sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(counted, self.sigma_mm) ** 2))
         far = s.reach * width + s.reach_mm
         w = weight(scan.residual, width) * weight(scan.distance, far) * scan.allowed
         v = weight(vertices.residual, width) * weight(vertices.distance, far) * vertices.allowed
-        return w, s.vertex_share * v
+        fineness = min(1.0, len(self.target.mesh.vertices) / len(self.surface.vertices))
+        return w, s.vertex_share * fineness**2 * v
 
     def step(self, modes: int) -> None:
         """Do one Gauss-Newton step on the pose and the first `modes` coefficients."""

@@ -54,12 +54,14 @@ class RobustSettings:
         beyond_share: it follows when what the model leaves is this share of the residuals' variance, and
         beyond_mm: this large (RMS), mm.
         weight: a name of `WEIGHTS`.
-        width: scale of the weights in units of the residuals' spread.
+        narrow: scale of the weights in units of the residuals' spread, where many residuals lie far out;
+        wide: the same where they are as few as in pure noise, of which narrow weights waste a part.
         least_spread_mm: the spread is not taken for less than this, mm.
         normal_cosine: matches whose normals disagree more than this are left out.
         reach: matches farther than this many widths and
         reach_mm: this, mm, count little.
-        vertex_share: weight of a vertex's match beside that of a scan point's.
+        vertex_share: weight of a vertex's match beside that of a scan point's, for scans at least as fine as the
+            model; less for coarser ones, whose flat triangles cut the corners.
         prior: how many matches tell as much as one independent one.
         scale_stddev: of log s about the start.
         seed: of the subsamples.
@@ -77,7 +79,8 @@ class RobustSettings:
     beyond_share: float = 0.2
     beyond_mm: float = 0.05
     weight: str = "welsch"
-    width: float = 2.5
+    narrow: float = 1.5
+    wide: float = 3.5
     least_spread_mm: float = 0.02
     normal_cosine: float = 0.4
     reach: float = 4.0

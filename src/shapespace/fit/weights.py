@@ -35,3 +35,8 @@ WEIGHTS: Mapping[str, Callable[[FloatArray, float], FloatArray]] = {
 def spread(residual: FloatArray) -> float:
     """Return the standard deviation that the median of |residual| (M,) stands for, whatever the outliers are."""
     return 1.4826 * float(np.median(np.abs(residual))) if len(residual) else float("inf")
+
+
+def tails(residual: FloatArray, spread_mm: float) -> float:
+    """Return how far the outer tenth of |residual| (M,) lies, where 1 is what noise of that spread would give."""
+    return float(np.quantile(np.abs(residual), 0.9)) / (1.645 * spread_mm)
