@@ -159,7 +159,9 @@ def _add_info(commands: Any) -> None:
 
 def _add_fit(commands: Any) -> None:
     sub = _add(commands, "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
-               "shapespace fit model.h5 scan.obj -o out")  # fmt: skip
+               "shapespace fit model.h5 scan.obj -o out\n"
+               "         shapespace fit model.h5 scans -o out --dense\n"
+               "         shapespace build out/*.dense.ply -o new.h5")  # fmt: skip
     sub.add_argument("model", type=Path, metavar="MODEL.h5")
     sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
@@ -178,6 +180,8 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
     sub.add_argument("--jobs", type=_natural, default=1, metavar="N", help="scans at a time; 0 for all cores")
     sub.add_argument("--resume", action="store_true", help="keep results of an earlier run that still hold")
+    sub.add_argument("--dense", action="store_true",
+                     help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
@@ -332,6 +336,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         scale=arguments.scale,
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,
+        dense=arguments.dense,
     )
     records = commands.fit_scans(
         arguments.model,
@@ -372,6 +377,9 @@ def _print_fit(record: Mapping[str, Any]) -> None:
         f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
         f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
     )
+    if "dense" in record["distances_mm"]:
+        dense = record["distances_mm"]["dense"]["model_to_scan"]
+        _print(f"  dense surface to scan: {dense['median']:.2f} mm median, {dense['mean']:.2f} mm mean")
     for note in record["notes"]:
         print(f"  {note}")
 

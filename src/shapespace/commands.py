@@ -215,13 +215,12 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
 
 
 def _without_results(scans: Sequence[Path], folder: Path) -> list[Path]:
-    """Return `scans` without the fitted surfaces that an earlier run left in `folder`, where scans and results mix."""
-    ending = ".fitted.ply"
+    """Return `scans` without the surfaces that an earlier run left in `folder`, where scans and results mix."""
     here = folder.resolve()
 
     def is_result(scan: Path) -> bool:
-        record = scan.with_name(scan.name.removesuffix(ending) + ".fit.json")
-        return scan.name.endswith(ending) and scan.parent.resolve() == here and record.is_file()
+        name = scan.name.removesuffix(".fitted.ply").removesuffix(".dense.ply")
+        return name != scan.name and scan.parent.resolve() == here and scan.with_name(f"{name}.fit.json").is_file()
 
     left = [scan for scan in scans if not is_result(scan)]
     if not left:

@@ -1,4 +1,4 @@
-"""The plain files that a fit ends in: NAME.fit.json, NAME.fitted.ply, NAME.stages.npz and coefficients.csv."""
+"""The files that a fit ends in: NAME.fit.json, NAME.fitted.ply, NAME.dense.ply, NAME.stages.npz, coefficients.csv."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from shapespace import __version__
 from shapespace.errors import FileFormatError
-from shapespace.fit.result import STAGES, FitResult
+from shapespace.fit.result import FitResult
 from shapespace.io.files import atomic_path, read_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -63,7 +63,7 @@ def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
         "b_stddev_calibrated": False,
-        "distances_mm": {name: result.stages[name].distances.as_dict() for name in STAGES},
+        "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [
             {
                 "phase": state.phase,
@@ -119,9 +119,9 @@ def read_record(path: Path) -> dict[str, Any]:
     return cast(dict[str, Any], record)
 
 
-def write_fitted_mesh(path: Path, result: FitResult, model: ShapeModel) -> None:
-    """Write the fitted surface, in the model's vertex order and the scan's own frame and unit."""
-    write_mesh(path, result.surface(model))
+def write_fitted_mesh(path: Path, result: FitResult, model: ShapeModel, stage: str = "final") -> None:
+    """Write the surface at `stage`, in the model's vertex order and the scan's own frame and unit."""
+    write_mesh(path, result.surface(model, stage))
 
 
 def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
@@ -130,11 +130,13 @@ def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
     Vertices are in the scan's frame in mm; distances are mm of the model's frame.
     """
     arrays: dict[str, Any] = {}
-    for name in STAGES:
-        distances = result.stages[name].distances
+    for name, stage in result.stages.items():
+        distances = stage.distances
         arrays[name] = (result.surface(model, name).vertices * result.mm_per_scan_unit).astype(np.float32)
         arrays[f"model_to_scan_{name}"] = distances.model_to_scan_mm.astype(np.float32)
         arrays[f"scan_to_model_{name}"] = distances.scan_to_model_mm[distances.scan_counted].astype(np.float32)
+        if stage.seen is not None:
+            arrays[f"seen_{name}"] = stage.seen
     if model.faces is not None:
         arrays["faces"] = model.faces
     with atomic_path(path) as temporary:

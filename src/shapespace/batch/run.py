@@ -118,11 +118,16 @@ def fit_file(
     else:
         record = fit_record(result, scan_source, model_source, marks_source)
         write_fitted_mesh(folder / f"{job.name}.fitted.ply", result, model)
+        if config.dense:
+            write_fitted_mesh(folder / f"{job.name}.dense.ply", result, model, "dense")
         if stages:
             write_stages(folder / f"{job.name}.stages.npz", result, model)
     if record["status"] == "failed":
         # An earlier run's surface would contradict the record.
         remove_file(folder / f"{job.name}.fitted.ply")
+    if (record["status"] == "failed" or not config.dense) and (folder / f"{job.name}.fit.json").is_file():
+        # Without a record it is no result of ours, but perhaps a scan.
+        remove_file(folder / f"{job.name}.dense.ply")
     if record["status"] == "failed" or not stages:
         remove_file(folder / f"{job.name}.stages.npz")
     write_record(folder / f"{job.name}.fit.json", record)
@@ -286,7 +291,8 @@ def _earlier_record(
 ) -> dict[str, Any] | None:
     """Return the record of an earlier run if it is good for the same scan, model and settings."""
     path = folder / f"{job.name}.fit.json"
-    needed = [path, folder / f"{job.name}.fitted.ply", *([folder / f"{job.name}.stages.npz"] if stages else [])]
+    wanted = {"fitted.ply": True, "dense.ply": config.dense, "stages.npz": stages}
+    needed = [path, *(folder / f"{job.name}.{ending}" for ending, want in wanted.items() if want)]
     if not all(file.is_file() for file in needed):
         return None
     try:

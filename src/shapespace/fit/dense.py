@@ -37,6 +37,8 @@ _FEWEST_PAIRS = 100
 _WELL_SHAPED = 0.05
 """Vertices own at least this share of the median area: slivers would be infinitely stiff."""
 _HALVINGS = 8
+_SEEN = 0.1
+"""Matches that together weigh as much show a vertex; a good one weighs 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +111,7 @@ def dense_surface(
         seen_at, pull_at = matching.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
-    return DenseSurface(T.apply(kept), seen_at > 0.0, noise_mm, left_mm, int((held | held_back).sum()))
+    return DenseSurface(T.apply(kept), seen_at * noise_mm**2 > _SEEN, noise_mm, left_mm, int((held | held_back).sum()))
 
 
 class _Matching:

@@ -15,7 +15,7 @@ from shapespace import __version__
 from shapespace.errors import FitError, InputError
 from shapespace.fit.result import FitResult, Stage, Status, doubts, posterior_stddev
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.fit.settings import RobustSettings
+from shapespace.fit.settings import DenseSettings, RobustSettings
 from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
@@ -28,6 +28,7 @@ from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
 _FAR_OUT = 3.0
 _FAR_OUT_BY_CHANCE = 0.01
+_ALL_BUT_THE_RIM = 0.95
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
 
@@ -49,9 +50,11 @@ class FitConfig:
         max_iterations: cap of each phase.
         seed: of the subsample that the start is searched on.
         robust: settings of the robust method.
+        dense: whether its surface is then taken the rest of the way to the scan, as the stage `dense`.
+        dense_settings: settings of that.
 
     Raises:
-        InputError: a name that does not exist, or a number of modes below one.
+        InputError: a name that does not exist, a number of modes below one, or a dense stage after the paper's method.
     """
 
     method: str = "robust"
@@ -64,6 +67,8 @@ class FitConfig:
     max_iterations: int = 500
     seed: int = 0
     robust: RobustSettings = field(default_factory=RobustSettings)
+    dense: bool = False
+    dense_settings: DenseSettings = field(default_factory=DenseSettings)
 
     def __post_init__(self) -> None:
         for value, choices, what in (
@@ -77,6 +82,10 @@ class FitConfig:
         if self.method == "robust" and self.search != "auto":
             raise InputError(
                 "The robust method always searches the scan's surface; leave search out, or use the paper's."
+            )
+        if self.dense and self.method != "robust":
+            raise InputError(
+                f"The dense stage goes on from the robust method's surface; leave dense out, or {self.method!r}."
             )
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
@@ -221,6 +230,10 @@ def _fit_scan(
     stages = {
         name: _stage(model, scan_mm, target.engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
     }
+    dense_from = time.perf_counter()
+    if config.dense:
+        stages["dense"] = _dense_stage(model, target, T_mm_scan.inverse(), fitted, config)
+    dense_s = time.perf_counter() - dense_from
     start_scale = start.T_scan_model.scale / mm
     status, reason = _verdict(model, stages, start_scale, ended[1][0], ended[2][0], config)
     clock.append(time.perf_counter())
@@ -246,15 +259,27 @@ def _fit_scan(
             *(f"{finding.what} {finding.action}".strip() for finding in findings),
             *_far_out(model, fitted.b),
             *_no_triangles(scan),
+            *_not_all_seen(stages),
         ],
         seconds={
             "start": clock[1] - clock[0],
             "phase_1": ended[1][1] - clock[1],
             "phase_2": ended[2][1] - ended[1][1],
-            "distances": clock[2] - ended[2][1],
+            **({"dense": dense_s} if config.dense else {}),
+            "distances": clock[2] - ended[2][1] - dense_s,
         },
         model_hash=model.content_hash,
     )
+
+
+def _not_all_seen(stages: Mapping[str, Stage]) -> list[str]:
+    dense = stages.get("dense")
+    if dense is None or dense.seen is None or dense.seen.mean() > _ALL_BUT_THE_RIM:
+        return []
+    return [
+        f"The dense surface follows the scan at {100 * dense.seen.mean():.0f} % of its vertices; where the scan shows "
+        "nothing the model stands in."
+    ]
 
 
 def _no_triangles(scan: Mesh) -> list[str]:
@@ -288,6 +313,23 @@ def _start(
         placed = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         return start_from_landmarks(model, placed, scan_mm.name, with_scale=fits_scale(model, config))
     return start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=fits_scale(model, config))
+
+
+def _dense_stage(
+    model: ShapeModel, target: ScanTarget, T_scan_mm: Similarity, fitted: Fitted, config: FitConfig
+) -> Stage:
+    from shapespace.fit.dense import dense_surface  # compiled
+
+    T = fitted.T_scan_model
+    dense = dense_surface(model, target, fitted.vertices_scan_mm, T, config.dense_settings)
+    placed = Mesh(dense.vertices_scan_mm, model.faces, name="model")
+    return Stage(
+        T_scan_mm @ T,
+        fitted.b,
+        lambda: surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale),
+        vertices=T_scan_mm.apply(dense.vertices_scan_mm),
+        seen=dense.seen,
+    )
 
 
 def _stage(
