@@ -449,7 +449,7 @@ CASES: Mapping[str, Case] = {
             model="expressions",
             repeats=5,
             with_start=False,
-            targets={50: (Target("ratio", 1.3), _NEVER), None: (Target("ratio", 1.3), _NEVER)},
+            targets={50: (Target("ratio", 1.3), _NEVER), None: (_NEVER,)},
         ),
         Case("aligned", "complete, model of the 200 aligned by Procrustes", _complete(), _off, model="aligned200"),
         Case(
