@@ -1,0 +1,200 @@
+"""How well a robust fit knows what it found: the joint posterior of pose and coefficients, tempered and calibrated.
+
+At the optimum the cost of `robust` is near quadratic, so the inverse of its Hessian is the covariance of pose,
+coefficients and residual modes together (Laplace). The block of b in the full inverse has the pose marginalised. Taken
+as it stands it is far too small, since residuals that share a cause are counted as independent. So the data's part of
+the Hessian is divided by a temperature before the prior joins it again: what the scan does not show stays at the prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, Similarity
+
+if TYPE_CHECKING:
+    from shapespace.fit.robust import JointFit
+
+POSE = 7
+_HALF = 0.5
+_LEADING = 10
+_NEAR = 0.05
+_FEWEST_SHAPES = 10
+_ALL_KEPT = 1e-6
+_NOISE_TEMPERATURE = 1.7
+_PATCHES = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What is known of a fit's coefficients beside their values.
+
+    Args:
+        b_stddev: (K,) standard deviation of each coefficient, mm; never above the model's.
+        shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
+        evidence: what speaks for and against the fit, by name; the unit stands in the name.
+    """
+
+    b_stddev: FloatArray
+    shrinkage: FloatArray
+    evidence: Mapping[str, float]
+
+
+def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_model_mm: float) -> Posterior:
+    """Return what `fit`, at its end, knows of the coefficients it reports.
+
+    Args:
+        fit: after its last step; it is not changed.
+        T_scan_model: the pose reported, to the frame of `fit.T`.
+        b: (K,) mm, the coefficients reported.
+        beyond_model_mm: RMS of what the model left of the residuals.
+    """
+    model, x = fit.prepared.model, fit.surface.vertices
+    prior = np.concatenate([variance_of_new_shapes(model), fit.stddev[model.n_modes :] ** 2])
+    covariance = _covariance(fit, prior, temperature(fit, beyond_model_mm))
+    K = len(b)
+    variance = np.clip(covariance.diagonal()[POSE : POSE + K], 0.0, prior[:K])
+    reported = (fit.T.inverse() @ T_scan_model).apply(model.reconstruct(b))
+    left_out = float(((x - reported) ** 2).sum(axis=1).mean())
+    expected = float((covariance * _gram(fit)).sum()) / len(x)
+    return Posterior(
+        np.sqrt(variance),
+        1.0 - variance / prior[:K],
+        {
+            **_matched(fit),
+            "spread_mm": fit.sigma_mm,
+            "beyond_model_mm": beyond_model_mm,
+            "left_out_mm": float(np.sqrt(left_out)),
+            "expected_error_mm": float(np.sqrt(max(expected, 0.0) + left_out)),
+        },
+    )
+
+
+def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
+    """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
+
+    Modes are chosen to fit the training shapes, so their variances there say too little of others: far too little for
+    the last of N - 1 modes of N shapes. Nonlinear shrinkage estimates it from the spectrum alone (Ledoit and Wolf,
+    Annals of Statistics 48(5), 2020, section 4.5 for more coordinates than shapes). Never below the model's own.
+    """
+    own, n = model.stddev**2, model.n_training
+    left = model.total_variance - float(own.sum())
+    rest = n - 1 - model.n_modes
+    if n < _FEWEST_SHAPES:
+        return own
+    spectrum = own
+    if rest > 0 and left > _ALL_KEPT * model.total_variance:
+        spectrum = np.concatenate([own, np.full(rest, left / rest)])
+    c = len(spectrum) / (n - 1)
+    density, transform = _smoothed(spectrum, n)
+    if c < 1:
+        shrunk = spectrum / ((np.pi * c * spectrum * density) ** 2 + (1 - c - np.pi * c * spectrum * transform) ** 2)
+    else:
+        shrunk = 1.0 / (np.pi**2 * spectrum * (density**2 + transform**2))
+    return np.maximum(own, shrunk[: len(own)])
+
+
+def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return the density (D,) of the eigenvalues and its Hilbert transform (D,), by an Epanechnikov kernel."""
+    width = n ** (-1.0 / 3.0) * spectrum
+    x = (spectrum[:, None] - spectrum) / width
+    root = np.sqrt(5.0)
+    near = np.maximum(1.0 - x**2 / 5.0, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curved = np.nan_to_num((1.0 - x**2 / 5.0) * np.log(np.abs((root - x) / (root + x))))
+    density = (0.75 / root * near / width).mean(axis=1)
+    transform = ((-0.3 * x + 0.75 / root * curved) / np.pi / width).mean(axis=1)
+    return density, transform
+
+
+def temperature(fit: JointFit, beyond_model_mm: float) -> float:
+    """Return how many residuals tell as much as one independent one.
+
+    Noise is nearly independent from match to match. What the model lacks is not: all matches of a patch share it.
+    """
+    patch = float(sum(w.sum() for w in fit.weigh())) / _PATCHES
+    return _NOISE_TEMPERATURE + patch * (beyond_model_mm / fit.sigma_mm) ** 2
+
+
+def data_hessian(fit: JointFit) -> FloatArray:
+    """Return the Hessian (7 + K + R, 7 + K + R) of the data alone, divided by the residuals' variance."""
+    n = len(fit.hessian)
+    rho = fit.settings.prior * fit.sigma_mm**2
+    own = np.array(fit.hessian)
+    index = np.arange(POSE, n)
+    own[index, index] -= rho / fit.stddev[: n - POSE] ** 2
+    if fit.with_scale:
+        own[6, 6] -= rho / fit.settings.scale_stddev**2
+    else:
+        own[6], own[:, 6] = 0.0, 0.0
+    whole = np.zeros((POSE + len(fit.stddev),) * 2)
+    whole[:n, :n] = own / fit.sigma_mm**2
+    return whole
+
+
+def _covariance(fit: JointFit, prior: FloatArray, temperature: float) -> FloatArray:
+    """Return the joint covariance (7 + K + R, 7 + K + R) of pose (radians, mm, log scale) and coefficients (mm)."""
+    precision = data_hessian(fit) / temperature
+    # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
+    unit = np.concatenate([np.full(3, 1.0), np.full(3, _size_mm(fit)), [fit.settings.scale_stddev], np.sqrt(prior)])
+    scaled = precision * np.outer(unit, unit)
+    scaled[np.diag_indices_from(scaled)] += np.concatenate([np.full(6, 1e-9), np.ones(len(unit) - 6)])
+    inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(len(unit))))
+    if not fit.with_scale:
+        inverse[6], inverse[:, 6] = 0.0, 0.0
+    return inverse * np.outer(unit, unit)
+
+
+def _size_mm(fit: JointFit) -> float:
+    x = fit.prepared.model.mean_vertices
+    return float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _gram(fit: JointFit) -> FloatArray:
+    """Return (7 + K + R, 7 + K + R): inner products over the surface of what each parameter moves."""
+    x, modes = fit.surface.vertices, fit.surface.modes
+    pose = np.zeros((len(x), 3, POSE))
+    pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
+    pose[:, 1, 0], pose[:, 2, 0], pose[:, 2, 1] = -x[:, 2], x[:, 1], -x[:, 0]
+    pose[:, :, 3:6] = np.eye(3)
+    pose[:, :, 6] = x
+    flat = pose.reshape(-1, POSE)
+    gram = np.eye(POSE + modes.shape[2])
+    gram[:POSE, :POSE] = flat.T @ flat
+    cross = flat.astype(np.float32).T @ modes.reshape(-1, modes.shape[2])
+    gram[:POSE, POSE:], gram[POSE:, :POSE] = cross, cross.T
+    return gram
+
+
+def _matched(fit: JointFit) -> dict[str, float]:
+    """Return how much of model and scan found a match, and how plausible pose and shape are."""
+    scan, vertices, model = fit.scan, fit.vertices, fit.prepared.model
+    assert scan is not None and vertices is not None
+    w, v = fit.weigh()
+    v = v / max(float(v.max()), 1e-12)
+    near_mm = _NEAR * _size_mm(fit)
+    z2 = fit.b[: model.n_modes] ** 2 / variance_of_new_shapes(model)
+    beyond = fit.b[model.n_modes :] / fit.stddev[model.n_modes :]
+    return {
+        "seen_share": float((fit.seen_at > 0).mean()),
+        "model_matched_share": float((v > _HALF).mean()),
+        "model_allowed_share": float(vertices.allowed.mean()),
+        "scan_matched_share": float((w > _HALF).mean()),
+        "scan_allowed_share": float(scan.allowed.mean()),
+        "scan_inlier_share": float((w[scan.allowed] > _HALF).mean()) if scan.allowed.any() else 0.0,
+        "scan_near_share": float((scan.distance < near_mm).mean()),
+        "model_near_share": float((vertices.distance < near_mm).mean()),
+        "scan_median_mm": float(np.median(scan.distance)),
+        "model_median_mm": float(np.median(vertices.distance)),
+        "z2": float(z2.mean()),
+        "z2_leading": float(z2[:_LEADING].mean()),
+        "z2_beyond": float((beyond**2).mean()) if len(beyond) else 0.0,
+        "log_scale": float(np.log(fit.T.scale)),
+        "log_scale_from_start": float(np.log(fit.T.scale / fit.start_scale)),
+    }
