@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import FitError
-from shapespace.fit.field_kernels import solve_field
+from shapespace.fit.field_kernels import less_sag, solve_field
 from shapespace.fit.kernels import gather_into, meet_into, normals_into, walk_into
 from shapespace.fit.moving_model import Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
@@ -152,6 +152,7 @@ class _Matching:
             self._points, self._point_normals, self.triangle, self.barycentric, x, self.normals, t.faces, t.rim,
             self.residual, self.distance, self._cosine, self._covered,
         )  # fmt: skip
+        less_sag(self.triangle, self.barycentric, x, self.normals, t.faces, self.residual)
         if self._winding == 0.0:
             # A scan wound the wrong way round has all its normals reversed.
             covered = self._cosine[self._covered]

@@ -118,11 +118,11 @@ class DenseSettings:
     """
 
     range_share: float = 1.0
-    amplitude: float = 10.0
-    least_unexplained_mm: float = 0.03
+    amplitude: float = 6.0
+    least_unexplained_mm: float = 0.06
     rounds: int = 3
     fine_range_share: float = 0.05
-    fine_amplitude_mm: float = 0.2
+    fine_amplitude_mm: float = 0.18
     fine_rounds: int = 2
     scan_points: int = 40_000
     vertex_share: float = 0.3
