@@ -149,6 +149,13 @@ def test_unfolding_holds_back_only_where_triangles_turn() -> None:
     assert np.array_equal(kept[~held], moved[~held])
 
 
+def test_a_scan_coarser_than_the_model_is_met_between_its_vertices() -> None:
+    scan = scanned(count=700)
+    surface = dense(scan)
+    engine = build_engine(scan)
+    assert engine.query(surface.vertices_scan_mm).distance.mean() < 0.25 * engine.query(fitted()).distance.mean()
+
+
 def test_a_point_cloud_will_do() -> None:
     scan = scanned(noise_mm=0.1, count=20_000)
     surface = dense(Mesh(scan.vertices, name="cloud.ply"))
