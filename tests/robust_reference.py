@@ -1,0 +1,41 @@
+"""One Gauss-Newton step of the robust fit in plain NumPy: the oracle of the compiled one, written to be read.
+
+The Jacobian of the distance r = n . (x - q) of a model point x = sum_c beta_c x_c from its match q, along the model's
+normal n, by a small rotation, translation and log scale of the model and by the coefficients b, is
+[ x_c x n_c | n_c | n_c . x_c | n_c^T P_c ], summed over the corners c of the triangle with their weights beta_c.
+"""
+
+import numpy as np
+
+from shapespace.fit.robust import POSE, JointFit
+from shapespace.types import FloatArray
+
+
+def vertex_rows(vertices: FloatArray, normals: FloatArray, modes: FloatArray) -> FloatArray:
+    """Return how each vertex moves along its normal with each parameter, (V, 7 + K)."""
+    turn = np.cross(vertices, normals)
+    size = (vertices * normals).sum(axis=1, keepdims=True)
+    return np.concatenate([turn, normals, size, np.einsum("vd,vdk->vk", normals, modes)], axis=1)
+
+
+def gauss_newton_step(fit: JointFit, modes: int) -> tuple[FloatArray, FloatArray]:
+    """Return the step (7 + K,) that `fit.step` takes from its matches as they are, and the Hessian of the cost."""
+    s, surface, scan, vertices = fit.settings, fit.surface, fit.scan, fit.vertices
+    assert scan is not None and vertices is not None
+    w, v = fit.weigh()
+    rows = vertex_rows(surface.vertices, surface.normals, surface.modes[:, :, :modes].astype(float))
+    hessian, gradient = np.zeros((POSE + modes, POSE + modes)), np.zeros(POSE + modes)
+    corners = surface.topology.faces[scan.triangle]
+    for i in np.flatnonzero(w):
+        for c, share in zip(corners[i], scan.barycentric[i], strict=True):
+            hessian += w[i] * share * np.outer(rows[c], rows[c])  # lumped on the corners
+            gradient += w[i] * share * scan.residual[i] * rows[c]
+    for j, weight, residual in zip(vertices.vertex, v, vertices.residual, strict=True):
+        hessian += weight * np.outer(rows[j], rows[j])
+        gradient += weight * residual * rows[j]
+    rho = fit.prior * fit.sigma_mm**2
+    hessian[POSE:, POSE:] += np.diag(rho / fit.stddev[:modes] ** 2)
+    gradient[POSE:] += rho * fit.b[:modes] / fit.stddev[:modes] ** 2
+    hessian[6, 6] += rho / s.scale_stddev**2
+    gradient[6] += rho / s.scale_stddev**2 * np.log(fit.T.scale / fit.start_scale)
+    return -np.linalg.solve(hessian, gradient), hessian
