@@ -178,7 +178,7 @@ def _add_fit(commands: Any) -> None:
                      help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
     sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
-    sub.add_argument("--jobs", type=_natural, default=1, metavar="N", help="scans at a time; 0 for all cores")
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="scans at a time (default: one a core)")
     sub.add_argument("--resume", action="store_true", help="keep results of an earlier run that still hold")
     sub.add_argument("--dense", action="store_true",
                      help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
@@ -326,6 +326,11 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
+    if arguments.jobs != 1 and (len(arguments.scans) > 1 or arguments.scans[0].is_dir()):
+        from shapespace.batch.workers import may_tell, start_loading
+
+        # While this process loads its own code; half of the time that many scans take to start.
+        start_loading(tell=may_tell(quiet=arguments.quiet))
     from shapespace import commands
     from shapespace.fit.fit import FitConfig
 

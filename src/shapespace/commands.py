@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from shapespace.batch.results import read_record
 from shapespace.batch.run import fit_files, make_executor, make_jobs, naming
+from shapespace.batch.workers import cores, may_tell, start_loading
 from shapespace.datasets import faces as bundled
 from shapespace.datasets import fetch, ict
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
@@ -35,6 +36,14 @@ def progress_bar(total: int | None, what: str, unit: str, *, quiet: bool) -> tqd
     """Return a progress bar on standard error that is silent with `quiet` or without a terminal."""
     # disable=None is tqdm's way to ask whether there is a terminal.
     return tqdm(total=total, desc=what, unit=unit, leave=False, disable=True if quiet else None)
+
+
+def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
+    """Return a block in which a line on standard error says why the user waits while code is compiled."""
+    from shapespace.batch.warm import tell_compiling
+    from shapespace.compiled import on_compiling
+
+    return on_compiling(tell_compiling) if may_tell(quiet=quiet) else nullcontext()
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
@@ -255,7 +264,7 @@ def fit_scans(
     write_bytes(folder / ".writable", b"")
     remove_file(folder / ".writable")
     work = make_jobs(files, landmarks)
-    workers = min(jobs or os.cpu_count() or 1, len(work))
+    workers = min(jobs or cores(), len(work))
     bar = progress_bar(len(work), "fitting", "scan", quiet=quiet)
 
     def show_state(state: IcpState) -> None:
@@ -271,10 +280,12 @@ def fit_scans(
 
     with bar:
         if workers <= 1:
-            return fit_files(
-                work, model, model_path.name, folder, config,
-                resume=resume, stages=stages, on_done=done, on_state=show_state,
-            )  # fmt: skip
+            with telling_of_compiling(quiet=quiet):
+                return fit_files(
+                    work, model, model_path.name, folder, config,
+                    resume=resume, stages=stages, on_done=done, on_state=show_state,
+                )  # fmt: skip
+        start_loading(tell=may_tell(quiet=quiet))
         with make_executor(model_path, workers) as executor:
             return fit_files(
                 work, model, model_path.name, folder, config,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba  # pyright: ignore[reportMissingTypeStubs]
+from numba.core import event  # pyright: ignore[reportMissingTypeStubs]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -14,6 +16,33 @@ R = TypeVar("R")
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function` as machine code: float64 as written, one thread, without Python's lock.
 
-    Its Python form stays at `.py_func`, for tests.
+    Its Python form stays at `.py_func`, for tests. The code is kept beside the source, or where that cannot be
+    written in the user's cache folder, or where there is none either in memory alone.
     """
-    return cast(Callable[P, R], cast(Any, numba).njit(cache=True, nogil=True, error_model="numpy")(function))
+
+    def made(*, cache: bool) -> Callable[P, R]:
+        return cast(Callable[P, R], cast(Any, numba).njit(cache=cache, nogil=True, error_model="numpy")(function))
+
+    try:
+        return made(cache=True)
+    except RuntimeError:  # no folder to keep it in
+        return made(cache=False)
+
+
+@contextmanager
+def on_compiling(tell: Callable[[], None]) -> Generator[None]:
+    """Call `tell` once if any code is compiled in this block, before it is; code read from disk does not count."""
+
+    class First(cast(Any, event).Listener):
+        told = False
+
+        def on_start(self, event: object) -> None:
+            if not self.told:
+                self.told = True
+                tell()
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    with cast(Any, event).install_listener("numba:compile", First()):
+        yield

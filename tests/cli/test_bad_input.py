@@ -407,7 +407,7 @@ def test_a_disk_that_fills_up_in_a_batch_keeps_what_was_written(
     names: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     FullDisk(monkeypatch, names)
-    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3)
+    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3, "--jobs", 1)
     assert outcome.code == 2
     errors = [line for line in outcome.err.splitlines() if "max_iterations" not in line]
     assert len(errors) == 1

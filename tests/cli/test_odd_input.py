@@ -186,7 +186,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
         monkeypatch.setattr(f"{module}.read_mesh", interrupted)
     arguments: dict[str, tuple[object, ...]] = {
         "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),
-        "fit": ("fit", world.model, *world.scans, "-o", tmp_path, *FAST),
+        "fit": ("fit", world.model, *world.scans, "-o", tmp_path, "--jobs", 1, *FAST),
         "check": ("check", *world.scans),
     }
     outcome = run(*arguments[command])

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, get_args
 
@@ -30,6 +26,7 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
+from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
 from shapespace.errors import FileError, FitError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.result import Status
@@ -213,7 +210,7 @@ def _run_on(
     executor: Executor, jobs: Sequence[Job], model_name: str, folder: Path, config: FitConfig, stages: bool
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
     with ExitStack() as stack:
-        with _interrupts_ignored():
+        with interrupts_ignored():
             futures = {
                 executor.submit(_fit_with_loaded_model, job, model_name, folder, config, stages): job for job in jobs
             }
@@ -227,19 +224,6 @@ def _run_on(
                     "run again with --resume and fewer --jobs."
                 ) from error
             yield futures[future], record
-
-
-@contextlib.contextmanager
-def _interrupts_ignored() -> Generator[None]:
-    """Let worker processes that start in this block inherit deafness to Ctrl-C: stopping them is the parent's job."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 _model: ShapeModel | None = None
@@ -264,7 +248,9 @@ def _fit_with_loaded_model(job: Job, model_name: str, folder: Path, config: FitC
 
 
 def _processes(model: Path, workers: int) -> Executor:
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_process, initargs=(model,))
+    start_loading(tell=False)
+    wait_until_loaded()
+    return ProcessPoolExecutor(workers, mp_context=context(), initializer=_start_process, initargs=(model,))
 
 
 def _threads(model: Path, workers: int) -> Executor:

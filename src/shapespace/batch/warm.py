@@ -1,0 +1,62 @@
+"""Imported by the server of `workers`: loads the code of a fit, or compiles it on a machine that has none yet.
+
+A small fit does it, since machine code is made for the arrays that it meets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+
+import numpy as np
+
+from shapespace.batch.workers import WARM_UP
+from shapespace.compiled import on_compiling
+from shapespace.errors import ShapespaceError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.residual import residual_modes
+from shapespace.fit.settings import ResidualSettings
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import Mesh
+
+COMPILING = "shapespace: compiling, once on this machine; this takes a while ..."
+
+
+def tell_compiling() -> None:
+    """Say on standard error why the user waits."""
+    print(COMPILING, file=sys.stderr, flush=True)
+
+
+def warm_up(*, tell: bool) -> None:
+    """Fit a small model to small surfaces and to points, from no start; with `tell` say so if that compiles."""
+    with on_compiling(tell_compiling if tell else lambda: None):
+        _small_fits()
+
+
+def _small_fits() -> None:
+    model = ShapeModel.fit([_hill(20, seed) for seed in range(8)], gauge="shape", align=False)
+    few = _hill(10, 9)
+    upside_down = Mesh(few.vertices @ np.diag([1.0, -1.0, -1.0]), few.faces)
+    for raw in (upside_down, _hill(45, 9), Mesh(_hill(45, 9).vertices)):
+        # So small a scan may be refused, and says nothing of those to come.
+        with contextlib.suppress(ShapespaceError):
+            _ = fit_scan(model, raw, FitConfig(max_iterations=20)).distances
+    residual_modes(model, ResidualSettings(count=5))
+
+
+def _hill(side: int, seed: int) -> Mesh:
+    """Return a lopsided hill over a square of 100 mm; `seed` draws its shape."""
+    u, v = np.meshgrid(*2 * [np.linspace(-1, 1, side)], indexing="ij")
+    a, b, c = np.random.default_rng(seed).normal(1, 0.2, 3)
+    z = 50 * a * np.exp(-4 * ((u - 0.3) ** 2 + v**2)) + 20 * b * np.exp(-9 * (u**2 + (v - 0.5) ** 2)) + 5 * c * u * v
+    at = np.arange(side * side).reshape(side, side)
+    p, q, r, s = (corner.ravel() for corner in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, s], axis=1)]).astype(np.int32)
+    return Mesh(np.stack([50 * u, 50 * v, z], axis=2).reshape(-1, 3), faces)
+
+
+if how := os.environ.get(WARM_UP):
+    # What fails here is said by the fits to come, and by name.
+    with contextlib.suppress(Exception):
+        warm_up(tell=how == "tell")

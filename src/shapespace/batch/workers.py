@@ -1,0 +1,104 @@
+"""Processes that fit: one server loads the code once, and each worker is a copy of it with a model of its own.
+
+This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Generator
+from typing import TYPE_CHECKING
+
+from shapespace.errors import FitError
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
+WARM_UP = "SHAPESPACE_WARM_UP"
+"""Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def may_tell(*, quiet: bool) -> bool:
+    """Return whether progress may be told on standard error: somebody is there, and has not asked for quiet."""
+    return not quiet and sys.stderr.isatty()
+
+
+def context() -> ForkServerContext | SpawnContext:
+    """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
+    # Apple's BLAS does not survive a fork, and Windows has none.
+    if sys.platform == "linux":
+        return multiprocessing.get_context("forkserver")
+    return multiprocessing.get_context("spawn")
+
+
+def start_loading(*, tell: bool) -> None:
+    """Load the code of the workers in the background; where they start from nothing, see that it is compiled.
+
+    Args:
+        tell: whether a line on standard error may say that the code is being compiled.
+    """
+    if sys.platform != "linux":
+        from shapespace.batch.warm import warm_up
+
+        warm_up(tell=tell)
+        return
+    from multiprocessing import forkserver  # not on Windows
+
+    # One worker is one core: threads of BLAS would spread it over all.
+    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet"}
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        with interrupts_ignored():
+            forkserver.set_forkserver_preload(["shapespace.batch.warm"])
+            forkserver.ensure_running()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def wait_until_loaded() -> None:
+    """Return when workers start at once; Ctrl-C is heard until then.
+
+    Raises:
+        FitError: no process can be started.
+    """
+    if sys.platform != "linux":
+        return
+    try:
+        first = context().Process(target=_nothing)
+        first.start()
+        first.join()
+    except (EOFError, OSError) as error:
+        raise FitError("The system does not let worker processes start; fit with --jobs 1.") from error
+
+
+def _nothing() -> None:
+    pass
+
+
+@contextlib.contextmanager
+def interrupts_ignored() -> Generator[None]:
+    """Let processes that start in this block inherit deafness to Ctrl-C: stopping them is the parent's job."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
