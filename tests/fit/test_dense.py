@@ -135,18 +135,35 @@ def test_a_crumpled_patch_does_not_fold_the_surface() -> None:
     surface = dense(Mesh(scan.vertices + crumpled, scan.faces, name="crumpled.ply"), reckless)
     assert surface.damped > 0
     assert turned(fitted(), surface.vertices_scan_mm) == 0
+    assert not (against_neighbours(surface.vertices_scan_mm) & ~against_neighbours(fitted())).any()
 
 
-def test_unfolding_holds_back_only_where_triangles_turn() -> None:
+def against_neighbours(x: FloatArray) -> np.ndarray:
+    """Return (F,) True for triangles that face away from the surface at one of their corners; the slow way."""
+    faces = model().faces
+    normals = vertex_normals(Mesh(x, faces))
+    return (np.einsum("fkd,fd->fk", normals[faces], face_vectors(x, faces)) <= 0).any(axis=1)
+
+
+@pytest.mark.parametrize("step", [(0.0, 30.0, 10.0), (0.0, 0.0, 25.0), (6.0, 12.0, 0.0)])
+def test_unfolding_holds_back_only_where_triangles_fold(step: tuple[float, float, float]) -> None:
     topology, start = prepare(model()).topology, fitted()
     moved = start + 0.1
     tip = int(start[:, 2].argmax())
-    moved[tip] -= [0.0, 30.0, 10.0]
-    assert turned(start, moved) > 0
+    moved[tip] -= step
+    assert turned(start, moved) > 0 or against_neighbours(moved).any()
     kept, held = unfolded(start, start, moved, topology, SETTINGS.turn_cosine)
-    assert turned(start, kept) == 0
+    assert turned(start, kept) == 0 and not (against_neighbours(kept) & ~against_neighbours(start)).any()
     assert held[tip] and held.sum() < 60
     assert np.array_equal(kept[~held], moved[~held])
+
+
+@pytest.mark.parametrize("roughness_mm", [3.0, 300.0])
+def test_unfolding_always_ends_without_a_fold(roughness_mm: float) -> None:
+    start = fitted()
+    moved = start + np.random.default_rng(4).normal(0, roughness_mm, start.shape)
+    kept, _ = unfolded(start, start, moved, prepare(model()).topology, SETTINGS.turn_cosine)
+    assert turned(start, kept) == 0 and not (against_neighbours(kept) & ~against_neighbours(start)).any()
 
 
 def test_a_scan_coarser_than_the_model_is_met_between_its_vertices() -> None:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import FitError
-from shapespace.fit.field_kernels import less_sag, solve_field
+from shapespace.fit.field_kernels import compare_triangles, less_sag, solve_field
 from shapespace.fit.kernels import gather_into, meet_into, normals_into, walk_into
 from shapespace.fit.moving_model import Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
@@ -50,7 +50,7 @@ class DenseSurface:
         seen: (V,) False where the scan shows nothing and the model stands in.
         noise_mm: of the scan as found, mm of the model's frame.
         unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
-        damped: how many vertices were held back so that no triangle turns over.
+        damped: how many vertices were held back so that no triangle folds.
     """
 
     vertices_scan_mm: FloatArray
@@ -69,7 +69,7 @@ def dense_surface(
 ) -> DenseSurface:
     """Return the surface `vertices_scan_mm` moved onto the scan where the scan shows it.
 
-    No triangle turns over: each keeps facing to the side it faced in `vertices_scan_mm`.
+    No triangle folds: none turns over, or against its neighbours, that does not in `vertices_scan_mm`.
 
     Args:
         model: gives the triangles, and the mean on which the field is smooth.
@@ -294,11 +294,13 @@ def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
 def unfolded(
     start: FloatArray, base: FloatArray, moved: FloatArray, topology: Topology, turn_cosine: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Return `moved` (V, 3) held back towards `base` where triangles would turn over, and (V,) where that is.
+    """Return `moved` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.
+
+    A triangle folds when it turns over, or against its neighbours, and did not do so in `start`.
 
     Args:
-        start: (V, 3) the surface whose triangles face the right way.
-        base: (V, 3) one on which none is turned.
+        start: (V, 3) the surface to compare with.
+        base: (V, 3) one on which nothing is folded.
         moved: (V, 3) the one that is wanted.
         topology: its triangles.
         turn_cosine: cosine of the angle that no triangle turns further than.
@@ -306,21 +308,28 @@ def unfolded(
     faces = topology.faces
     before = face_vectors(start, faces)
     before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-300)
+    corners, normals = np.empty((len(faces), 9)), np.empty_like(start)
+    cosine, was_even, even = np.empty(len(faces)), np.empty(len(faces), np.bool_), np.empty(len(faces), np.bool_)
+    normals_into(start, faces, corners, normals)
+    compare_triangles(start, normals, faces, before, cosine, was_even)
     share, out, halvings = np.ones(len(start)), moved, 0
+    can_turn = cosine > turn_cosine  # all but those without area
     while True:
-        now = face_vectors(out, faces)
-        turned = np.einsum("fd,fd->f", before, now) < turn_cosine * np.linalg.norm(now, axis=1)
-        turned &= share[faces].max(axis=1) > 0.0
-        if not turned.any():
+        normals_into(out, faces, corners, normals)
+        compare_triangles(out, normals, faces, before, cosine, even)
+        folded = (can_turn & (cosine < turn_cosine)) | (was_even & ~even)
+        if not folded.any():
             return out, share < 1.0
-        held = np.zeros(len(start), dtype=np.bool_)
-        held[faces[turned]] = True
-        beside = np.zeros(len(start), dtype=np.bool_)
+        held, beside = np.zeros(len(start), dtype=np.bool_), np.zeros(len(start), dtype=np.bool_)
+        held[faces[folded]] = True
         beside[faces[held[faces].any(axis=1)]] = True
         halvings += 1
-        # From then on fewer vertices move with every turn, so this ends.
-        share[held] *= 0.5 if halvings <= _HALVINGS else 0.0
-        share[beside & ~held] *= 0.75
+        if halvings <= _HALVINGS:
+            share[held] *= 0.5
+            share[beside & ~held] *= 0.75
+        else:
+            # A triangle is as it is by its neighbours' corners, so with all of them on `base` it is no longer folded.
+            share[beside] = 0.0
         out = base + share[:, None] * (moved - base)
 
 

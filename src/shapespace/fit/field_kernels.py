@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.compiled import compiled
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray
 
 
 @compiled
@@ -40,6 +40,42 @@ def less_sag(
             over += wb * normals[b, k] * (vertices[b, k] - p)
             over += wc * normals[c, k] * (vertices[c, k] - p)
         residual[i] += 0.5 * over
+
+
+@compiled
+def compare_triangles(
+    vertices: FloatArray,
+    normals: FloatArray,
+    faces: IntArray,
+    before: FloatArray,
+    cosine: FloatArray,
+    even: BoolArray,
+) -> None:
+    """Say how far triangles have turned, and which agree with the surface around them.
+
+    Args:
+        vertices: (V, 3),
+        normals: (V, 3) unit.
+        faces: (F, 3).
+        before: (F, 3) their unit normals before.
+        cosine: (F,) to be written: of the angle between then and now; 0 without area.
+        even: (F,) to be written: whether each lies within 90 degrees of the normals at its corners.
+    """
+    n = np.empty(3)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        length, along = 0.0, 0.0
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            n[k] = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
+            length += n[k] * n[k]
+            along += n[k] * before[f, k]
+        cosine[f] = along / np.sqrt(length) if length > 0.0 else 0.0
+        even[f] = True
+        for corner in range(3):
+            v = faces[f, corner]
+            if n[0] * normals[v, 0] + n[1] * normals[v, 1] + n[2] * normals[v, 2] <= 0.0:
+                even[f] = False
 
 
 @compiled
