@@ -25,7 +25,7 @@ contracts: $(READY)
 check: lint types contracts test
 
 bench: $(READY)
-	$(BIN)/python benchmarks/pca.py
+	set -e; for name in pca accuracy speed memory throughput; do $(BIN)/python benchmarks/$$name.py; done
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -34,4 +34,4 @@ $(READY): pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) build demo-out .pytest_cache .ruff_cache
+	rm -rf $(VENV) build demo-out bench-out .pytest_cache .ruff_cache
