@@ -7,6 +7,7 @@ import pytest
 
 from shapespace.fit.fit import METHODS, FitConfig
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.start import Start
 from shapespace.fit.state import IcpState
 from synthetic_shapes import blob_model, raw_scan, similarity
 
@@ -17,7 +18,7 @@ def states(name: str, **settings: object) -> list[IcpState]:
     T = similarity(degrees=5.0, shift=2.0)
     raw = raw_scan(Z, T)
     config = FitConfig(method=name, **settings)  # type: ignore[arg-type]
-    return list(METHODS[name](blob_model(), ScanTarget(raw.scan), T, config))
+    return list(METHODS[name](blob_model(), ScanTarget(raw.scan), Start(T, "given", np.nan), config))
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -9,6 +9,7 @@ import pytest
 
 from shapespace.fit.fit import FitConfig, paper_method
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.start import Start
 from shapespace.types import Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity
 
@@ -32,7 +33,7 @@ def test_both_take_the_same_steps_to_the_same_coefficients(plain: ModuleType, se
     raw = raw_scan(z, similarity(seed, 12.0, 1.1), vertices=5000, model_vertices=1500, noise_mm=0.2)
     start = Similarity(1.0, np.eye(3), raw.scan.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0))
     config = FitConfig(scale="free", max_iterations=200)
-    states = list(paper_method(model, ScanTarget(raw.scan), start, config))
+    states = list(paper_method(model, ScanTarget(raw.scan), Start(start, "given", np.nan), config))
     scale, R, T, b, iterations = plain.fit(
         model.mean_vertices, model.basis, raw.scan.vertices, 1.0, np.eye(3), start.translation, max_iterations=200
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Literal, TypeAlias
@@ -20,6 +20,7 @@ from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState, StopRule
+from shapespace.fit.trust import doubts_of_robust, start_evidence
 from shapespace.geometry.closest import ENGINES, ClosestPointEngine
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
@@ -96,12 +97,12 @@ class FitConfig:
         return StopRule(self.stop_rate, self.stop_motion_mm, self.max_iterations)
 
 
-Method: TypeAlias = Callable[[ShapeModel, ScanTarget, Similarity, FitConfig], Generator[IcpState, None, Fitted]]
+Method: TypeAlias = Callable[[ShapeModel, ScanTarget, Start, FitConfig], Generator[IcpState, None, Fitted]]
 """(model, scan, start, config) -> the states it goes through, and where it ended."""
 
 
 def paper_method(
-    model: ShapeModel, scan: ScanTarget, T_scan_model: Similarity, config: FitConfig
+    model: ShapeModel, scan: ScanTarget, start: Start, config: FitConfig
 ) -> Generator[IcpState, None, Fitted]:
     """Yield the states of the paper's modified ICP: phase 1, then phase 2 from where it ended."""
     model = model if config.modes is None else model.truncate(config.modes)
@@ -110,24 +111,26 @@ def paper_method(
         fits_scale(model, config),
         scan.search("vertices" if config.search == "auto" else config.search),
     )
-    state = None
+    T_scan_model, state = start.T_scan_model, None
     for state in similarity_icp(model, engine, T_scan_model, stop, with_scale=with_scale):
         T_scan_model = state.T_scan_model
         yield state
     for state in shape_icp(model, engine, T_scan_model, stop, with_scale=with_scale):
         yield state
     assert state is not None
+    b_stddev = posterior_stddev(model, float(state.rms_mm**2) / 3.0)
     return Fitted(
         T_scan_model=state.T_scan_model,
         b=state.b,
-        b_stddev=posterior_stddev(model, float(state.rms_mm**2) / 3.0),
+        b_stddev=b_stddev,
+        shrinkage=1.0 - (b_stddev / model.stddev) ** 2,
         vertices_scan_mm=state.T_scan_model.apply(model.reconstruct(state.b)),
         rms_mm=state.rms_mm,
     )
 
 
 def robust_method(
-    model: ShapeModel, scan: ScanTarget, T_scan_model: Similarity, config: FitConfig
+    model: ShapeModel, scan: ScanTarget, start: Start, config: FitConfig
 ) -> Generator[IcpState, None, Fitted]:
     """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together."""
     from shapespace.fit.robust import robust_icp  # compiled
@@ -135,7 +138,7 @@ def robust_method(
     return robust_icp(
         model,
         scan,
-        T_scan_model,
+        start,
         config.robust,
         with_scale=fits_scale(model, config),
         modes=config.modes,
@@ -204,7 +207,7 @@ def _fit_scan(
     history: list[IcpState] = []
     ended: dict[int, tuple[IcpState, float]] = {}
     try:
-        states = METHODS[config.method](model, target, start.T_scan_model, config)
+        states = METHODS[config.method](model, target, start, config)
         while True:
             state = next(states)
             history.append(state)
@@ -234,8 +237,12 @@ def _fit_scan(
     if config.dense:
         stages["dense"] = _dense_stage(model, target, T_mm_scan.inverse(), fitted, config)
     dense_s = time.perf_counter() - dense_from
-    start_scale = start.T_scan_model.scale / mm
-    status, reason = _verdict(model, stages, start_scale, ended[1][0], ended[2][0], config)
+    evidence = {**fitted.evidence, **start_evidence(start)} if config.method == "robust" else dict(fitted.evidence)
+    if config.method == "robust":
+        against = doubts_of_robust(evidence)
+    else:
+        against = doubts(model, stages, start.T_scan_model.scale / mm)
+    status, reason = _verdict(against, ended[1][0], ended[2][0], config)
     clock.append(time.perf_counter())
     return FitResult(
         scan_name=scan.name,
@@ -245,6 +252,7 @@ def _fit_scan(
         mm_per_scan_unit=mm,
         b=fitted.b,
         b_stddev=fitted.b_stddev,
+        shrinkage=fitted.shrinkage,
         z=fitted.b / model.stddev[: len(fitted.b)],
         stages=stages,
         history=history,
@@ -255,6 +263,7 @@ def _fit_scan(
             "version": __version__,
         },
         start=start.how,
+        evidence=evidence,
         notes=[
             *(f"{finding.what} {finding.action}".strip() for finding in findings),
             *_far_out(model, fitted.b),
@@ -345,15 +354,7 @@ def _distances(
     return surface_distances(placed, scan_mm, scan_engine=engine, mm_per_length=1.0 / T.scale)
 
 
-def _verdict(
-    model: ShapeModel,
-    stages: Mapping[str, Stage],
-    start_scale: float,
-    phase_1: IcpState,
-    phase_2: IcpState,
-    config: FitConfig,
-) -> tuple[Status, str]:
-    against = doubts(model, stages, start_scale)
+def _verdict(against: Sequence[str], phase_1: IcpState, phase_2: IcpState, config: FitConfig) -> tuple[Status, str]:
     if against:
         return "doubtful", f"Do not trust this fit: {'; '.join(against)}."
     if "cap" in (phase_1.stopped, phase_2.stopped):

@@ -67,13 +67,16 @@ class FitResult:
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         mm_per_scan_unit: the scan's unit as found or given.
         b: (K,) coefficients, mm.
-        b_stddev: (K,) their standard deviation by the model's own noise, mm; not calibrated, mostly too small.
+        b_stddev: (K,) their standard deviation, mm. Of the robust method it is calibrated (docs/uncertainty.md); of the
+            paper's it goes by the model's own noise and is mostly too small.
+        shrinkage: (K,) in [0, 1]: near 1 the scan told the coefficient, near 0 only the model did.
         z: (K,) b in standard deviations of the model.
         stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
         history: every state the loop went through, in the scan's mm frame.
         method: the method that ran.
         config: every setting in effect, with the software version.
         start: how the start was found.
+        evidence: what the status goes by, by name; empty for the paper's method, which goes by the distances.
         notes: what was repaired or noticed in the scan.
         seconds: by part.
         model_hash: content hash of the model.
@@ -86,12 +89,14 @@ class FitResult:
     mm_per_scan_unit: float
     b: FloatArray
     b_stddev: FloatArray
+    shrinkage: FloatArray
     z: FloatArray
     stages: Mapping[str, Stage]
     history: Sequence[IcpState]
     method: str
     config: Mapping[str, Any]
     start: str
+    evidence: Mapping[str, float]
     notes: Sequence[str]
     seconds: Mapping[str, float]
     model_hash: str

@@ -24,9 +24,11 @@ from scipy.spatial.transform import Rotation
 from shapespace.errors import FitError
 from shapespace.fit.kernels import Float32Array, gather_into, rows_into
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
+from shapespace.fit.posterior import posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
+from shapespace.fit.start import Start
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.weights import WEIGHTS, spread, tails
 from shapespace.geometry.closest import ClosestPoints, on_boundary
@@ -41,6 +43,8 @@ _FIXED = 1e12
 _MOTION_STRIDE = 7
 _FEWEST_MATCHES = 30
 _FLICKER = 10.0
+_CLEARLY_BETTER = 0.95
+_FARTHEST = 5.0
 _IN_SPAN = 1e-9
 """What is left of a pose parameter outside the modes is rounding below this share."""
 
@@ -87,11 +91,11 @@ class JointFit:
         with_scale: bool,
     ) -> None:
         self.prepared, self.target, self.settings, self.with_scale = prepared, target, settings, with_scale
-        self.T, self._start_scale = T_scan_model, T_scan_model.scale
+        self.T, self.start_scale = T_scan_model, T_scan_model.scale
         self.stddev = np.array(prepared.model.stddev)
         self.b = np.zeros(len(self.stddev))
         self.surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        self.sigma_mm = self.rms_mm = self.motion_mm = float("inf")
+        self.sigma_mm = self.width_mm = self.rms_mm = self.motion_mm = float("inf")
         self.hessian = np.zeros((0, 0))
         self.seen_at = self.pull_at = np.zeros(0)
         self.scan: Matches | None = None
@@ -167,6 +171,7 @@ class JointFit:
         self.sigma_mm = max(spread(counted), s.least_spread_mm)
         weight = WEIGHTS[s.weight]
         width = self.sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(counted, self.sigma_mm) ** 2))
+        self.width_mm = width
         far = s.reach * width + s.reach_mm
         w = weight(scan.residual, width) * weight(scan.distance, far) * scan.allowed
         v = weight(vertices.residual, width) * weight(vertices.distance, far) * vertices.allowed
@@ -189,18 +194,23 @@ class JointFit:
         rows, gradient = np.empty((len(seen_at), POSE + modes), dtype=np.float32), np.zeros(POSE + modes)
         count = rows_into(surface.vertices, surface.normals, surface.modes, modes, seen_at, pull_at, rows, gradient)
         hessian = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)
-        rho = s.prior * self.sigma_mm**2
+        rho = self.prior * self.sigma_mm**2
         precision = rho / self.stddev[:modes] ** 2
         index = np.arange(POSE, POSE + modes)
         hessian[index, index] += precision
         gradient[POSE:] += precision * self.b[:modes]
         if self.with_scale:
             hessian[6, 6] += rho / s.scale_stddev**2
-            gradient[6] += rho / s.scale_stddev**2 * np.log(self.T.scale / self._start_scale)
+            gradient[6] += rho / s.scale_stddev**2 * np.log(self.T.scale / self.start_scale)
         else:
             hessian[6, 6], gradient[6] = _FIXED * (hessian[6, 6] + 1.0), 0.0
         self.hessian = hessian
         self._take(-_solve(hessian, gradient, self.target.mesh.name), modes)
+
+    @property
+    def prior(self) -> float:
+        """How many matches tell as much as one independent one."""
+        return self.settings.prior if len(self.b) == self.prepared.model.n_modes else self.settings.beyond_prior
 
     def _take(self, delta: FloatArray, modes: int) -> None:
         T, x = self.T, self.surface.vertices
@@ -214,6 +224,32 @@ class JointFit:
             self.surface.deform(self.b)
         after = self.T.apply(self.surface.vertices[::_MOTION_STRIDE])
         self.motion_mm = float(np.linalg.norm(after - before, axis=1).max()) / T.scale
+
+    def prefer(self, start: Start, level: Level) -> None:
+        """Do `level` again from `start` with its coefficients, and go on from there if that matches clearly better."""
+        free = len(self.b) if level.modes is None else min(level.modes, len(self.b))
+        own, own_cost = (self.T, self.b.copy()), self.mismatch()
+        b = np.zeros(len(self.b))
+        b[: min(len(start.b), free)] = start.b[:free]
+        self._place(start.T_scan_model, b)
+        self.begin(level)
+        for _ in range(level.iterations):
+            self.step(free)
+            if self.motion_mm < level.stop_motion_mm:
+                break
+        if self.mismatch() > _CLEARLY_BETTER * own_cost:
+            self._place(*own)
+
+    def _place(self, T: Similarity, b: FloatArray) -> None:
+        self.T, self.b = T, b
+        self.surface.deform(b)
+
+    def mismatch(self) -> float:
+        """Return the mean distance both ways, mm, of which none counts more than the reach."""
+        self.match()
+        scan, vertices, most = self.scan, self.vertices, _FARTHEST * self.settings.reach_mm
+        assert scan is not None and vertices is not None
+        return float(np.minimum(scan.distance, most).mean() + np.minimum(vertices.distance, most).mean())
 
     def state(self, phase: int, iteration: int, stopped: str | None = None) -> IcpState:
         """Return where the fit is."""
@@ -242,7 +278,7 @@ class JointFit:
 def robust_icp(
     model: ShapeModel,
     target: ScanTarget,
-    T_scan_model: Similarity,
+    start: Start,
     settings: RobustSettings,
     *,
     with_scale: bool = True,
@@ -254,7 +290,8 @@ def robust_icp(
     Args:
         model: mean and modes, with triangles.
         target: the scan in its mm frame.
-        T_scan_model: the start.
+        start: where to begin; where it has coefficients, such as those of an open mouth, there is a second start with
+            them, and the one of the two that matches better after the first modes goes on.
         settings: of the method.
         with_scale: False holds the scale of the start.
         modes: how many coefficients to report; None for all. The fit uses all in any case: modes left out of the fit
@@ -266,10 +303,11 @@ def robust_icp(
         FitError: hardly anything matches, or the fit diverged.
     """
     prepared = prepare(model)
-    fit = JointFit(prepared, target, settings, T_scan_model, with_scale=with_scale)
+    fit = JointFit(prepared, target, settings, start.T_scan_model, with_scale=with_scale)
     fit.begin(settings.levels[0])
     fit.match()
     left_mm2 = 0.0
+    first = next(number for number, level in enumerate(settings.levels) if level.modes != 0)
     phase, iteration, state = 1, 0, fit.state(1, 0)
     for number, level in enumerate((*settings.levels, settings.beyond)):
         if number == len(settings.levels):
@@ -296,24 +334,22 @@ def robust_icp(
             state = fit.state(phase, iteration, "rate" if still else "cap")
             if settled:
                 break
+        if number == first and len(start.b) and iteration < max_iterations:
+            fit.prefer(start, level)
     yield state
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     T, b = fit.T, fit.b
     if len(b) > wanted:
         T, b = in_span(prepared, fit.surface.vertices, T, wanted, with_scale=with_scale)
-    covariance = fit.sigma_mm**2 * np.linalg.inv(fit.hessian)
-    variance = covariance.diagonal()[POSE : POSE + len(b)]
+    known = posterior(fit, T, b, float(np.sqrt(max(left_mm2, 0.0))))
     return Fitted(
         T_scan_model=T,
         b=b,
-        b_stddev=np.sqrt(np.minimum(variance, model.stddev[: len(b)] ** 2)),
+        b_stddev=known.b_stddev,
+        shrinkage=known.shrinkage,
         vertices_scan_mm=fit.T.apply(fit.surface.vertices),
         rms_mm=fit.rms_mm,
-        evidence={
-            "spread_mm": fit.sigma_mm,
-            "beyond_model_mm": float(np.sqrt(max(left_mm2, 0.0))),
-            "seen_share": float((fit.seen_at > 0).mean()),
-        },
+        evidence=known.evidence,
     )
 
 

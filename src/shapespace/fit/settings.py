@@ -62,7 +62,8 @@ class RobustSettings:
         reach_mm: this, mm, count little.
         vertex_share: weight of a vertex's match beside that of a scan point's, for scans at least as fine as the
             model; less for coarser ones, whose flat triangles cut the corners.
-        prior: how many matches tell as much as one independent one.
+        prior: how many matches tell as much as one independent one,
+        beyond_prior: the same beside modes that the model lacks.
         scale_stddev: of log s about the start.
         seed: of the subsamples.
     """
@@ -86,7 +87,8 @@ class RobustSettings:
     reach: float = 4.0
     reach_mm: float = 2.0
     vertex_share: float = 0.3
-    prior: float = 1.0
+    prior: float = 0.3
+    beyond_prior: float = 1.0
     scale_stddev: float = 0.15
     seed: int = 0
 

@@ -42,6 +42,7 @@ class Fitted:
         T_scan_model: from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm.
         b_stddev: (K,) their standard deviation, mm.
+        shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
         vertices_scan_mm: (V, 3) the fitted surface in the scan's mm frame; it may leave the span of the model.
         rms_mm: RMS distance of the matched vertices from the scan, mm of the model's frame.
         evidence: what the verdict goes by, by name.
@@ -50,6 +51,7 @@ class Fitted:
     T_scan_model: Similarity
     b: FloatArray
     b_stddev: FloatArray
+    shrinkage: FloatArray
     vertices_scan_mm: FloatArray
     rms_mm: float
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
