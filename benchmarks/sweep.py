@@ -118,11 +118,8 @@ def main() -> None:
     for row in rows:
         mark = "**" if row["chosen"] else ""
         cells = [f"{row[case]:.2f}" for case in CASES_SWEPT]
-        lines.append(
-            f"| `{row['setting']}` | {mark}{row['value']}{mark} | {row['score']:.3f} | {row['james_m2s_median_mm']:.2f} | "
-            + " | ".join(cells)
-            + " |"
-        )
+        head = [f"`{row['setting']}`", f"{mark}{row['value']}{mark}", f"{row['score']:.3f}"]
+        lines.append("| " + " | ".join([*head, f"{row['james_m2s_median_mm']:.2f}", *cells]) + " |")
     table = "\n".join(lines)
     (arguments.out / "sweep.md").write_text(table + "\n")
     print(table)
