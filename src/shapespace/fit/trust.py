@@ -27,12 +27,14 @@ class _Input:
 
     Args:
         value: from the evidence; grows with what speaks against the fit.
+        least: where it lies for the clearest good fits; below it nothing more speaks for the fit.
         usual: its median over good fits.
         weight: in the score, of each unit above `usual`.
         says: the reason in words.
     """
 
     value: Callable[[Mapping[str, float]], float]
+    least: float
     usual: float
     weight: float
     says: Callable[[Mapping[str, float]], str]
@@ -50,30 +52,35 @@ def _log_share(share: float) -> float:
 _INPUTS = (
     _Input(
         lambda e: math.log(max(e["expected_error_mm"] / e["size_mm"], 1e-6)),
+        least=-6.5,
         usual=-4.49,
         weight=2.14,
         says=lambda e: f"its vertices are expected to be {e['expected_error_mm']:.1f} mm off",
     ),
     _Input(
         lambda e: math.log(max(e["spread_mm"] / e["size_mm"], 1e-6)),
+        least=-6.15,
         usual=-4.98,
         weight=1.61,
         says=lambda e: f"even the parts that match lie {e['spread_mm']:.1f} mm apart",
     ),
     _Input(
         lambda e: -_log_share(e["seen_share"]),
+        least=0.2,
         usual=0.675,
         weight=1.60,
         says=lambda e: f"only {100 * e['seen_share']:.0f} % of the model's vertices have a point of the scan",
     ),
     _Input(
         lambda e: -_log_share(e["model_matched_share"]),
+        least=0.06,
         usual=0.374,
         weight=1.54,
         says=lambda e: f"only {100 * e['model_matched_share']:.0f} % of the model lies on the scan",
     ),
     _Input(
         lambda e: math.log(max(e["z2"], 1e-6)),
+        least=-0.57,
         usual=-0.067,
         weight=2.41,
         says=lambda e: (
@@ -83,6 +90,7 @@ _INPUTS = (
     ),
     _Input(
         lambda e: math.log(max(e["z2_leading"], 1e-6)),
+        least=-0.7,
         usual=-0.056,
         weight=0.715,
         says=lambda e: (
@@ -92,6 +100,7 @@ _INPUTS = (
     ),
     _Input(
         lambda e: min(abs(e["log_scale"]), _MOST_LOG_SCALE),
+        least=0.0,
         usual=0.012,
         weight=4.31,
         says=lambda e: (
@@ -120,4 +129,4 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
 
 
 def _contributions(evidence: Mapping[str, float]) -> list[float]:
-    return [each.weight * (each.value(evidence) - each.usual) for each in _INPUTS]
+    return [each.weight * (max(each.value(evidence), each.least) - each.usual) for each in _INPUTS]
