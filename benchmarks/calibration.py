@@ -141,8 +141,9 @@ def main() -> None:
     rows: list[Coverage] = []
     for condition in CONDITIONS:
         if condition.name.startswith(options.only):
-            rows += measure(bench, condition, options.scans)
-            print(table(rows[-4:]), flush=True)
+            found = measure(bench, condition, options.scans)
+            print(table(found), flush=True)
+            rows += found
     about = {"split": split, "scans": options.scans, **trust.machine()}
     trust.write(options.out, f"calibration_{split}", table(rows), {**about, "rows": [asdict(row) for row in rows]})
 
