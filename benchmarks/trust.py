@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from cases import FAILED_MM, Bench, Scan, Split, error_mm, run
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
@@ -32,6 +33,7 @@ from shapespace import FitConfig, fit_scan
 from shapespace.datasets.ict import EXPRESSIONS
 from shapespace.datasets.simulated_scan import Collar, Hair, retriangulate, simulate_scan
 from shapespace.errors import ShapespaceError
+from shapespace.fit.trust import INPUTS
 from shapespace.geometry.surface import face_areas
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
@@ -280,6 +282,43 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def tune(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return offset, usual values and weights of the inputs of `shapespace.fit.trust` that judge `records` best.
+
+    A logistic regression with a small ridge on standardised inputs and no negative weights; the bound is where 5 % of
+    the good fits are doubted, each judged by the four fifths it is not in.
+    """
+    judged = [r for r in records if r["evidence"]]
+    raw = np.array([[max(i.value(r["evidence"]), i.least) for i in INPUTS] for r in judged])
+    wrong = np.array([r["wrong"] for r in judged])
+    usual, spread = np.median(raw[~wrong], axis=0), raw.std(axis=0)
+    inputs = np.column_stack([(raw - usual) / spread, np.ones(len(raw))])
+
+    def weights(rows: np.ndarray) -> np.ndarray:
+        x, sign = inputs[rows], np.where(wrong[rows], -1.0, 1.0)
+
+        def loss(t: np.ndarray) -> tuple[float, np.ndarray]:
+            margin = sign * (x @ t)
+            slope = x.T @ (sign / (1 + np.exp(-margin))) + np.append(t[:-1], 0.0)
+            return float(np.logaddexp(0, margin).sum() + 0.5 * (t[:-1] ** 2).sum()), slope
+
+        bounds = [(0, None)] * len(INPUTS) + [(None, None)]
+        return minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
+
+    fold = np.arange(len(raw)) % 5
+    unseen = np.zeros(len(raw))
+    for k in range(5):
+        unseen[fold == k] = inputs[fold == k] @ weights(fold != k)
+    bound = float(np.quantile(unseen[~wrong], 0.95))
+    t = weights(np.full(len(raw), True))
+    passed = float((unseen[wrong] <= bound).mean())
+    lines = [
+        f"offset {t[-1] - bound:.2f}; cross-validated: 5 % of good fits doubted, {100 * passed:.1f} % of wrong pass"
+    ]
+    lines += [f"usual={u:.3f}, weight={w / s:.3f}" for u, w, s in zip(usual, t, spread, strict=False)]
+    return "\n".join(lines)
+
+
 def _share(part: int, whole: int) -> str:
     return f"{part} ({100 * part / whole:.1f} %)" if whole else "0"
 
@@ -309,7 +348,11 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("bench-out"))
     parser.add_argument("--cache", type=Path)
+    parser.add_argument("--tune", type=Path, metavar="TRUST_DEV.json", help="print weights that judge these fits best")
     options = parser.parse_args()
+    if options.tune:
+        print(tune(json.loads(options.tune.read_text("utf-8"))["fits"]))
+        return
     begun = (options.split, options.cache)
     with ProcessPoolExecutor(options.jobs, get_context("spawn"), prepare, begun) as pool:
         outcomes = list(pool.map(judge, range(options.fits), chunksize=5))

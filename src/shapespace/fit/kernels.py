@@ -36,6 +36,18 @@ def normals_into(vertices: FloatArray, faces: IntArray, corners: FloatArray, nor
 
 
 @compiled
+def areas_into(corners: FloatArray, faces: IntArray, areas: FloatArray) -> None:
+    """Add to `areas` (V,) a third of the area of each triangle, corners (F, 9), at each of its vertices."""
+    for f in range(len(faces)):
+        ux, uy, uz = corners[f, 3] - corners[f, 0], corners[f, 4] - corners[f, 1], corners[f, 5] - corners[f, 2]
+        vx, vy, vz = corners[f, 6] - corners[f, 0], corners[f, 7] - corners[f, 1], corners[f, 8] - corners[f, 2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        third = np.sqrt(x * x + y * y + z * z) / 6.0
+        for k in range(3):
+            areas[faces[f, k]] += third
+
+
+@compiled
 def walk_into(
     points: FloatArray,
     vertex: IntArray,

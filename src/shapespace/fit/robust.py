@@ -118,7 +118,7 @@ class JointFit:
     def begin(self, level: Level) -> None:
         """Draw the points that `level` matches, and say where to look for them first."""
         rng, target = np.random.default_rng(self.settings.seed), self.target
-        points = _some(np.arange(len(target.mesh.vertices), dtype=np.int32), level.scan_points, rng)
+        points = target.draw(level.scan_points, rng)
         self._points_mm, self._normals = target.mesh.vertices[points], target.normals[points]
         self._asked = _some(self.surface.topology.used, level.vertices, rng)
         self._engine, self._near = target.engine if level.triangles else target.vertex_engine, None

@@ -9,7 +9,10 @@ import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, finest_engine
 from shapespace.geometry.surface import boundary_vertices
-from shapespace.types import BoolArray, FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+_ROUNDS = 4
+"""Of finding how much the larger areas must make up for vertices that are drawn for certain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +47,36 @@ class ScanTarget:
         return boundary_vertices(self.mesh)
 
     @cached_property
+    def _normals_and_areas(self) -> tuple[FloatArray, FloatArray]:
+        from shapespace.fit.kernels import areas_into, normals_into  # compiled
+
+        normals, areas = np.zeros(self.mesh.vertices.shape), np.zeros(len(self.mesh.vertices))
+        if self.mesh.faces is None:
+            return normals, np.ones(len(areas))
+        faces, corners = np.array(self.mesh.faces), np.empty((len(self.mesh.faces), 9))
+        normals_into(np.array(self.mesh.vertices), faces, corners, normals)
+        areas_into(corners, faces, areas)
+        return normals, areas
+
+    @property
     def normals(self) -> FloatArray:
         """(S, 3) unit normals at the vertices; zero where no triangle gives one."""
-        from shapespace.fit.kernels import normals_into  # compiled
+        return self._normals_and_areas[0]
 
-        normals = np.zeros(self.mesh.vertices.shape)
-        if self.mesh.faces is not None:
-            normals_into(
-                np.array(self.mesh.vertices), np.array(self.mesh.faces), np.empty((len(self.mesh.faces), 9)), normals
-            )
-        return normals
+    def draw(self, count: int | None, rng: np.random.Generator) -> IntArray:
+        """Return about `count` vertices, spread as evenly by area as that many can be; None for all.
+
+        Scanners and editors sample hair, rims and creases more densely; by number such parts would outvote the rest.
+        """
+        areas = self._normals_and_areas[1]
+        if count is None or count >= len(areas) or areas.sum() <= 0.0:
+            return np.arange(len(areas), dtype=np.int32)
+        areas = np.minimum(areas, areas.mean())  # what outliers pull into spikes has much area and says little
+        share = areas * (count / areas.sum())
+        for _ in range(_ROUNDS):
+            share *= count / np.minimum(1.0, share).sum()
+        reached = np.cumsum(np.minimum(1.0, share)) + rng.random()
+        return np.flatnonzero(np.diff(np.floor(reached), prepend=0.0) > 0).astype(np.int32)
 
     def normals_at(self, matches: ClosestPoints) -> FloatArray:
         """Return the normals (M, 3) at `matches`, interpolated and so not quite of unit length between vertices."""

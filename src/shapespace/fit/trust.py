@@ -22,7 +22,7 @@ _TOLD = 3
 
 
 @dataclass(frozen=True)
-class _Input:
+class Input:
     """One input of the score.
 
     Args:
@@ -49,36 +49,36 @@ def _log_share(share: float) -> float:
     return math.log(max(share, _LEAST_SHARE))
 
 
-_INPUTS = (
-    _Input(
+INPUTS = (
+    Input(
         lambda e: math.log(max(e["expected_error_mm"] / e["size_mm"], 1e-6)),
         least=-6.5,
         usual=-4.49,
         weight=2.14,
         says=lambda e: f"its vertices are expected to be {e['expected_error_mm']:.1f} mm off",
     ),
-    _Input(
+    Input(
         lambda e: math.log(max(e["spread_mm"] / e["size_mm"], 1e-6)),
         least=-6.15,
         usual=-4.98,
         weight=1.61,
         says=lambda e: f"even the parts that match lie {e['spread_mm']:.1f} mm apart",
     ),
-    _Input(
-        lambda e: -_log_share(e["seen_share"]),
-        least=0.2,
-        usual=0.675,
-        weight=1.60,
-        says=lambda e: f"only {100 * e['seen_share']:.0f} % of the model's vertices have a point of the scan",
+    Input(
+        lambda e: -_log_share(e["model_near_share"]),
+        least=0.02,
+        usual=0.15,
+        weight=2.0,
+        says=lambda e: f"only {100 * e['model_near_share']:.0f} % of the model has the scan anywhere near",
     ),
-    _Input(
+    Input(
         lambda e: -_log_share(e["model_matched_share"]),
         least=0.06,
         usual=0.374,
         weight=1.54,
         says=lambda e: f"only {100 * e['model_matched_share']:.0f} % of the model lies on the scan",
     ),
-    _Input(
+    Input(
         lambda e: math.log(max(e["z2"], 1e-6)),
         least=-0.57,
         usual=-0.067,
@@ -88,7 +88,7 @@ _INPUTS = (
             "average, where about 1 is usual"
         ),
     ),
-    _Input(
+    Input(
         lambda e: math.log(max(e["z2_leading"], 1e-6)),
         least=-0.7,
         usual=-0.056,
@@ -98,7 +98,7 @@ _INPUTS = (
             "deviations out on average, where about 1 is usual"
         ),
     ),
-    _Input(
+    Input(
         lambda e: min(abs(e["log_scale"]), _MOST_LOG_SCALE),
         least=0.0,
         usual=0.012,
@@ -123,10 +123,10 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     """
     if score(evidence) <= 0.0:
         return []
-    found = sorted(zip(_contributions(evidence), range(len(_INPUTS)), strict=True), reverse=True)
+    found = sorted(zip(_contributions(evidence), range(len(INPUTS)), strict=True), reverse=True)
     most = found[0][0]
-    return [_INPUTS[i].says(evidence) for part, i in found[:_TOLD] if part >= _TOLD_SHARE * most]
+    return [INPUTS[i].says(evidence) for part, i in found[:_TOLD] if part >= _TOLD_SHARE * most]
 
 
 def _contributions(evidence: Mapping[str, float]) -> list[float]:
-    return [each.weight * (max(each.value(evidence), each.least) - each.usual) for each in _INPUTS]
+    return [each.weight * (max(each.value(evidence), each.least) - each.usual) for each in INPUTS]
