@@ -69,8 +69,8 @@ class RobustSettings:
     """
 
     levels: tuple[Level, ...] = (
-        Level(0, 1_500, 1_000, False, 2, 2.0),
-        Level(10, 1_500, 1_000, False, 4, 2.0),
+        Level(0, 1_500, 1_000, False, 8, 1.0),
+        Level(10, 1_500, 1_000, False, 6, 1.0),
         Level(40, 2_500, 1_500, False, 2, 1.0),
         Level(None, 5_000, 2_000, False, 6, 0.2),
         Level(None, 20_000, 1_500, True, 15, 0.05),
