@@ -337,16 +337,19 @@ def robust_icp(
         if number == first and len(start.b) and iteration < max_iterations:
             fit.prefer(start, level)
     yield state
-    wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     T, b = fit.T, fit.b
-    if len(b) > wanted:
-        T, b = in_span(prepared, fit.surface.vertices, T, wanted, with_scale=with_scale)
+    if len(b) > model.n_modes:
+        T, b = in_span(prepared, fit.surface.vertices, T, model.n_modes, with_scale=with_scale)
+    # Modes that nobody asked for are no reason to doubt the fit, so the verdict is on all of them.
     known = posterior(fit, T, b, float(np.sqrt(max(left_mm2, 0.0))))
+    wanted = model.n_modes if modes is None else min(modes, model.n_modes)
+    if wanted < model.n_modes:
+        T, b = in_span(prepared, fit.surface.vertices, fit.T, wanted, with_scale=with_scale)
     return Fitted(
         T_scan_model=T,
         b=b,
-        b_stddev=known.b_stddev,
-        shrinkage=known.shrinkage,
+        b_stddev=known.b_stddev[:wanted],
+        shrinkage=known.shrinkage[:wanted],
         vertices_scan_mm=fit.T.apply(fit.surface.vertices),
         rms_mm=fit.rms_mm,
         evidence=known.evidence,
