@@ -13,7 +13,8 @@ from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
 GOOD: Mapping[str, float] = {
-    "expected_error_mm": 0.9, "size_mm": 80.0, "spread_mm": 0.55, "model_near_share": 0.9, "model_matched_share": 0.7,
+    "expected_error_mm": 0.9, "size_mm": 80.0, "spread_mm": 0.55, "model_near_share": 0.92, "seen_share": 0.5,
+    "scan_allowed_share": 0.94, "model_matched_share": 0.7,
     "z2": 1.0, "z2_leading": 1.0, "log_scale": 0.0,
 }  # fmt: skip
 
@@ -24,7 +25,7 @@ GOOD: Mapping[str, float] = {
         ("expected_error_mm", 6.0, "6.0 mm off"),
         ("spread_mm", 8.0, "8.0 mm apart"),
         ("model_near_share", 0.03, "3 % of the model has"),
-        ("model_matched_share", 0.02, "2 % of the model lies"),
+        ("seen_share", 0.02, "2 % of the model's vertices"),
         ("z2", 16.0, "4.0 standard deviations"),
         ("log_scale", np.log(3.0), "3.00 times"),
     ],
@@ -36,7 +37,11 @@ def test_each_fault_alone_is_doubted_and_named_first(name: str, value: float, sa
 
 def test_worse_evidence_never_makes_a_fit_more_trusted() -> None:
     for name in GOOD:
-        worse = -1 if name in ("model_near_share", "model_matched_share", "size_mm") else 1
+        worse = (
+            -1
+            if name in ("model_near_share", "seen_share", "scan_allowed_share", "model_matched_share", "size_mm")
+            else 1
+        )
         steps = [score({**GOOD, name: GOOD[name] * 2.0 ** (worse * k) + (0.2 * k if name == "log_scale" else 0)})
                  for k in range(4)]  # fmt: skip
         assert (np.diff(steps) > 0).all(), name
