@@ -30,6 +30,7 @@ class Input:
         least: where it lies for the clearest good fits; below it nothing more speaks for the fit.
         usual: its median over good fits.
         weight: in the score, of each unit above `usual`.
+        most: beyond this the fit is doubted whatever the rest says.
         says: the reason in words.
     """
 
@@ -37,6 +38,7 @@ class Input:
     least: float
     usual: float
     weight: float
+    most: float
     says: Callable[[Mapping[str, float]], str]
 
 
@@ -55,6 +57,7 @@ INPUTS = (
         least=-6.5,
         usual=-4.519,
         weight=1.293,
+        most=-3.0,
         says=lambda e: f"its vertices are expected to be {e['expected_error_mm']:.1f} mm off",
     ),
     Input(
@@ -62,6 +65,7 @@ INPUTS = (
         least=-6.15,
         usual=-4.975,
         weight=0.741,
+        most=-3.0,
         says=lambda e: f"even the parts that match lie {e['spread_mm']:.1f} mm apart",
     ),
     Input(
@@ -69,6 +73,7 @@ INPUTS = (
         least=0.02,
         usual=0.084,
         weight=1.827,
+        most=1.2,
         says=lambda e: f"only {100 * e['model_near_share']:.0f} % of the model has the scan anywhere near",
     ),
     Input(
@@ -76,6 +81,7 @@ INPUTS = (
         least=0.2,
         usual=0.688,
         weight=1.516,
+        most=3.5,
         says=lambda e: f"only {100 * e['seen_share']:.0f} % of the model's vertices have a point of the scan",
     ),
     Input(
@@ -83,6 +89,7 @@ INPUTS = (
         least=0.02,
         usual=0.061,
         weight=0.347,
+        most=2.5,
         says=lambda e: f"only {100 * e['scan_allowed_share']:.0f} % of the scan faces as the model does",
     ),
     Input(
@@ -90,6 +97,7 @@ INPUTS = (
         least=0.06,
         usual=0.373,
         weight=0.237,
+        most=3.5,
         says=lambda e: f"only {100 * e['model_matched_share']:.0f} % of the model lies on the scan",
     ),
     Input(
@@ -97,6 +105,7 @@ INPUTS = (
         least=-0.57,
         usual=0.023,
         weight=3.001,
+        most=2.2,
         says=lambda e: (
             f"the shape is implausible: its coefficients lie {math.sqrt(e['z2']):.1f} standard deviations out on "
             "average, where about 1 is usual"
@@ -107,6 +116,7 @@ INPUTS = (
         least=-0.7,
         usual=-0.047,
         weight=1.064,
+        most=2.5,
         says=lambda e: (
             f"the shape is implausible: its main coefficients lie {math.sqrt(e['z2_leading']):.1f} standard "
             "deviations out on average, where about 1 is usual"
@@ -117,6 +127,7 @@ INPUTS = (
         least=0.0,
         usual=0.010,
         weight=2.298,
+        most=0.7,
         says=lambda e: (
             f"the scan is {math.exp(e['log_scale']):.2f} times as large as the model, where about 1 is usual"
         ),
@@ -135,11 +146,13 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     Args:
         evidence: of `posterior` and `start_evidence`; lengths in mm of the model's frame.
     """
-    if score(evidence) <= 0.0:
+    parts = _contributions(evidence)
+    beyond = [i for i, each in enumerate(INPUTS) if each.value(evidence) > each.most]
+    if score(evidence) <= 0.0 and not beyond:
         return []
-    found = sorted(zip(_contributions(evidence), range(len(INPUTS)), strict=True), reverse=True)
-    most = found[0][0]
-    return [INPUTS[i].says(evidence) for part, i in found[:_TOLD] if part >= _TOLD_SHARE * most]
+    found = sorted(range(len(INPUTS)), key=lambda i: (i in beyond, parts[i]), reverse=True)
+    least = _TOLD_SHARE * parts[found[0]]
+    return [INPUTS[i].says(evidence) for i in found[:_TOLD] if i in beyond or parts[i] >= least]
 
 
 def _contributions(evidence: Mapping[str, float]) -> list[float]:
