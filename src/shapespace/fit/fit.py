@@ -86,7 +86,7 @@ class FitConfig:
             )
         if self.dense and self.method != "robust":
             raise InputError(
-                f"The dense stage goes on from the robust method's surface; leave dense out, or {self.method!r}."
+                f"The dense stage needs the robust method; leave out dense, or the method {self.method!r}."
             )
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
