@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.fit import rigid_kernels as kernels
 from shapespace.geometry.kdtree import KdTree
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.surface import rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -129,7 +129,7 @@ class _ModelSide:
     @staticmethod
     def of(model: ShapeModel) -> _ModelSide:
         mean = np.array(model.mean_vertices)
-        size = _rms_size(mean)
+        size = rms_size(mean)
         chosen = np.random.default_rng(0).permutation(_evenly(mean, _MODEL_CELL * size, size))
         points = np.ascontiguousarray(mean[chosen])
         normals = _normals(points) if model.faces is None else vertex_normals(Mesh(mean, model.faces))[chosen]
@@ -321,10 +321,6 @@ def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, s
             if len(kept) == limit:
                 break
     return kept
-
-
-def _rms_size(points: FloatArray) -> float:
-    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:

@@ -22,13 +22,13 @@ import numpy as np
 from shapespace.errors import FitError
 from shapespace.fit.field_kernels import compare_triangles, less_sag, solve_field
 from shapespace.fit.kernels import gather_into, meet_into, normals_into, walk_into
+from shapespace.fit.matching import VertexMatches, match_vertices, unexplained_variance, winding_of
 from shapespace.fit.moving_model import Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
-from shapespace.fit.weights import WEIGHTS, spread
-from shapespace.geometry.closest import ClosestPoints, on_boundary
+from shapespace.fit.weights import match_weights, spread
 from shapespace.geometry.kdtree import KdTree
-from shapespace.geometry.surface import face_vectors, vertex_areas
+from shapespace.geometry.surface import face_vectors, rms_size, vertex_areas
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -85,7 +85,7 @@ def dense_surface(
     topology, T = prepare(model).topology, T_scan_model
     start = T.inverse().apply(vertices_scan_mm)
     matching = _Matching(topology, target, T, start, settings)
-    size_mm = _size_mm(model.mean_vertices)
+    size_mm = rms_size(model.mean_vertices)
 
     matching.match(start)
     noise_mm, left_mm = matching.noise_mm(), matching.unexplained_mm()
@@ -137,7 +137,7 @@ class _Matching:
         self._cosine, self._covered = np.empty(len(chosen)), np.empty(len(chosen), dtype=np.bool_)
         self._corners = np.empty((len(topology.faces), 9))
         self.normals = np.empty_like(start)
-        self._near: ClosestPoints | None = None
+        self.vertices: VertexMatches | None = None
         self._winding = 0.0
 
     def match(self, x: FloatArray) -> None:
@@ -154,25 +154,15 @@ class _Matching:
         )  # fmt: skip
         less_sag(self.triangle, self.barycentric, x, self.normals, t.faces, self.residual)
         if self._winding == 0.0:
-            # A scan wound the wrong way round has all its normals reversed.
-            covered = self._cosine[self._covered]
-            self._winding = 1.0 if not len(covered) or np.median(covered) >= 0 else -1.0
+            self._winding = winding_of(self._cosine, self._covered)
         self.allowed = self._covered & (self._winding * self._cosine > self.settings.normal_cosine)
         if int(self.allowed.sum()) < _FEWEST_MATCHES:
             raise FitError(f"{self.target.mesh.name}: too little of it matches the fitted surface to go on from there.")
 
-        mesh = self.target.mesh
-        asked = t.used
-        self._near = near = self.target.engine.query(T.apply(x[asked]), self._near)
-        n = self.normals[asked]
-        to_scan = x[asked] - ((near.points - T.translation) @ T.rotation) / T.scale
-        self.vertex_allowed = ~on_boundary(near, mesh, self.target.rim)
-        if mesh.faces is not None:
-            n_scan = self.target.normals_at(near) @ T.rotation
-            cosine = self._winding * np.einsum("md,md->m", n, n_scan)
-            self.vertex_allowed &= cosine > self.settings.normal_cosine * np.linalg.norm(n_scan, axis=1)
-        self.vertex_residual = np.einsum("md,md->m", to_scan, n)
-        self.vertex_distance = near.distance / T.scale
+        self.vertices = match_vertices(
+            self.target, self.target.engine, T, x, self.normals, t.used, self.vertices and self.vertices.near,
+            winding=self._winding, normal_cosine=self.settings.normal_cosine,
+        )  # fmt: skip
 
     def spread_mm(self) -> float:
         """Return the spread of the residuals."""
@@ -188,22 +178,21 @@ class _Matching:
         return max(noise, self.settings.least_noise_mm)
 
     def unexplained_mm(self) -> float:
-        """Return the RMS of the residuals' part that is no noise: the product of two halves of the points, gathered."""
+        """Return the RMS of the residuals' part that is no noise."""
         w, _ = self._weights(self.spread_mm())
-        half = np.random.default_rng(self.settings.seed).random(len(w)) < 0.5
-        seen, pull = np.zeros((2, len(self.normals))), np.zeros((2, len(self.normals)))
-        for i, part in enumerate((half, ~half)):
-            gather_into(self.triangle, self.barycentric, self.topology.faces, w * part, self.residual, seen[i], pull[i])
-        both = np.minimum(seen[0], seen[1])
-        mean = pull / np.maximum(seen, 1e-12)
-        return float(np.sqrt(max((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12), 0.0)))
+        left = unexplained_variance(
+            self.triangle, self.barycentric, self.topology.faces, w, self.residual, len(self.normals),
+            self.settings.seed,
+        )  # fmt: skip
+        return float(np.sqrt(max(left, 0.0)))
 
     def _weights(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
-        s = self.settings
-        weight, width = WEIGHTS[s.weight], s.width * max(spread_mm, s.least_noise_mm)
+        s, vertices = self.settings, self.vertices
+        assert vertices is not None
+        width = s.width * max(spread_mm, s.least_noise_mm)
         far = s.reach * width + s.reach_mm
-        w = weight(self.residual, width) * weight(self.distance, far) * self.allowed
-        v = weight(self.vertex_residual, width) * weight(self.vertex_distance, far) * self.vertex_allowed
+        w = match_weights(s.weight, self.residual, self.distance, self.allowed, width, far)
+        v = match_weights(s.weight, vertices.residual, vertices.distance, vertices.allowed, width, far)
         return w, s.vertex_share * v
 
     def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -211,8 +200,9 @@ class _Matching:
         w, v = self._weights(spread_mm)
         seen_at, pull_at = np.zeros(len(self.normals)), np.zeros(len(self.normals))
         gather_into(self.triangle, self.barycentric, self.topology.faces, w, self.residual, seen_at, pull_at)
-        seen_at[self.topology.used] += v
-        pull_at[self.topology.used] += v * self.vertex_residual
+        assert self.vertices is not None
+        seen_at[self.vertices.vertex] += v
+        pull_at[self.vertices.vertex] += v * self.vertices.residual
         return seen_at / spread_mm**2, pull_at / spread_mm**2
 
 
@@ -331,7 +321,3 @@ def unfolded(
             # A triangle is as it is by its neighbours' corners, so with all of them on `base` it is no longer folded.
             share[beside] = 0.0
         out = base + share[:, None] * (moved - base)
-
-
-def _size_mm(x: FloatArray) -> float:
-    return float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean()))

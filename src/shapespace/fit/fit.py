@@ -21,7 +21,7 @@ from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState, StopRule
 from shapespace.fit.trust import doubts_of_robust, start_evidence
-from shapespace.geometry.closest import ENGINES, ClosestPointEngine
+from shapespace.geometry.closest import ENGINES
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.model.shape_model import ShapeModel
@@ -230,15 +230,17 @@ def _fit_scan(
         "initial": (ended[1][0].T_scan_model, ended[1][0].b),
         "final": (fitted.T_scan_model, fitted.b),
     }
+    T_scan_mm = T_mm_scan.inverse()
     stages = {
-        name: _stage(model, scan_mm, target.engine, T_mm_scan.inverse(), T, b) for name, (T, b) in moments.items()
+        name: Stage(T_scan_mm @ T, b, partial(_distances, model, target, T, b)) for name, (T, b) in moments.items()
     }
     dense_from = time.perf_counter()
     if config.dense:
-        stages["dense"] = _dense_stage(model, target, T_mm_scan.inverse(), fitted, config)
+        stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
     dense_s = time.perf_counter() - dense_from
-    evidence = {**fitted.evidence, **start_evidence(start)} if config.method == "robust" else dict(fitted.evidence)
+    evidence = dict(fitted.evidence)
     if config.method == "robust":
+        evidence |= start_evidence(start)
         against = doubts_of_robust(evidence)
     else:
         against = doubts(model, stages, start.T_scan_model.scale / mm)
@@ -331,27 +333,22 @@ def _dense_stage(
 
     T = fitted.T_scan_model
     dense = dense_surface(model, target, fitted.vertices_scan_mm, T, config.dense_settings)
-    placed = Mesh(dense.vertices_scan_mm, model.faces, name="model")
     return Stage(
         T_scan_mm @ T,
         fitted.b,
-        lambda: surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale),
+        partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
     )
 
 
-def _stage(
-    model: ShapeModel, scan_mm: Mesh, engine: ClosestPointEngine, T_scan_mm: Similarity, T: Similarity, b: FloatArray
-) -> Stage:
-    return Stage(T_scan_mm @ T, b, partial(_distances, model, scan_mm, engine, T, b))
-
-
 def _distances(
-    model: ShapeModel, scan_mm: Mesh, engine: ClosestPointEngine, T: Similarity, b: FloatArray
+    model: ShapeModel, target: ScanTarget, T: Similarity, b: FloatArray, vertices_scan_mm: FloatArray | None = None
 ) -> SurfaceDistances:
-    placed = Mesh(T.apply(model.reconstruct(b)), model.faces, name="model")
-    return surface_distances(placed, scan_mm, scan_engine=engine, mm_per_length=1.0 / T.scale)
+    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it."""
+    vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
+    placed = Mesh(vertices, model.faces, name="model")
+    return surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale)
 
 
 def _verdict(against: Sequence[str], phase_1: IcpState, phase_2: IcpState, config: FitConfig) -> tuple[Status, str]:

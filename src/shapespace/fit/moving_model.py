@@ -14,6 +14,9 @@ from shapespace.geometry.surface import boundary_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
+POSE = 7
+"""Pose parameters come before the coefficients: rotation, translation, scale."""
+
 
 @dataclass(frozen=True, eq=False)
 class Topology:
@@ -96,19 +99,19 @@ def prepare(model: ShapeModel) -> PreparedModel:
                 "The robust method needs a model with triangles; this one has none, so use --method paper."
             )
         modes = np.ascontiguousarray(model.basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
-        pose = _small_poses(model.mean_vertices)
+        pose = small_poses(model.mean_vertices)
         _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.basis.T @ pose)
     return _PREPARED[model]
 
 
-def _small_poses(x: FloatArray) -> FloatArray:
+def small_poses(x: FloatArray) -> FloatArray:
     """Return (3V, 7): how x (V, 3) moves by a rotation about each axis, a translation along each, and a scaling."""
-    pose = np.zeros((len(x), 3, 7))
+    pose = np.zeros((len(x), 3, POSE))
     pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
     pose[:, :, :3] -= pose[:, :, :3].transpose(0, 2, 1)
     pose[:, :, 3:6] = np.eye(3)
     pose[:, :, 6] = x
-    return pose.reshape(-1, 7)
+    return pose.reshape(-1, POSE)
 
 
 class MovingSurface:

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from shapespace.fit.moving_model import POSE, small_poses
+from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
 
 if TYPE_CHECKING:
     from shapespace.fit.robust import JointFit
 
-POSE = 7
 _HALF = 0.5
 _LEADING = 10
 _NEAR = 0.05
@@ -60,23 +61,27 @@ def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_mod
         beyond_model_mm: RMS of what the model left of the residuals.
     """
     model, x = fit.prepared.model, fit.surface.vertices
-    prior = np.concatenate([variance_of_new_shapes(model), fit.stddev[model.n_modes :] ** 2])
-    covariance = _covariance(fit, prior, temperature(fit, beyond_model_mm, _patches(fit)))
+    new_shapes = variance_of_new_shapes(model)
+    prior = np.concatenate([new_shapes, fit.stddev[model.n_modes :] ** 2])
+    w, v = fit.weigh()
+    matches, data = float(w.sum()) + float(v.sum()), data_hessian(fit)
+
+    def covariance_of(patches: float) -> FloatArray:
+        return _covariance(fit, data, prior, temperature(fit, matches, beyond_model_mm, patches))
+
+    covariance = covariance_of(_patches(fit))
     K = len(b)
     variance = np.clip(covariance.diagonal()[POSE : POSE + K], 0.0, prior[:K])
     reported = (fit.T.inverse() @ T_scan_model).apply(model.reconstruct(b))
     left_out = float(((x - reported) ** 2).sum(axis=1).mean())
-    if beyond_model_mm > 0:
-        # The verdict's weights were fitted to the darker view of what the model lacks.
-        doubted = _covariance(fit, prior, temperature(fit, beyond_model_mm, _FEWEST_PATCHES))
-    else:
-        doubted = covariance
+    # The verdict's weights were fitted to the darker view of what the model lacks.
+    doubted = covariance_of(_FEWEST_PATCHES) if beyond_model_mm > 0 else covariance
     expected = float((doubted * _gram(fit)).sum()) / len(x)
     return Posterior(
         np.sqrt(variance),
         1.0 - variance / prior[:K],
         {
-            **_matched(fit),
+            **_matched(fit, v, fit.b[: model.n_modes] ** 2 / new_shapes),
             "spread_mm": fit.sigma_mm,
             "beyond_model_mm": beyond_model_mm,
             "left_out_mm": float(np.sqrt(left_out)),
@@ -122,12 +127,11 @@ def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     return density, transform
 
 
-def temperature(fit: JointFit, beyond_model_mm: float, patches: float) -> float:
+def temperature(fit: JointFit, matches: float, beyond_model_mm: float, patches: float) -> float:
     """Return how many residuals tell as much as one independent one.
 
     Noise is nearly independent from match to match. What the model lacks is not: all matches of a patch share it.
     """
-    matches = float(sum(w.sum() for w in fit.weigh()))
     return _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / fit.sigma_mm) ** 2
 
 
@@ -153,11 +157,11 @@ def data_hessian(fit: JointFit) -> FloatArray:
     return whole
 
 
-def _covariance(fit: JointFit, prior: FloatArray, temperature: float) -> FloatArray:
+def _covariance(fit: JointFit, data: FloatArray, prior: FloatArray, temperature: float) -> FloatArray:
     """Return the joint covariance (7 + K + R, 7 + K + R) of pose (radians, mm, log scale) and coefficients (mm)."""
-    precision = data_hessian(fit) / temperature
+    precision, size_mm = data / temperature, rms_size(fit.prepared.model.mean_vertices)
     # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
-    unit = np.concatenate([np.full(3, 1.0), np.full(3, _size_mm(fit)), [fit.settings.scale_stddev], np.sqrt(prior)])
+    unit = np.concatenate([np.full(3, 1.0), np.full(3, size_mm), [fit.settings.scale_stddev], np.sqrt(prior)])
     scaled = precision * np.outer(unit, unit)
     scaled[np.diag_indices_from(scaled)] += np.concatenate([np.full(6, 1e-9), np.ones(len(unit) - 6)])
     inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(len(unit))))
@@ -166,20 +170,9 @@ def _covariance(fit: JointFit, prior: FloatArray, temperature: float) -> FloatAr
     return inverse * np.outer(unit, unit)
 
 
-def _size_mm(fit: JointFit) -> float:
-    x = fit.prepared.model.mean_vertices
-    return float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean()))
-
-
 def _gram(fit: JointFit) -> FloatArray:
     """Return (7 + K + R, 7 + K + R): inner products over the surface of what each parameter moves."""
-    x, modes = fit.surface.vertices, fit.surface.modes
-    pose = np.zeros((len(x), 3, POSE))
-    pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
-    pose[:, 1, 0], pose[:, 2, 0], pose[:, 2, 1] = -x[:, 2], x[:, 1], -x[:, 0]
-    pose[:, :, 3:6] = np.eye(3)
-    pose[:, :, 6] = x
-    flat = pose.reshape(-1, POSE)
+    flat, modes = small_poses(fit.surface.vertices), fit.surface.modes
     gram = np.eye(POSE + modes.shape[2])
     gram[:POSE, :POSE] = flat.T @ flat
     cross = flat.astype(np.float32).T @ modes.reshape(-1, modes.shape[2])
@@ -187,19 +180,23 @@ def _gram(fit: JointFit) -> FloatArray:
     return gram
 
 
-def _matched(fit: JointFit) -> dict[str, float]:
-    """Return how much of model and scan found a match, and how plausible pose and shape are."""
-    scan, vertices, model = fit.scan, fit.vertices, fit.prepared.model
+def _matched(fit: JointFit, v: FloatArray, z2: FloatArray) -> dict[str, float]:
+    """Return how much of model and scan found a match, and how plausible pose and shape are.
+
+    Args:
+        fit: at its end.
+        v: (M,) weights of its vertices' matches.
+        z2: (K,) squares of its coefficients, in variances of new shapes.
+    """
+    scan, vertices, size_mm = fit.scan, fit.vertices, rms_size(fit.prepared.model.mean_vertices)
     assert scan is not None and vertices is not None
-    v = fit.weigh()[1]
-    z2 = fit.b[: model.n_modes] ** 2 / variance_of_new_shapes(model)
     return {
-        "size_mm": _size_mm(fit),
+        "size_mm": size_mm,
         "seen_share": float((fit.seen_at > 0).mean()),
         "model_matched_share": float((v > _HALF * v.max()).mean()),
         "model_allowed_share": float(vertices.allowed.mean()),
         "scan_allowed_share": float(scan.allowed.mean()),
-        "model_near_share": float((vertices.distance < _NEAR * _size_mm(fit)).mean()),
+        "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),
         "log_scale": float(np.log(fit.T.scale)),

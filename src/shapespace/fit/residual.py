@@ -21,6 +21,7 @@ from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -66,7 +67,7 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
-    fields = _smooth_fields(x, settings.range_share * _size_mm(x))
+    fields = _smooth_fields(x, settings.range_share * rms_size(x))
     mode, at = _strongest(model.stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS // len(sources))
     field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
@@ -113,7 +114,7 @@ def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
     x = model.mean_vertices
     mean = model.mesh()
     assert mean.faces is not None
-    engine, size = build_engine(mean), _size_mm(x)
+    engine, size = build_engine(mean), rms_size(x)
     centre = x.mean(axis=0)
     some = x[:: max(1, len(x) // _MIRROR_POINTS)] - centre
     best = (np.inf, np.eye(3), Similarity.identity())
@@ -149,10 +150,6 @@ def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
 
 def _blocks(count: int) -> list[slice]:
     return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
-
-
-def _size_mm(x: FloatArray) -> float:
-    return float(np.sqrt(((x - x.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _smooth_fields(x: FloatArray, range_mm: float) -> FloatArray:

@@ -12,6 +12,7 @@ from scipy.special import fdtri  # scipy.stats would cost every start half a sec
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
+from shapespace.geometry.surface import rms_size
 from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
@@ -146,8 +147,7 @@ def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -
     """
     final, initial = stages["final"], stages["initial"]
     forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
-    centred = model.mean_vertices - model.mean_vertices.mean(axis=0)
-    size_mm = float(np.sqrt((centred**2).sum(axis=1).mean()))
+    size_mm = rms_size(model.mean_vertices)
     found: list[str] = []
     shrunk = min(
         final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,

@@ -23,21 +23,20 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.errors import FitError
 from shapespace.fit.kernels import Float32Array, gather_into, rows_into
-from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
+from shapespace.fit.matching import VertexMatches, match_vertices, unexplained_variance, winding_of
+from shapespace.fit.moving_model import POSE, MovingSurface, PreparedModel, prepare
 from shapespace.fit.posterior import posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.start import Start
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.weights import WEIGHTS, spread, tails
-from shapespace.geometry.closest import ClosestPoints, on_boundary
+from shapespace.fit.weights import match_weights, spread, tails
+from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.kdtree import KdTree
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
-POSE = 7
-"""Pose parameters come first: rotation, translation, scale."""
 _DAMPING = 1e-7
 _FIXED = 1e12
 _MOTION_STRIDE = 7
@@ -55,16 +54,6 @@ class Matches:
 
     triangle: IntArray
     barycentric: FloatArray
-    residual: FloatArray
-    distance: FloatArray
-    allowed: BoolArray
-
-
-@dataclass(frozen=True, eq=False)
-class VertexMatches:
-    """Model vertices matched to the scan, (M,) each; residuals and distances in mm of the model's frame."""
-
-    vertex: IntArray
     residual: FloatArray
     distance: FloatArray
     allowed: BoolArray
@@ -97,7 +86,7 @@ class JointFit:
         self.surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
         self.sigma_mm = self.width_mm = self.rms_mm = self.motion_mm = float("inf")
         self.hessian = np.zeros((0, 0))
-        self.seen_at = self.pull_at = np.zeros(0)
+        self.seen_at = np.zeros(0)
         self.scan: Matches | None = None
         self.vertices: VertexMatches | None = None
         self._winding = 0.0
@@ -128,6 +117,10 @@ class JointFit:
         self._walks = self.surface.topology.used[self._tree.nearest(self._in_model()[0])[0]]
         self._triangles = np.full_like(self._walks, -1)
 
+    def free_modes(self, level: Level) -> int:
+        """Return how many modes are free on `level`."""
+        return len(self.b) if level.modes is None else min(level.modes, len(self.b))
+
     def _in_model(self) -> tuple[FloatArray, FloatArray]:
         """Return the drawn points of the scan in the model's frame with their normals."""
         T = self.T
@@ -140,23 +133,17 @@ class JointFit:
         weights = self.surface.walk(q, self._walks, triangle)
         residual, distance, cosine, covered = self.surface.meet(q, n, triangle, weights)
         if self._winding == 0.0:
-            # A scan wound the wrong way round has all its normals reversed.
-            self._winding = 1.0 if np.median(cosine[covered] if covered.any() else cosine) >= 0 else -1.0
+            self._winding = winding_of(cosine, covered)
         agree = self._winding * cosine > self.settings.normal_cosine
         self.scan = Matches(triangle, weights, residual, distance, covered & agree)
 
-        T, asked = self.T, self._asked
-        x, n = self.surface.vertices[asked], self.surface.normals[asked]
-        self._near = near = self._engine.query(T.apply(x), self._near)
-        to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
-        allowed = ~on_boundary(near, self.target.mesh, self.target.rim)
-        if self.target.mesh.faces is not None:
-            n_scan = self.target.normals_at(near) @ T.rotation
-            cosine = self._winding * np.einsum("md,md->m", n, n_scan)
-            allowed &= cosine > self.settings.normal_cosine * np.linalg.norm(n_scan, axis=1)
-        residual, distance = np.einsum("md,md->m", to_scan, n), near.distance / T.scale
-        self.vertices = VertexMatches(asked, residual, distance, allowed)
-        self.rms_mm = float(np.sqrt((distance[allowed] ** 2).mean())) if allowed.any() else float("inf")
+        surface = self.surface
+        self.vertices = match_vertices(
+            self.target, self._engine, self.T, surface.vertices, surface.normals, self._asked, self._near,
+            winding=self._winding, normal_cosine=self.settings.normal_cosine,
+        )  # fmt: skip
+        self._near, near = self.vertices.near, self.vertices.distance[self.vertices.allowed]
+        self.rms_mm = float(np.sqrt((near**2).mean())) if len(near) else float("inf")
 
     def weigh(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights of the matches of scan points and of vertices, by the spread of the residuals."""
@@ -169,12 +156,11 @@ class JointFit:
                 "check that it shows what the model does."
             )
         self.sigma_mm = max(spread(counted), s.least_spread_mm)
-        weight = WEIGHTS[s.weight]
         width = self.sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(counted, self.sigma_mm) ** 2))
         self.width_mm = width
         far = s.reach * width + s.reach_mm
-        w = weight(scan.residual, width) * weight(scan.distance, far) * scan.allowed
-        v = weight(vertices.residual, width) * weight(vertices.distance, far) * vertices.allowed
+        w = match_weights(s.weight, scan.residual, scan.distance, scan.allowed, width, far)
+        v = match_weights(s.weight, vertices.residual, vertices.distance, vertices.allowed, width, far)
         fineness = min(1.0, len(self.target.mesh.vertices) / len(self.surface.vertices))
         return w, s.vertex_share * fineness**2 * v
 
@@ -227,7 +213,7 @@ class JointFit:
 
     def prefer(self, start: Start, level: Level) -> None:
         """Do `level` again from `start` with its coefficients, and go on from there if that matches clearly better."""
-        free = len(self.b) if level.modes is None else min(level.modes, len(self.b))
+        free = self.free_modes(level)
         own, own_cost = (self.T, self.b.copy()), self.mismatch()
         b = np.zeros(len(self.b))
         b[: min(len(start.b), free)] = start.b[:free]
@@ -257,22 +243,15 @@ class JointFit:
         return IcpState(phase, iteration, self.T, b, self.rms_mm, self.motion_mm, stopped)
 
     def unexplained(self) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise.
-
-        Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
-        say of the same vertex is the variance of the shape that the model leaves.
-        """
+        """Return the variance, mm^2, of the part of the residuals that is no noise."""
         self.match()
         w, _ = self.weigh()
-        scan, faces = self.scan, self.surface.topology.faces
+        scan, surface = self.scan, self.surface
         assert scan is not None
-        half = np.random.default_rng(self.settings.seed).random(len(w)) < 0.5
-        seen, pull = np.zeros((2, len(self.surface.vertices))), np.zeros((2, len(self.surface.vertices)))
-        for i, part in enumerate((half, ~half)):
-            gather_into(scan.triangle, scan.barycentric, faces, w * part, scan.residual, seen[i], pull[i])
-        both = np.minimum(seen[0], seen[1])
-        mean = pull / np.maximum(seen, 1e-12)
-        return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))
+        return unexplained_variance(
+            scan.triangle, scan.barycentric, surface.topology.faces, w, scan.residual, len(surface.vertices),
+            self.settings.seed,
+        )  # fmt: skip
 
 
 def robust_icp(
@@ -316,7 +295,7 @@ def robust_icp(
                 break
             extra = residual_modes(model, settings.residual)
             fit.add_modes(extra.modes, extra.stddev)
-        free = len(fit.b) if level.modes is None else min(level.modes, len(fit.b))
+        free = fit.free_modes(level)
         if free and phase == 1:
             yield replace(state, stopped=state.stopped or "rate")
             phase, iteration, state = 2, 0, fit.state(2, 0)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from shapespace.types import FloatArray
+from shapespace.types import BoolArray, FloatArray
 
 
 def welsch(residual: FloatArray, scale: float) -> FloatArray:
@@ -40,3 +40,20 @@ def spread(residual: FloatArray) -> float:
 def tails(residual: FloatArray, spread_mm: float) -> float:
     """Return how far the outer tenth of |residual| (M,) lies, where 1 is what noise of that spread would give."""
     return float(np.quantile(np.abs(residual), 0.9)) / (1.645 * spread_mm)
+
+
+def match_weights(
+    name: str, residual: FloatArray, distance: FloatArray, allowed: BoolArray, width_mm: float, far_mm: float
+) -> FloatArray:
+    """Return the weights (M,) of matches by the weight called `name`: residuals against a width, distances against far.
+
+    Args:
+        name: of `WEIGHTS`.
+        residual: (M,) mm.
+        distance: (M,) mm.
+        allowed: (M,) False for matches that count nothing.
+        width_mm: scale of the residuals.
+        far_mm: scale of the distances.
+    """
+    weight = WEIGHTS[name]
+    return weight(residual, width_mm) * weight(distance, far_mm) * allowed

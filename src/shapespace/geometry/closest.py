@@ -110,36 +110,6 @@ class SurfaceEngine:
         return ClosestPoints(found, np.sqrt(squared), triangle, barycentric, vertex)
 
 
-def barycentric_coordinates(points: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return (M, 3) weights of the corners `a`, `b`, `c` (M, 3) that give `points` in their triangles.
-
-    In a triangle without area the two ends of its longest edge carry the point.
-    """
-    ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
-    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
-    determinant = d00 * d11 - d01 * d01
-    flat = determinant <= 1e-14 * d00 * d11
-    safe = np.where(flat, 1.0, determinant)
-    v, w = (d11 * d20 - d01 * d21) / safe, (d00 * d21 - d01 * d20) / safe
-    weights = np.clip(np.stack([1 - v - w, v, w], axis=1), 0.0, 1.0)
-    if flat.any():
-        weights[flat] = _on_longest_edge(points[flat], np.stack([a[flat], b[flat], c[flat]], axis=1))
-    return weights / weights.sum(axis=1, keepdims=True)
-
-
-def _on_longest_edge(points: FloatArray, corners: FloatArray) -> FloatArray:
-    ends = np.roll(corners, -1, axis=1)
-    squared = ((ends - corners) ** 2).sum(2)
-    start, row = squared.argmax(1), np.arange(len(points))
-    edge, length = (ends - corners)[row, start], squared[row, start]
-    along = ((points - corners[row, start]) * edge).sum(1)
-    t = np.clip(np.divide(along, length, out=np.zeros_like(along), where=length > 0), 0.0, 1.0)
-    weights = np.zeros((len(points), 3))
-    weights[row, start], weights[row, (start + 1) % 3] = 1 - t, t
-    return weights
-
-
 def on_boundary(matches: ClosestPoints, mesh: Mesh, boundary: BoolArray) -> BoolArray:
     """Return (M,) True where a match lies on the rim of `mesh`.
 

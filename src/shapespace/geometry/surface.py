@@ -19,6 +19,11 @@ def faces_of(mesh: Mesh) -> IntArray:
     return mesh.faces
 
 
+def rms_size(points: FloatArray) -> float:
+    """Return the RMS distance of `points` (N, 3) from their mean."""
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
 def face_vectors(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Return (F, 3) cross products: normals of the triangles, as long as twice their areas."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
