@@ -282,13 +282,13 @@ def fit_scans(
         if workers <= 1:
             with telling_of_compiling(quiet=quiet):
                 return fit_files(
-                    work, model, model_path.name, folder, config,
+                    work, model, model_path, folder, config,
                     resume=resume, stages=stages, on_done=done, on_state=show_state,
                 )  # fmt: skip
         start_loading(tell=may_tell(quiet=quiet))
         with make_executor(model_path, workers) as executor:
             return fit_files(
-                work, model, model_path.name, folder, config,
+                work, model, model_path, folder, config,
                 executor=executor, resume=resume, stages=stages, on_done=done,
             )  # fmt: skip
 

@@ -339,7 +339,7 @@ def _fit_all(
         records = fit_files(
             make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
             model,
-            model_name,
+            home / model_name,
             make_folder(home / "fits"),
             config,
             executor=stack.enter_context(make_executor(home / model_name, workers)) if workers > 1 else None,

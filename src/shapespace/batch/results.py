@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from shapespace import __version__
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
+from shapespace.fit.stages import stage_arrays
 from shapespace.io.files import atomic_path, read_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -28,14 +30,30 @@ _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
 
 @dataclass(frozen=True)
 class Source:
-    """A file that took part: its name and the SHA-256 of its content (a model's content hash for models)."""
+    """A file that took part.
+
+    Args:
+        name: of the file.
+        content_hash: SHA-256 of its content; of models their content hash.
+        path: where it was, relative to the folder of the results where there is such a path; empty if not known.
+    """
 
     name: str
     content_hash: str
+    path: str = ""
+
+    @staticmethod
+    def at(file: Path, content_hash: str, folder: Path) -> Source:
+        """Return the source `file` as results in `folder` refer to it."""
+        try:
+            path = os.path.relpath(file.resolve(), folder.resolve())
+        except (ValueError, OSError):  # another drive, or a folder that is gone
+            path = str(file)
+        return Source(file.name, content_hash, Path(path).as_posix())
 
     def as_dict(self) -> dict[str, str]:
         """Return it as it stands in a result file."""
-        return {"name": self.name, "hash": self.content_hash}
+        return {"name": self.name, "hash": self.content_hash, "path": self.path}
 
 
 def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source | None = None) -> dict[str, Any]:
@@ -127,21 +145,9 @@ def write_fitted_mesh(path: Path, result: FitResult, model: ShapeModel, stage: s
 
 
 def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
-    """Write the surfaces at each stage and their distances, for figures.
-
-    Vertices are in the scan's frame in mm; distances are mm of the model's frame.
-    """
-    arrays: dict[str, Any] = {}
-    for name, stage in result.stages.items():
-        distances = stage.distances
-        arrays[name] = (result.surface(model, name).vertices * result.mm_per_scan_unit).astype(np.float32)
-        arrays[f"model_to_scan_{name}"] = distances.model_to_scan_mm.astype(np.float32)
-        arrays[f"scan_to_model_{name}"] = distances.scan_to_model_mm[distances.scan_counted].astype(np.float32)
-        if stage.seen is not None:
-            arrays[f"seen_{name}"] = stage.seen
-    if model.faces is not None:
-        arrays["faces"] = model.faces
+    """Write `stage_arrays` as NAME.stages.npz."""
     with atomic_path(path) as temporary:
+        arrays: dict[str, Any] = dict(stage_arrays(result, model))  # savez has keywords of its own type
         np.savez_compressed(temporary, **arrays)
 
 

@@ -81,7 +81,7 @@ def _shortened(stem: str) -> str:
 def fit_file(
     job: Job,
     model: ShapeModel,
-    model_name: str,
+    model_file: Path,
     folder: Path,
     config: FitConfig,
     *,
@@ -95,11 +95,11 @@ def fit_file(
     Raises:
         FileError: the results cannot be written.
     """
-    model_source = Source(model_name, model.content_hash)
-    scan_source = Source(job.scan.name, "")
+    model_source = Source.at(model_file, model.content_hash, folder)
+    scan_source = Source.at(job.scan, "", folder)
     marks_source: Source | None = None
     try:
-        scan_source = Source(job.scan.name, sha256_of_file(job.scan))
+        scan_source = Source.at(job.scan, sha256_of_file(job.scan), folder)
         scan = read_mesh(job.scan)
         landmarks: Mapping[str, FloatArray] | None = None
         if job.landmarks is not None:
@@ -143,7 +143,7 @@ def naming(scan: Path, sentence: str) -> str:
 def fit_files(
     jobs: Sequence[Job],
     model: ShapeModel,
-    model_name: str,
+    model_file: Path,
     folder: Path,
     config: FitConfig,
     *,
@@ -158,7 +158,7 @@ def fit_files(
     Args:
         jobs: the scans.
         model: the shape space.
-        model_name: file name of the model, for the records.
+        model_file: where the model was read from, for the records.
         folder: where results go; made if absent.
         config: settings of all fits.
         executor: from `EXECUTORS`, or anything with its face; None fits one after the other here.
@@ -197,9 +197,9 @@ def fit_files(
     try:
         if executor is None:
             for job in open_jobs:
-                done(job, fit_file(job, model, model_name, folder, config, stages=stages, on_state=on_state))
+                done(job, fit_file(job, model, model_file, folder, config, stages=stages, on_state=on_state))
         else:
-            for job, record in _run_on(executor, open_jobs, model_name, folder, config, stages):
+            for job, record in _run_on(executor, open_jobs, model_file, folder, config, stages):
                 done(job, record)
     finally:
         save()
@@ -207,12 +207,12 @@ def fit_files(
 
 
 def _run_on(
-    executor: Executor, jobs: Sequence[Job], model_name: str, folder: Path, config: FitConfig, stages: bool
+    executor: Executor, jobs: Sequence[Job], model_file: Path, folder: Path, config: FitConfig, stages: bool
 ) -> Iterator[tuple[Job, dict[str, Any]]]:
     with ExitStack() as stack:
         with interrupts_ignored():
             futures = {
-                executor.submit(_fit_with_loaded_model, job, model_name, folder, config, stages): job for job in jobs
+                executor.submit(_fit_with_loaded_model, job, model_file, folder, config, stages): job for job in jobs
             }
         stack.callback(lambda: [future.cancel() for future in futures])
         for future in as_completed(futures):
@@ -241,10 +241,10 @@ def _start_process(path: Path) -> None:
     _load_model(path)
 
 
-def _fit_with_loaded_model(job: Job, model_name: str, folder: Path, config: FitConfig, stages: bool) -> dict[str, Any]:
+def _fit_with_loaded_model(job: Job, model_file: Path, folder: Path, config: FitConfig, stages: bool) -> dict[str, Any]:
     if _model is None:
         raise FileError("The worker has no model; start it with make_executor.")
-    return fit_file(job, _model, model_name, folder, config, stages=stages)
+    return fit_file(job, _model, model_file, folder, config, stages=stages)
 
 
 def _processes(model: Path, workers: int) -> Executor:

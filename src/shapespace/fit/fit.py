@@ -13,8 +13,9 @@ from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.errors import FitError, InputError
+from shapespace.fit.regions import all_followed
 from shapespace.fit.result import FitResult, Stage, Status, doubts, posterior_stddev
-from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings, RobustSettings
 from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
@@ -126,6 +127,7 @@ def paper_method(
         shrinkage=1.0 - (b_stddev / model.stddev) ** 2,
         vertices_scan_mm=state.T_scan_model.apply(model.reconstruct(state.b)),
         rms_mm=state.rms_mm,
+        regions=partial(all_followed, len(model.mean_vertices)),
     )
 
 
@@ -197,8 +199,7 @@ def _fit_scan(
     scan, findings = repair(scan)
     unit = find_unit(model, scan) if config.unit == "auto" else config.unit
     mm = MM_PER_UNIT[unit]
-    centre = np.median(scan.vertices, axis=0)
-    T_mm_scan = Similarity(mm, np.eye(3), -mm * centre)  # near the origin, where float64 is finest
+    T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
     target = ScanTarget(scan_mm)
     start = _start(model, scan_mm, T_mm_scan, landmarks, T_scan_model, config)
@@ -280,6 +281,8 @@ def _fit_scan(
             "distances": clock[2] - ended[2][1] - dense_s,
         },
         model_hash=model.content_hash,
+        scan=scan,
+        find_regions=fitted.regions,
     )
 
 

@@ -15,7 +15,7 @@ from shapespace.geometry.distance import SurfaceDistances
 from shapespace.geometry.surface import rms_size
 from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
@@ -81,6 +81,8 @@ class FitResult:
         notes: what was repaired or noticed in the scan.
         seconds: by part.
         model_hash: content hash of the model.
+        scan: what was fitted: the scan as repaired, in its own frame and unit.
+        find_regions: finds `regions`.
     """
 
     scan_name: str
@@ -101,6 +103,16 @@ class FitResult:
     notes: Sequence[str]
     seconds: Mapping[str, float]
     model_hash: str
+    scan: Mesh = field(repr=False)
+    find_regions: Callable[[], IntArray] = field(repr=False)
+
+    @cached_property
+    def regions(self) -> IntArray:
+        """(V,) code of each model vertex in `fit.regions.REGIONS`, found when first asked for.
+
+        The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
+        """
+        return self.find_regions()
 
     @property
     def iterations(self) -> dict[str, int]:

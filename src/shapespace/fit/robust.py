@@ -26,6 +26,7 @@ from shapespace.fit.kernels import Float32Array, gather_into, rows_into
 from shapespace.fit.matching import VertexMatches, match_vertices, unexplained_variance, winding_of
 from shapespace.fit.moving_model import POSE, MovingSurface, PreparedModel, prepare
 from shapespace.fit.posterior import posterior
+from shapespace.fit.regions import FinalMatches
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -84,7 +85,7 @@ class JointFit:
         self.stddev = np.array(prepared.model.stddev)
         self.b = np.zeros(len(self.stddev))
         self.surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        self.sigma_mm = self.width_mm = self.rms_mm = self.motion_mm = float("inf")
+        self.sigma_mm = self.width_mm = self.far_mm = self.rms_mm = self.motion_mm = float("inf")
         self.hessian = np.zeros((0, 0))
         self.seen_at = np.zeros(0)
         self.scan: Matches | None = None
@@ -157,8 +158,8 @@ class JointFit:
             )
         self.sigma_mm = max(spread(counted), s.least_spread_mm)
         width = self.sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(counted, self.sigma_mm) ** 2))
-        self.width_mm = width
         far = s.reach * width + s.reach_mm
+        self.width_mm, self.far_mm = width, far
         w = match_weights(s.weight, scan.residual, scan.distance, scan.allowed, width, far)
         v = match_weights(s.weight, vertices.residual, vertices.distance, vertices.allowed, width, far)
         fineness = min(1.0, len(self.target.mesh.vertices) / len(self.surface.vertices))
@@ -241,6 +242,14 @@ class JointFit:
         """Return where the fit is."""
         b = self.b[: self.prepared.model.n_modes].copy()
         return IcpState(phase, iteration, self.T, b, self.rms_mm, self.motion_mm, stopped)
+
+    def final_matches(self) -> FinalMatches:
+        """Return what tells, later, which vertices followed the scan."""
+        s, surface = self.settings, self.surface
+        return FinalMatches(
+            self.target, self.T, surface.vertices.copy(), surface.normals.copy(), self._winding, s.normal_cosine,
+            s.weight, self.width_mm, self.far_mm,
+        )  # fmt: skip
 
     def unexplained(self) -> float:
         """Return the variance, mm^2, of the part of the residuals that is no noise."""
@@ -331,6 +340,7 @@ def robust_icp(
         shrinkage=known.shrinkage[:wanted],
         vertices_scan_mm=fit.T.apply(fit.surface.vertices),
         rms_mm=fit.rms_mm,
+        regions=fit.final_matches(),
         evidence=known.evidence,
     )
 

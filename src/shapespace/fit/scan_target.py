@@ -9,10 +9,16 @@ import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, finest_engine
 from shapespace.geometry.surface import boundary_vertices
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _ROUNDS = 4
 """Of finding how much the larger areas must make up for vertices that are drawn for certain."""
+
+
+def mm_frame(scan: Mesh, mm_per_scan_unit: float) -> Similarity:
+    """Return T_mm_scan: from the scan's own frame to mm, near the origin, where float64 is finest."""
+    centre = np.median(scan.vertices, axis=0)
+    return Similarity(mm_per_scan_unit, np.eye(3), -mm_per_scan_unit * centre)
 
 
 @dataclass(frozen=True, eq=False)

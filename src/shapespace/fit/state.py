@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.types import FloatArray, Similarity
+from shapespace.types import FloatArray, IntArray, Similarity
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,7 @@ class Fitted:
         shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
         vertices_scan_mm: (V, 3) the fitted surface in the scan's mm frame; it may leave the span of the model.
         rms_mm: RMS distance of the matched vertices from the scan, mm of the model's frame.
+        regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
         evidence: what the verdict goes by, by name.
     """
 
@@ -54,6 +55,7 @@ class Fitted:
     shrinkage: FloatArray
     vertices_scan_mm: FloatArray
     rms_mm: float
+    regions: Callable[[], IntArray] = field(repr=False)
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
 
 

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices
+from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
+from shapespace.geometry.surface import boundary_vertices, vertex_normals
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 
@@ -54,11 +54,27 @@ class SurfaceDistances:
         scan_to_model_mm: (S,) from each scan vertex to the model.
         scan_counted: (S,) False where the closest model point lies on the model's rim: there the scan shows
             something that the model does not cover, such as the back of a head.
+        outside_of_model: (V,) True where the scan lies on the side to which the model's normal points; all True
+            where the model has no triangles.
+        scan_outside: (S,) the same of each scan vertex.
     """
 
     model_to_scan_mm: FloatArray
     scan_to_model_mm: FloatArray
     scan_counted: BoolArray
+    outside_of_model: BoolArray
+    scan_outside: BoolArray
+
+    @property
+    def model_to_scan_signed_mm(self) -> FloatArray:
+        """(V,) with a minus where the scan lies behind the model's surface."""
+        return np.where(self.outside_of_model, self.model_to_scan_mm, -self.model_to_scan_mm)
+
+    @property
+    def scan_to_model_signed_mm(self) -> FloatArray:
+        """(S,) with a minus where the scan lies behind the model's surface; not-a-number where it is not counted."""
+        signed = np.where(self.scan_outside, self.scan_to_model_mm, -self.scan_to_model_mm)
+        return np.where(self.scan_counted, signed, np.nan)
 
     @property
     def model_to_scan(self) -> DistanceSummary:
@@ -90,4 +106,21 @@ def surface_distances(
     forward = engine.query(model.vertices)
     backward = build_engine(model).query(scan.vertices)
     counted = ~on_boundary(backward, model, boundary_vertices(model))
-    return SurfaceDistances(forward.distance * mm_per_length, backward.distance * mm_per_length, counted)
+    outside, scan_outside = np.ones(len(model.vertices), dtype=bool), np.ones(len(scan.vertices), dtype=bool)
+    if model.faces is not None:
+        normals = vertex_normals(model)
+        outside = _in_front(forward.points - model.vertices, normals)
+        scan_outside = _in_front(scan.vertices - backward.points, _normals_at(backward, model, normals))
+    return SurfaceDistances(
+        forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside
+    )
+
+
+def _in_front(away: FloatArray, normals: FloatArray) -> BoolArray:
+    return np.asarray(np.einsum("ij,ij->i", away, normals) >= 0.0)
+
+
+def _normals_at(matches: ClosestPoints, mesh: Mesh, normals: FloatArray) -> FloatArray:
+    if matches.triangle is None or matches.barycentric is None or mesh.faces is None:
+        return normals[matches.vertex]
+    return np.einsum("mc,mcd->md", matches.barycentric, normals[mesh.faces[matches.triangle]])

@@ -1,4 +1,4 @@
-"""What the demo saved, read back for the report: JSON, arrays and meshes, checked and inside the demo's folder."""
+"""What fits and the demo saved, read back for pictures: JSON, arrays, meshes and models, checked, inside one folder."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import FileFormatError
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes import read_mesh
-from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report.staged import StagedFit
+from shapespace.types import FloatArray, Mesh
 
 _LARGEST_JSON = 64 * 2**20
 _LARGEST_ARRAY = 2**30
-_AGAIN = "run the demo again"
+_AGAIN = "make it again"
+_RECORD = ".fit.json"
 
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder of a demo; paths in its files are relative to it and stay inside it."""
+    """A folder of results; names in its files are relative to it and stay inside it."""
 
     root: Path
 
@@ -96,10 +99,11 @@ class Folder:
 
 @dataclass(frozen=True, eq=False)
 class SavedFit:
-    """One fit of the demo, as its entry in demo.json and its record tell it.
+    """One fit, as its record tells it and what is known beside it.
 
     Args:
-        entry: from demo.json.
+        entry: `name`, and where there are such `json`, `stages`, `fitted`, `dense`, `expression`, `intensity`: from
+            demo.json, or from the files of a folder.
         record: NAME.fit.json.
     """
 
@@ -120,13 +124,18 @@ class SavedFit:
 
     @property
     def status(self) -> str:
-        """`converged`, `max_iterations`, `doubtful` or `failed`."""
-        return str(self.record.get("status", "unknown"))
+        """`converged`, `max_iterations`, `doubtful` or `failed`; `unreadable` where the record is."""
+        return str(self.record.get("status", "unreadable"))
+
+    @property
+    def reason(self) -> str:
+        """Why it has that status."""
+        return str(self.record.get("reason", ""))
 
     @property
     def pictured(self) -> bool:
         """Whether surfaces were kept."""
-        return bool(self.entry.get("stages")) and self.status != "failed"
+        return bool(self.entry.get("stages")) and self.status not in ("failed", "unreadable")
 
     def summary_mm(self, stage: str, direction: str, measure: str) -> float:
         """Return a distance summary in mm, or not-a-number where the record has none."""
@@ -168,52 +177,106 @@ def read_fit(folder: Folder, entry: Mapping[str, Any]) -> SavedFit:
     return SavedFit(entry, folder.json(entry.get("json")))
 
 
+def find_fits(folder: Folder) -> list[SavedFit]:
+    """Return the fits whose records lie directly in `folder`, in the order of their names.
+
+    One that cannot be read has the status `unreadable` and says why.
+
+    Raises:
+        FileError: the folder cannot be read.
+        InputError: there is no fit in it.
+    """
+    try:
+        names = sorted(path.name for path in folder.root.iterdir() if path.name.endswith(_RECORD))
+    except OSError as error:
+        raise read_error(folder.root, error) from error
+    if not names:
+        raise InputError(f"{folder.root} holds no fits (NAME{_RECORD}); give a folder that shapespace fit wrote.")
+    return [_found(folder, name) for name in names]
+
+
+def _found(folder: Folder, file: str) -> SavedFit:
+    name = file.removesuffix(_RECORD)
+    beside = {
+        key: f"{name}.{ending}"
+        for key, ending in (("stages", "stages.npz"), ("fitted", "fitted.ply"), ("dense", "dense.ply"))
+        if (folder.root / f"{name}.{ending}").is_file()
+    }
+    entry = {"name": _printable(name), "json": file, **beside}
+    try:
+        record = folder.json(file)
+        if record.get("format") != "shapespace fit":
+            raise FileFormatError(f"{folder.root / file} is not the record of a fit; {_AGAIN}.")
+    except ShapespaceError as error:
+        record = {"status": "unreadable", "reason": str(error)}
+    return SavedFit(entry, record)
+
+
+def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
+    """Return what pictures of `fit` need.
+
+    Raises:
+        FileError: its stages cannot be read.
+        FileFormatError: they were not saved, or are damaged.
+    """
+    stages = fit.entry.get("stages")
+    if not stages:
+        raise FileFormatError(f"{fit.name}: its stages were not saved; fit the scan again with --stages.")
+    return StagedFit.from_arrays(
+        folder.arrays(stages),
+        name=fit.name,
+        label=fit.label,
+        status=fit.status,
+        reason=fit.reason,
+        b=fit.numbers("b"),
+        z=fit.numbers("z"),
+        b_stddev=fit.numbers("b_stddev"),
+        shrinkage=fit.numbers("shrinkage"),
+    )
+
+
 def surfaces_of(
     folder: Folder, fit: SavedFit, stages: Sequence[str]
 ) -> tuple[Mesh, dict[str, Mesh], dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return the scan, the model's surface at each stage, and both directions' distances at each stage.
+    """Return scan, surfaces and unsigned distances of `staged_fit` at `stages`; raises as it does."""
+    staged = staged_fit(folder, fit)
+    backward = {stage: staged.scan_to_model_mm[stage] for stage in stages}
+    return (
+        staged.scan,
+        {stage: staged.surfaces[stage] for stage in stages},
+        {stage: np.abs(staged.model_to_scan_mm[stage]) for stage in stages},
+        {stage: np.abs(signed[np.isfinite(signed)]) for stage, signed in backward.items()},
+    )
 
-    Scan and surfaces are brought into the model's frame in mm by the final pose, so that faces look at the camera.
+
+def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None) -> ShapeModel:
+    """Return the model by which `fits` were made.
+
+    Args:
+        folder: where the fits lie.
+        fits: one or more; those without a readable record do not count.
+        given: the model's file; None goes by the path in the records.
 
     Raises:
-        FileError: a file cannot be read.
-        FileFormatError: arrays are absent or do not fit together.
-        MeshError: the scan is damaged.
+        FileError: it cannot be read.
+        FileFormatError: it is damaged.
+        InputError: it is not where the records say, or not the one they name.
     """
-    T_model_scan = _pose(fit).inverse()
-    unit = float(fit.record.get("mm_per_scan_unit") or 1.0)
-    scan = folder.mesh(fit.entry["scan"])
-    arrays = folder.arrays(fit.entry["stages"])
-    faces: IntArray | None = arrays.get("faces")
-    surfaces: dict[str, Mesh] = {}
-    forward: dict[str, FloatArray] = {}
-    backward: dict[str, FloatArray] = {}
-    for stage in stages:
-        try:
-            vertices = arrays[stage].astype(np.float64)
-            forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
-            backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
-        except (KeyError, ValueError) as error:
-            raise FileFormatError(
-                f"{fit.entry['stages']} lacks the surface or the distances {stage!r}; {_AGAIN}."
-            ) from error
-        surfaces[stage] = Mesh(T_model_scan.apply(vertices / unit), faces, name=fit.name)
-        if forward[stage].shape != (len(vertices),) or backward[stage].ndim != 1:
-            raise FileFormatError(f"{fit.entry['stages']}: the distances {stage!r} do not fit the surface; {_AGAIN}.")
-        if not all(np.isfinite(values).all() for values in (vertices, forward[stage], backward[stage])):
-            raise FileFormatError(f"{fit.entry['stages']}: {stage!r} holds values that are not finite; {_AGAIN}.")
-    seen = scan.with_vertices(T_model_scan.apply(scan.vertices))
-    return seen, surfaces, forward, backward
-
-
-def _pose(fit: SavedFit) -> Similarity:
-    try:
-        T = fit.record["T_scan_model"]
-        return Similarity(
-            float(T["scale"]), np.array(T["rotation"], dtype=float), np.array(T["translation"], dtype=float)
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_AGAIN}.") from error
+    sources = [
+        cast(Mapping[str, Any], fit.record["model"]) for fit in fits if isinstance(fit.record.get("model"), dict)
+    ]
+    hashes = {str(source.get("hash")) for source in sources}
+    if not sources:
+        raise InputError(f"{folder.root}: no record names a model; give it with --model.")
+    if len(hashes) > 1 and given is None:
+        raise InputError(f"{folder.root}: its fits are by {len(hashes)} different models; give one with --model.")
+    path = given or folder.root / str(sources[0].get("path") or sources[0].get("name"))
+    if given is None and not path.is_file():
+        raise InputError(f"{folder.root}: the model {path.name} is no longer at {path}; give it with --model.")
+    model = ShapeModel.load(path)
+    if model.content_hash not in hashes:
+        raise InputError(f"{path} is not the model of the fits in {folder.root}; give the right one with --model.")
+    return model
 
 
 def _bounded(path: Path, most: int) -> None:
@@ -222,7 +285,7 @@ def _bounded(path: Path, most: int) -> None:
     except OSError as error:
         raise read_error(path, error) from error
     if size > most:
-        raise FileFormatError(f"{path} is larger ({size / 2**20:.0f} MiB) than any file of the demo; {_AGAIN}.")
+        raise FileFormatError(f"{path} is larger ({size / 2**20:.0f} MiB) than such a file can be; {_AGAIN}.")
 
 
 def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:

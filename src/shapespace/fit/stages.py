@@ -1,0 +1,55 @@
+"""A fit as plain arrays, from which all pictures of it are made."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.fit.result import FitResult
+from shapespace.fit.scan_target import mm_frame
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray
+
+STAGES_VERSION = 2
+
+
+def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[Any]]:
+    """Return what NAME.stages.npz holds: all that pictures of a fit need, in the model's frame in mm.
+
+    Of each stage the vertices (V, 3), the signed distances `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,),
+    positive where the scan lies outside of the model, not-a-number at scan points beyond the model's rim. `scan` and
+    `scan_faces` are the scan as repaired; `regions` the codes of `fit.regions.REGIONS`; `history_*` each iteration,
+    with T (I, 3, 4) from the model's frame then to the frame of the final pose.
+    """
+    T_model_scan = result.T_scan_model.inverse()
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "format_version": np.array(STAGES_VERSION),
+        "scan": T_model_scan.apply(result.scan.vertices).astype(np.float32),
+        "regions": result.regions.astype(np.uint8),
+    }
+    for name, stage in result.stages.items():
+        arrays[name] = T_model_scan.apply(result.surface(model, name).vertices).astype(np.float32)
+        arrays[f"model_to_scan_{name}"] = stage.distances.model_to_scan_signed_mm.astype(np.float32)
+        arrays[f"scan_to_model_{name}"] = stage.distances.scan_to_model_signed_mm.astype(np.float32)
+        if stage.seen is not None:
+            arrays[f"seen_{name}"] = stage.seen
+    if model.faces is not None:
+        arrays["faces"] = model.faces
+    if result.scan.faces is not None:
+        arrays["scan_faces"] = result.scan.faces
+    T_model_mm = T_model_scan @ mm_frame(result.scan, result.mm_per_scan_unit).inverse()
+    T = [T_model_mm @ state.T_scan_model for state in result.history]
+    arrays["history_phase"] = np.array([state.phase for state in result.history], dtype=np.int32)
+    arrays["history_iteration"] = np.array([state.iteration for state in result.history], dtype=np.int32)
+    arrays["history_rms_mm"] = np.array([state.rms_mm for state in result.history], dtype=np.float32)
+    arrays["history_b"] = np.array([_padded(state.b, len(result.b)) for state in result.history], dtype=np.float32)
+    arrays["history_T"] = np.array(
+        [np.column_stack([each.scale * each.rotation, each.translation]) for each in T], dtype=np.float64
+    ).reshape(-1, 3, 4)
+    return arrays
+
+
+def _padded(b: FloatArray, modes: int) -> FloatArray:
+    return np.pad(b[:modes], (0, max(modes - len(b), 0)))

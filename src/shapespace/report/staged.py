@@ -1,0 +1,150 @@
+"""A fit as pictures need it: scan and model in the model's frame in mm, moment by moment, with signed distances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.fit.regions import REGIONS
+from shapespace.fit.result import STAGES, FitResult
+from shapespace.fit.stages import STAGES_VERSION, stage_arrays
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One iteration of a fit.
+
+    Args:
+        phase: 1 or 2.
+        iteration: from 0, by phase.
+        rms_mm: what the loop saw, mm.
+        b: (K,) coefficients then, mm.
+        T_final_now: from the model's frame then to the frame of the final pose, in which all pictures are.
+    """
+
+    phase: int
+    iteration: int
+    rms_mm: float
+    b: FloatArray
+    T_final_now: Similarity
+
+    def vertices(self, model: ShapeModel) -> FloatArray:
+        """Return the model's surface then, (V, 3), in the frame of the final pose."""
+        return self.T_final_now.apply(model.reconstruct(self.b))
+
+
+@dataclass(frozen=True, eq=False)
+class StagedFit:
+    """A fit as pictures need it, with scan and model in the model's frame in mm.
+
+    Args:
+        name: of the fit.
+        label: what pictures call it.
+        status: `converged`, `max_iterations` or `doubtful`.
+        reason: one sentence on why.
+        scan: the raw surface or points, as repaired.
+        surfaces: the model at each stage: `before`, `initial`, `final`, and `dense` where there was one.
+        model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model.
+        scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
+        regions: (V,) codes of `fit.regions.REGIONS`.
+        b: (K,) mm.
+        z: (K,) in standard deviations of the model.
+        b_stddev: (K,) mm.
+        shrinkage: (K,) in [0, 1].
+        history: the iterations, in order.
+    """
+
+    name: str
+    label: str
+    status: str
+    reason: str
+    scan: Mesh
+    surfaces: Mapping[str, Mesh]
+    model_to_scan_mm: Mapping[str, FloatArray]
+    scan_to_model_mm: Mapping[str, FloatArray]
+    regions: IntArray
+    b: FloatArray
+    z: FloatArray
+    b_stddev: FloatArray
+    shrinkage: FloatArray
+    history: tuple[Moment, ...]
+
+    @staticmethod
+    def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
+        """Return what pictures need of `result`, which was fitted by `model`."""
+        return StagedFit.from_arrays(
+            stage_arrays(result, model),
+            name=result.scan_name,
+            label=label or result.scan_name,
+            status=result.status,
+            reason=result.reason,
+            b=result.b,
+            z=result.z,
+            b_stddev=result.b_stddev,
+            shrinkage=result.shrinkage,
+        )
+
+    @staticmethod
+    def from_arrays(
+        arrays: Mapping[str, npt.NDArray[Any]],
+        *,
+        name: str,
+        label: str,
+        status: str,
+        reason: str,
+        b: FloatArray,
+        z: FloatArray,
+        b_stddev: FloatArray,
+        shrinkage: FloatArray,
+    ) -> StagedFit:
+        """Return a fit from the arrays of NAME.stages.npz and the numbers of its record.
+
+        Raises:
+            FileFormatError: arrays are absent, of an earlier version, or do not fit together.
+        """
+        again = "fit the scan again with --stages"
+        if int(arrays.get("format_version", np.array(0))) != STAGES_VERSION:
+            raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
+        try:
+            faces = arrays.get("faces")
+            scan = Mesh(arrays["scan"].astype(np.float64), arrays.get("scan_faces"), name=name)
+            surfaces: dict[str, Mesh] = {}
+            forward: dict[str, FloatArray] = {}
+            backward: dict[str, FloatArray] = {}
+            for stage in (*STAGES, *(("dense",) if "dense" in arrays else ())):
+                surfaces[stage] = Mesh(arrays[stage].astype(np.float64), faces, name=name)
+                forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
+                backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
+            regions = arrays["regions"].astype(np.int32)
+            history = tuple(
+                Moment(int(phase), int(iteration), float(rms), np.asarray(b_now, dtype=np.float64), _similarity(T))
+                for phase, iteration, rms, b_now, T in zip(
+                    *(arrays[f"history_{key}"] for key in ("phase", "iteration", "rms_mm", "b", "T")), strict=True
+                )
+            )
+        except (KeyError, ValueError, TypeError, IndexError, ShapespaceError) as error:
+            raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {again}.") from error
+        V, S = len(surfaces["final"].vertices), len(scan.vertices)
+        whole = all(len(surface.vertices) == V for surface in surfaces.values())
+        whole &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
+        whole &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
+        whole &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
+        whole &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
+        if not whole:
+            raise FileFormatError(f"{name}: its saved stages do not fit together; {again}.")
+        return StagedFit(
+            name, label, status, reason, scan, surfaces, forward, backward, regions, b, z, b_stddev, shrinkage, history
+        )
+
+
+def _similarity(T: npt.NDArray[Any]) -> Similarity:
+    matrix = np.asarray(T, dtype=np.float64)
+    scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
+    return Similarity(scale, matrix[:, :3] / scale, matrix[:, 3])
