@@ -1,0 +1,333 @@
+"""What turns in the browser: arrays packed for scene.js, and the scripts that draw them.
+
+The bytes of `pack` are a uint32 (little-endian) with the length of a JSON header, the header, zeros up to a multiple of
+8, then the arrays, each at a multiple of 8. `Shapespace.unpack` of scene.js reads them back.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+if TYPE_CHECKING:
+    from shapespace.model.shape_model import ShapeModel
+    from shapespace.report.staged import StagedFit
+
+SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
+"""The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
+
+_DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
+_UNKNOWN = -32768
+_STEPS = 32767
+
+
+@dataclass(frozen=True, eq=False)
+class Quantised:
+    """An array as int16 times a scale, for `pack`.
+
+    Args:
+        steps: int16, any shape; -32768 stands for NaN.
+        scale: one positive number, or one for each leading row.
+    """
+
+    steps: npt.NDArray[np.int16]
+    scale: float | list[float]
+
+
+def quantised(values: npt.ArrayLike, *, by_row: bool = False) -> Quantised:
+    """Return `values` as int16 steps; the error is at most half a step, which is max|values| / 65534.
+
+    Args:
+        values: float, any shape; NaN and infinities become NaN.
+        by_row: one scale for each leading row instead of one for all.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(array)
+    size = np.where(known, np.abs(array), 0.0)
+    if by_row:
+        scales = size.reshape(len(array), -1).max(axis=1, initial=0.0) / _STEPS
+        scales = np.where(scales > 0, scales, 1.0)
+        step = scales.reshape(-1, *[1] * (array.ndim - 1))
+        scale: float | list[float] = [float(value) for value in scales]
+    else:
+        step = scale = float(size.max(initial=0.0)) / _STEPS or 1.0
+    steps = np.where(known, np.rint(np.where(known, array, 0.0) / step), _UNKNOWN)
+    return Quantised(steps.astype(np.int16), scale)
+
+
+def pack(arrays: Mapping[str, npt.NDArray[Any] | Quantised], facts: Mapping[str, Any]) -> bytes:
+    """Return `arrays` and `facts` as bytes that `Shapespace.unpack` reads in the browser.
+
+    Args:
+        arrays: name -> array; float64 becomes float32, int64 int32 and bool uint8, other types must be float32, int32,
+            uint32, uint16, int16 or uint8, or `Quantised`.
+        facts: anything JSON can hold; numbers that are not finite become null.
+
+    Raises:
+        InputError: an array of another type, or facts that JSON cannot hold.
+    """
+    specs: dict[str, Any] = {}
+    buffers: list[bytes] = []
+    offset = 0
+    for name, given in arrays.items():
+        array = given.steps if isinstance(given, Quantised) else _portable(name, np.asarray(given))
+        spec: dict[str, Any] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": offset}
+        if isinstance(given, Quantised):
+            spec["scale"] = given.scale
+        specs[name] = spec
+        data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        buffers.append(data + bytes(-len(data) % 8))
+        offset += len(buffers[-1])
+    try:
+        header = json.dumps({"facts": _plain(facts), "arrays": specs}, allow_nan=False).encode("ascii")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"The facts of a scene must be plain values that JSON can hold ({error}).") from error
+    return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
+
+
+def pack_model(model: ShapeModel, modes: int | None = None) -> bytes:
+    """Return what `Shapespace.Model` and the widget of modes need.
+
+    Arrays: `mean` (V, 3) float32 mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the
+    displacement of one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
+
+    Args:
+        model: any model.
+        modes: how many of its modes; None takes all, and a number above them is cut to them.
+
+    Raises:
+        InputError: fewer than one mode.
+    """
+    if modes is not None and modes < 1:
+        raise InputError(f"At least one mode must be packed, not {modes}.")
+    K = model.n_modes if modes is None else min(modes, model.n_modes)
+    one = np.zeros(K)
+    moved = np.empty((K, model.n_vertices, 3))
+    for k in range(K):
+        one[k] = model.stddev[k]
+        moved[k] = model.reconstruct(one) - model.mean_vertices
+        one[k] = 0.0
+    arrays: dict[str, npt.NDArray[Any] | Quantised] = {
+        "mean": model.mean_vertices,
+        "modes": quantised(moved, by_row=True),
+        "stddev": model.stddev[:K],
+        "share": model.stddev[:K] ** 2 / model.total_variance,
+    }
+    if model.faces is not None:
+        arrays["faces"] = _indices(model.faces, model.n_vertices)
+    facts = {
+        "kind": "model",
+        "names": [f"mode {k + 1}" for k in range(K)],
+        "n_modes": model.n_modes,
+        "n_training": model.n_training,
+        "gauge": model.gauge,
+        "landmarks": dict(model.landmarks),
+        "provenance": model.provenance,
+        "licence": model.licence,
+    }
+    return pack(arrays, facts)
+
+
+def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
+    """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
+
+    Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
+    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed; `regions` (V,) codes; `b`, `z`, `b_stddev`
+    (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration` and `history_rms_mm` (n,).
+
+    Args:
+        staged: a fit with its stages.
+        largest_scan: for a report: the scan is thinned to at most this many triangles (or points), positions are
+            quantised and the iterations left out. None packs everything as it is.
+
+    Raises:
+        InputError: `largest_scan` below 1.
+    """
+    if largest_scan is not None and largest_scan < 1:
+        raise InputError(f"A scan must keep at least one triangle, not {largest_scan}.")
+    small = largest_scan is not None
+    scan, kept = staged.scan, np.arange(len(staged.scan.vertices))
+    if largest_scan is not None:
+        scan, kept = thinned(scan, largest_scan)
+    place = quantised if small else _as_given
+    arrays: dict[str, npt.NDArray[Any] | Quantised] = {"scan": place(scan.vertices)}
+    if scan.faces is not None:
+        arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices))
+    for stage, surface in staged.surfaces.items():
+        if surface.faces is not None:
+            arrays.setdefault("faces", _indices(surface.faces, len(surface.vertices)))
+        arrays[f"surface_{stage}"] = place(surface.vertices)
+        arrays[f"model_to_scan_{stage}"] = quantised(staged.model_to_scan_mm[stage])
+        arrays[f"scan_to_model_{stage}"] = quantised(staged.scan_to_model_mm[stage][kept])
+    arrays |= {
+        "regions": staged.regions.astype(np.uint8),
+        "b": staged.b,
+        "z": staged.z,
+        "b_stddev": staged.b_stddev,
+    }
+    if not small:
+        moments = staged.history
+        K = len(staged.b)
+        arrays |= {
+            "history_b": np.array([moment.b for moment in moments]).reshape(-1, K),
+            "history_T": np.array([_matrix(moment.T_final_now) for moment in moments]).reshape(-1, 3, 4),
+            "history_phase": np.array([moment.phase for moment in moments], dtype=np.int32),
+            "history_iteration": np.array([moment.iteration for moment in moments], dtype=np.int32),
+            "history_rms_mm": np.array([moment.rms_mm for moment in moments], dtype=np.float32),
+        }
+    facts = {
+        "kind": "fit",
+        "name": staged.name,
+        "label": staged.label,
+        "status": staged.status,
+        "reason": staged.reason,
+        "stages": list(staged.surfaces),
+        "scan_vertices": len(staged.scan.vertices),
+        "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
+        "thinned": len(scan.vertices) < len(staged.scan.vertices),
+    }
+    return pack(arrays, facts)
+
+
+def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
+
+    Vertices of one cell of a cubic grid become the one that is nearest to their mean, and triangles that fold up are
+    dropped (Rossignac and Borrel 1993). No new point is made, so what was measured at a vertex stays true of it.
+
+    Args:
+        scan: any surface or points.
+        largest: at least 1.
+
+    Returns:
+        The mesh, and (S',) indices into the vertices of `scan`.
+    """
+
+    everything = np.arange(len(scan.vertices))
+    if _count(scan) <= largest:
+        return scan, everything
+    cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
+    best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
+    # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
+    for _ in range(8):
+        trial = _clustered(scan, cell)
+        left = _count(trial[0])
+        if left <= largest and (best is None or left > _count(best[0])):
+            best = trial
+            if left >= 0.9 * largest:
+                break
+        cell *= math.sqrt(max(left, 1) / (0.95 * largest))
+    while best is None:
+        cell *= 2.0
+        trial = _clustered(scan, cell)
+        best = trial if _count(trial[0]) <= largest else None
+    return best
+
+
+def _count(mesh: Mesh) -> int:
+    return len(mesh.vertices) if mesh.faces is None else len(mesh.faces)
+
+
+def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    points = scan.vertices
+    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    side = at.max(axis=0) + 1
+    _, group = np.unique((at[:, 0] * side[1] + at[:, 1]) * side[2] + at[:, 2], return_inverse=True)
+    size = np.bincount(group)
+    middle = np.stack([np.bincount(group, points[:, k]) / size for k in range(3)], axis=1)
+    far = ((points - middle[group]) ** 2).sum(axis=1)
+    order = np.lexsort((far, group))
+    first = np.r_[0, np.cumsum(size)[:-1]]
+    kept = order[first]
+    if scan.faces is None:
+        return Mesh(points[kept], None, name=scan.name), kept
+    faces = group[scan.faces].astype(np.int32)
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[whole]
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(points[kept], faces[np.sort(once)], name=scan.name), kept
+
+
+def scripts() -> str:
+    """Return the JavaScript of a page with scenes, for one inline `<script>`."""
+    from shapespace.report import colours
+
+    folder = files("shapespace.report").joinpath("assets")
+    shared = {
+        "sequential": colours.as_list(colours.SEQUENTIAL),
+        "diverging": colours.as_list(colours.DIVERGING),
+        "regions": {name: list(colour) for name, colour in colours.REGION_COLOURS.items()},
+        "categories": [list(colour) for colour in colours.CATEGORIES],
+        "clay": list(colours.CLAY),
+        "scan": list(colours.SCAN_COLOUR),
+        "model": list(colours.MODEL_COLOUR),
+        "dense": list(colours.DENSE_COLOUR),
+        "unknown": list(colours.UNKNOWN_COLOUR),
+        "beyond": list(colours.BEYOND_COLOUR),
+    }
+    texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS]
+    texts.insert(-1, f"Shapespace.colours = {json.dumps(shared)};\n")
+    return "\n".join(texts)
+
+
+def style() -> str:
+    """Return the CSS of views and widgets, for a page that defines --page, --ink, --soft, --line, --card, --accent."""
+    return files("shapespace.report").joinpath("assets/widgets.css").read_text(encoding="utf-8")
+
+
+def payload_html(identifier: str, payload: bytes) -> str:
+    """Return `payload` as a script element of a type that browsers keep but never run, base64 inside.
+
+    Args:
+        identifier: its id, escaped here; widgets are given the element or this id.
+        payload: from `pack`.
+    """
+    text = base64.b64encode(payload).decode("ascii")
+    return f'<script type="application/octet-stream" id="{escape(identifier, quote=True)}">{text}</script>\n'
+
+
+def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    wanted = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
+    if wanted is not None:
+        if array.dtype == np.int64 and array.size and np.abs(array).max() > np.iinfo(np.int32).max:
+            raise InputError(f"The array {name!r} holds integers beyond 32 bits, which scenes do not have.")
+        array = array.astype(wanted)
+    if array.dtype.name not in _DTYPES:
+        raise InputError(f"The array {name!r} has the type {array.dtype}; scenes have {', '.join(_DTYPES)}.")
+    return array
+
+
+def _plain(value: Any) -> Any:
+    """Return `value` with numbers that are not finite as None, which JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in cast(list[Any], value)]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _indices(faces: IntArray, vertices: int) -> npt.NDArray[Any]:
+    return faces.astype(np.uint16 if vertices <= 1 << 16 else np.uint32)
+
+
+def _as_given(values: npt.ArrayLike) -> npt.NDArray[Any]:
+    return np.asarray(values, dtype=np.float32)
+
+
+def _matrix(T: Similarity) -> FloatArray:
+    return np.column_stack([T.scale * T.rotation, T.translation])
