@@ -93,7 +93,7 @@ def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
     for k in range(3):
         curve[:, k] = np.convolve(padded[:, k], window, mode="valid")
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    return _srgb(_between(np.linspace(0, along[-1], count), along, curve))
+    return _srgb(_between(np.linspace(0, float(along[-1]), count), along, curve))
 
 
 def _between(at: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
