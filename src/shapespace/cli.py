@@ -72,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     _add_build(commands)
     _add_info(commands)
     _add_fit(commands)
+    _add_view(commands)
     return top
 
 
@@ -186,6 +187,18 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=_fit)
+
+
+def _add_view(commands: Any) -> None:
+    sub = _add(commands, "view", "shape model and fits in the browser, and scans dropped there fitted",
+               "shapespace view model.h5", json_facts=False)  # fmt: skip
+    sub.add_argument("path", type=Path, metavar="MODEL.h5|DIR", help="a model, or a folder that fit wrote")
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits in DIR (default: named in them)")
+    sub.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default 127.0.0.1)")
+    sub.add_argument("--port", type=_natural, metavar="N", help="default: the first free one from 7860")
+    sub.add_argument("--no-open", action="store_true", help="do not open a browser")
+    sub.add_argument("--max-upload-mb", type=_positive, default=200, metavar="N", help="largest scan (default 200)")
+    sub.set_defaults(run=_view)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -371,6 +384,27 @@ def _fit(arguments: argparse.Namespace) -> int:
     if counts["failed"] == len(records):
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from shapespace.viewer.serve import serve
+
+    serve(
+        arguments.path,
+        model=arguments.model,
+        host=arguments.host,
+        port=arguments.port,
+        open_browser=not arguments.no_open,
+        max_upload_mb=arguments.max_upload_mb,
+        quiet=arguments.quiet,
+        say=_now,
+    )
+    return 0
+
+
+def _now(line: str) -> None:
+    _print(line)
+    sys.stdout.flush()
 
 
 def _print_fit(record: Mapping[str, Any]) -> None:

@@ -1,0 +1,146 @@
+"""Opens a viewer: finds a port, prints the address, and runs the server until it is stopped."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import secrets
+import socket
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from shapespace.batch.workers import cores, may_tell, start_loading
+from shapespace.errors import InputError, ShapespaceError
+
+if TYPE_CHECKING:
+    from shapespace.viewer.sessions import Sessions
+
+FIRST_PORT = 7860
+_PORTS_TRIED = 50
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_EVERYWHERE = ("0.0.0.0", "::", "")
+
+
+def serve(
+    path: Path,
+    *,
+    model: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    open_browser: bool = True,
+    max_upload_mb: int = 200,
+    quiet: bool = False,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Show a model, or the fits of a folder, in the browser until Ctrl-C.
+
+    Args:
+        path: a model file, or a folder that `shapespace fit` wrote.
+        model: the model's file, where the records of the folder do not lead to it.
+        host: the address to listen at; anything but loopback needs a token, which is part of the address printed.
+        port: None takes the first free one from `FIRST_PORT`.
+        open_browser: whether to open the page.
+        max_upload_mb: largest scan that may be dropped.
+        quiet: whether to be silent about code that is being compiled.
+        say: told the address.
+
+    Raises:
+        ShapespaceError: the extra `view` is not installed.
+        FileError: the model or the folder cannot be read.
+        InputError: the port is taken, or the host is none of this machine's.
+    """
+    for needed in ("starlette", "uvicorn"):
+        if importlib.util.find_spec(needed) is None:
+            raise ShapespaceError(
+                f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
+            )
+    # While this process loads its own code.
+    start_loading(tell=may_tell(quiet=quiet))
+    from shapespace.viewer.server import make_app
+    from shapespace.viewer.sessions import Limits
+    from shapespace.viewer.shown import Shown
+
+    shown = Shown.open(path, model)
+    listening = listen(host, port)
+    taken = int(listening.getsockname()[1])
+    token = None if host in _LOOPBACK else secrets.token_urlsafe(24)
+    limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
+    app, sessions = make_app(shown, limits=limits, token=token, cookie_name=f"shapespace_{taken}")
+    address = page_address(host, taken, token)
+    say(f"The viewer is at {address}")
+    if token is not None:
+        say("Whoever has this address can use it, and the connection is not encrypted. Ctrl-C ends the viewer.")
+    else:
+        say("Ctrl-C ends the viewer.")
+    if open_browser:
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    run(app, sessions, listening)
+
+
+def run(app: object, sessions: Sessions, listening: socket.socket) -> None:
+    """Serve `app` until a signal ends it; scans and processes of visitors are gone when it returns."""
+    import uvicorn
+
+    class Server(uvicorn.Server):
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            # Pages that watch a fit would otherwise hold the server up.
+            sessions.closing = True
+            super().handle_exit(sig, frame)
+
+    config = uvicorn.Config(
+        app,  # type: ignore[arg-type]
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=3,
+        timeout_keep_alive=30,
+        ws="none",
+        lifespan="on",
+    )
+    try:
+        Server(config).run(sockets=[listening])
+    except KeyboardInterrupt:
+        # Ctrl-C is how a viewer ends.
+        pass
+    finally:
+        sessions.close()
+
+
+def listen(host: str, port: int | None) -> socket.socket:
+    """Return a socket that listens at `host`, at `port` or at the first free one.
+
+    Raises:
+        InputError: the port is taken or not allowed, or the host is none of this machine's.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    ports = range(FIRST_PORT, FIRST_PORT + _PORTS_TRIED) if port is None else [port]
+    for attempt in ports:
+        listening = socket.socket(family)
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listening.bind((host, attempt))
+            listening.listen(128)
+        except (OSError, OverflowError) as error:
+            listening.close()
+            number = error.errno if isinstance(error, OSError) else None
+            if number == errno.EADDRINUSE:
+                continue
+            if number in (errno.EACCES, errno.EPERM) or isinstance(error, OverflowError):
+                raise InputError(f"Port {attempt} cannot be used; choose one from 1024 to 65535.") from error
+            raise InputError(f"The viewer cannot listen at {host!r}: it is no address of this machine.") from error
+        return listening
+    if port is not None:
+        raise InputError(f"Port {port} is taken by another program; choose another one, or leave --port out.")
+    raise InputError(f"The ports from {FIRST_PORT} to {FIRST_PORT + _PORTS_TRIED - 1} are taken; choose one by --port.")
+
+
+def page_address(host: str, port: int, token: str | None) -> str:
+    """Return the address of the page, as a browser takes it."""
+    name = socket.gethostname() if host in _EVERYWHERE else host
+    if ":" in name:
+        name = f"[{name}]"
+    return f"http://{name}:{port}/" + ("" if token is None else f"?token={token}")

@@ -1,0 +1,419 @@
+"""The viewer's application: the page, what it shows, and scans that visitors drop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import shutil
+import tempfile
+import unicodedata
+from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from shapespace import __version__
+from shapespace.errors import ShapespaceError
+from shapespace.io.files import read_bytes
+from shapespace.io.landmarks import write_landmarks
+from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
+from shapespace.report import colours
+from shapespace.types import Mesh
+from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
+from shapespace.viewer.guard import Guard, cookie, refusal
+from shapespace.viewer.sessions import DroppedScan, Limits, Session, Sessions
+from shapespace.viewer.shown import Shown, shape_of
+
+_OWN_ASSETS = Path(__file__).parent / "assets"
+_SHARED_ASSETS = Path(__file__).parents[1] / "report" / "assets"
+ASSETS: Mapping[str, tuple[Path, str]] = {
+    "viewer.css": (_OWN_ASSETS / "viewer.css", "text/css"),
+    "viewer.js": (_OWN_ASSETS / "viewer.js", "text/javascript"),
+    "scene.js": (_SHARED_ASSETS / "scene.js", "text/javascript"),
+    "three.min.js": (_SHARED_ASSETS / "vendor" / "three.min.js", "text/javascript"),
+}
+"""What the page may load, by name."""
+
+EXPORTS = ("ply", "obj", "stl")
+_LARGEST_QUESTION = 2**20
+_LONGEST_NAME = 120
+_FEWEST_LANDMARKS = 3
+_BINARY = "application/octet-stream"
+_NO_SCAN = "There is no such scan; it was removed, or it never was yours."
+_NO_SESSION = "This visit has ended, and its scans were removed; reload the page."
+_BROKEN = "The server met an error of its own; look at the terminal where it runs, and reload the page."
+_DISK = "The server could not store the scan: {}; free some space there and drop it again."
+
+Endpoint: TypeAlias = Callable[[Request], Coroutine[Any, Any, Response]]
+
+
+def make_app(
+    shown: Shown,
+    *,
+    limits: Limits | None = None,
+    token: str | None = None,
+    cookie_name: str = "shapespace",
+    worker: Worker = fit_upload,
+) -> tuple[ASGIApp, Sessions]:
+    """Return the application and its sessions.
+
+    Args:
+        shown: what it shows.
+        limits: what a visitor may use; None for the defaults.
+        token: what every request must carry; None on loopback.
+        cookie_name: of its cookies; browsers share cookies between ports, so it should name the port.
+        worker: what fits a dropped scan, in a process of its own.
+    """
+    root = Path(tempfile.mkdtemp(prefix="shapespace-view-"))
+    model_file = root / "model.h5"
+    shown.model.save(model_file)
+    sessions = Sessions(
+        root,
+        model_file,
+        shown.model_name,
+        with_landmarks=len(shown.model.landmarks) >= _FEWEST_LANDMARKS,
+        limits=limits or Limits(),
+        worker=worker,
+    )
+    viewer = _Viewer(shown, sessions, f"{cookie_name}_session")
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        watching = asyncio.create_task(sessions.watch_over())
+        try:
+            yield
+        finally:
+            watching.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await watching
+            sessions.close()
+
+    app = Starlette(
+        routes=viewer.routes(),
+        lifespan=lifespan,
+        exception_handlers={
+            HTTPException: _told,
+            ShapespaceError: _sentence,
+            ClientDisconnect: _left,
+            Exception: _broken,
+        },
+    )
+    return Guard(app, token=token, cookie=f"{cookie_name}_token"), sessions
+
+
+class _Viewer:
+    def __init__(self, shown: Shown, sessions: Sessions, cookie_name: str) -> None:
+        self._shown = shown
+        self._sessions = sessions
+        self._cookie = cookie_name
+        self._packed: tuple[bytes, int] | None = None
+        self._packing = asyncio.Lock()
+
+    def routes(self) -> list[Route]:
+        scan = "/api/scans/{key}"
+        return [
+            Route("/", self.page),
+            Route("/assets/{name}", self.asset),
+            Route("/api/about", self.about),
+            Route("/api/model", self.model),
+            Route("/api/fits", self.fits),
+            Route("/api/fits/{name}", self.fit),
+            Route("/api/export", self.export, methods=["POST"]),
+            Route("/api/scans", self.scans),
+            Route("/api/scans", self.drop, methods=["PUT"]),
+            Route(scan, self.remove, methods=["DELETE"]),
+            Route(f"{scan}/events", self.events),
+            Route(f"{scan}/preview", self.preview),
+            Route(f"{scan}/picture", self.picture),
+            Route(f"{scan}/record", self.record),
+            Route(f"{scan}/landmarks", self.landmarks, methods=["POST"]),
+            Route(f"{scan}/cancel", self.cancel, methods=["POST"]),
+        ]
+
+    async def page(self, request: Request) -> Response:
+        session = self._sessions.find(request.cookies.get(self._cookie))
+        response = FileResponse(_OWN_ASSETS / "viewer.html", media_type="text/html")
+        if session is None:
+            response.headers.append("Set-Cookie", cookie(self._cookie, self._sessions.new().key))
+        return response
+
+    async def asset(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in ASSETS:
+            raise HTTPException(404, "There is no such file.")
+        path, kind = ASSETS[name]
+        return FileResponse(path, media_type=kind)
+
+    async def about(self, request: Request) -> Response:
+        model, limits = self._shown.model, self._sessions.limits
+        _, modes = await self._packed_model()
+        return JSONResponse(
+            {
+                "version": __version__,
+                "model": self._shown.model_name,
+                "modes": model.n_modes,
+                "modes_sent": modes,
+                "vertices": model.n_vertices,
+                "triangles": 0 if model.faces is None else len(model.faces),
+                "landmarks": list(model.landmarks),
+                "has_fits": self._shown.folder is not None,
+                "upload_bytes": limits.upload_bytes,
+                "formats": list(MESH_FORMATS),
+                "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
+                "sequential": colours.as_list(colours.SEQUENTIAL),
+                "diverging": colours.as_list(colours.DIVERGING),
+                "scan_colour": colours.SCAN_COLOUR,
+                "model_colour": colours.MODEL_COLOUR,
+                "region_colours": dict(colours.REGION_COLOURS),
+            }
+        )
+
+    async def model(self, request: Request) -> Response:
+        packed, _ = await self._packed_model()
+        return Response(packed, media_type=_BINARY)
+
+    async def fits(self, request: Request) -> Response:
+        return JSONResponse(await asyncio.to_thread(self._shown.fit_list))
+
+    async def fit(self, request: Request) -> Response:
+        try:
+            packed = await asyncio.to_thread(self._shown.packed_fit, request.path_params["name"])
+        except KeyError:
+            raise HTTPException(
+                404, "There is no such fit; reload the page to see what the folder holds now."
+            ) from None
+        return Response(packed, media_type=_BINARY)
+
+    async def export(self, request: Request) -> Response:
+        kind = request.query_params.get("format", "")
+        if kind not in EXPORTS:
+            raise HTTPException(400, f"There is no export as {kind[:20]!r}; choose one of {', '.join(EXPORTS)}.")
+        question = await _question(request)
+        content = await asyncio.to_thread(self._exported, kind, question, self._session(request))
+        return _download(content, f"shape.{kind}")
+
+    def _exported(self, kind: str, question: Mapping[str, Any], session: Session | None) -> bytes:
+        mesh = self._asked_mesh(question, session)
+        with tempfile.TemporaryDirectory(prefix="shapespace-export-") as folder:
+            path = Path(folder) / f"shape.{kind}"
+            write_mesh(path, mesh)
+            return read_bytes(path)
+
+    def _asked_mesh(self, question: Mapping[str, Any], session: Session | None) -> Mesh:
+        if "fit" in question:
+            try:
+                return self._shown.fitted_mesh(str(question["fit"]))
+            except (KeyError, AssertionError):
+                raise HTTPException(404, "There is no such fit.") from None
+        if "scan" in question:
+            scan = session.scans.get(str(question["scan"])) if session else None
+            if scan is None or not (scan.folder / f"{NAME}.fitted.ply").is_file():
+                raise HTTPException(404, _NO_SCAN)
+            return read_mesh(scan.folder / f"{NAME}.fitted.ply")
+        z = question.get("z")
+        if not _numbers(z):
+            raise HTTPException(400, "An export needs z, a list of numbers in standard deviations.")
+        return shape_of(self._shown.model, cast(list[float], z))
+
+    async def scans(self, request: Request) -> Response:
+        session = self._session(request)
+        return JSONResponse([scan.facts() for scan in session.scans.values()] if session else [])
+
+    async def drop(self, request: Request) -> Response:
+        session = self._own_session(request)
+        limits = self._sessions.limits
+        name = _shown_name(request.query_params.get("name", ""))
+        ending = Path(name).suffix.lower()
+        if ending not in MESH_FORMATS:
+            raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_FORMATS)}.")
+        if session.unfinished() >= limits.unfinished:
+            raise HTTPException(
+                429, f"{limits.unfinished} of your scans are being fitted or wait for it; wait for one, or stop one."
+            )
+        too_large = (
+            f"{name} is larger than the {limits.upload_bytes / 2**20:g} MB that this viewer takes; thin it, or start "
+            "the viewer with a larger --max-upload-mb."
+        )
+        announced = request.headers.get("content-length", "0")
+        if not announced.isdigit() or int(announced) > limits.upload_bytes:
+            raise HTTPException(413, too_large)
+        session.uploading += 1
+        folder = self._sessions.new_folder()
+        try:
+            # A name of our own: what the visitor calls the file never becomes a path.
+            path = folder / f"upload-{secrets.token_hex(4)}{ending}"
+            await _receive(request, path, limits.upload_bytes, too_large)
+            if self._sessions.find(session.key) is None:
+                raise HTTPException(403, _NO_SESSION)
+            scan = self._sessions.add(session, name, folder, path)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            session.uploading -= 1
+        return JSONResponse(scan.facts(), 201)
+
+    async def events(self, request: Request) -> Response:
+        scan = self._own_scan(request)
+
+        async def stream() -> AsyncGenerator[str]:
+            async for message in scan.follow(lambda: self._sessions.closing):
+                if message is None:
+                    self._session(request)  # a visitor who watches is not idle
+                    yield ": waiting\n\n"
+                else:
+                    yield f"data: {json.dumps(_finite(message))}\n\n"
+
+        return StreamingResponse(stream(), media_type="text/event-stream")
+
+    async def preview(self, request: Request) -> Response:
+        return _file(self._own_scan(request).folder / PREVIEW)
+
+    async def picture(self, request: Request) -> Response:
+        return _file(self._own_scan(request).folder / PICTURE)
+
+    async def record(self, request: Request) -> Response:
+        path = self._own_scan(request).folder / f"{NAME}.fit.json"
+        if not path.is_file():
+            raise HTTPException(404, "This scan has no result yet.")
+        return _download(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
+
+    async def landmarks(self, request: Request) -> Response:
+        session, scan = self._own_session(request), self._own_scan(request)
+        if not scan.finished or scan.upload is None:
+            raise HTTPException(409, "Landmarks can be placed on a scan whose fit has ended in doubt; drop it again.")
+        if session.unfinished() >= self._sessions.limits.unfinished:
+            raise HTTPException(429, "Too many of your scans are being fitted; wait for one, or stop one.")
+        given: object = (await _question(request)).get("landmarks")
+        points = cast(dict[str, Any], given) if isinstance(given, dict) else dict[str, Any]()
+        known = self._shown.model.landmarks
+        if not all(name in known and _numbers(point) and len(point) == 3 for name, point in points.items()):
+            raise HTTPException(400, "A landmark needs a name of the model and three numbers.")
+        if len(points) < _FEWEST_LANDMARKS:
+            raise HTTPException(400, f"At least {_FEWEST_LANDMARKS} landmarks are needed, not {len(points)}.")
+        path = scan.folder / "landmarks.csv"
+        write_landmarks(path, {name: np.asarray(point, dtype=np.float64) for name, point in points.items()})
+        self._sessions.fit_again(scan, path)
+        return JSONResponse(scan.facts())
+
+    async def cancel(self, request: Request) -> Response:
+        self._sessions.cancel(self._own_scan(request))
+        return JSONResponse({})
+
+    async def remove(self, request: Request) -> Response:
+        self._sessions.remove(self._own_session(request), self._own_scan(request))
+        return JSONResponse({})
+
+    def _session(self, request: Request) -> Session | None:
+        return self._sessions.find(request.cookies.get(self._cookie))
+
+    def _own_session(self, request: Request) -> Session:
+        session = self._session(request)
+        if session is None:
+            raise HTTPException(403, _NO_SESSION)
+        return session
+
+    def _own_scan(self, request: Request) -> DroppedScan:
+        session = self._session(request)
+        scan = session.scans.get(request.path_params["key"]) if session else None
+        if scan is None:
+            raise HTTPException(404, _NO_SCAN)
+        return scan
+
+    async def _packed_model(self) -> tuple[bytes, int]:
+        async with self._packing:
+            if self._packed is None:
+                self._packed = await asyncio.to_thread(self._shown.packed_model)
+            return self._packed
+
+
+async def _receive(request: Request, path: Path, most: int, too_large: str) -> None:
+    """Write the body of `request` to `path`, and stop where it grows too large."""
+    size = 0
+    try:
+        with path.open("xb") as file:
+            async for chunk in request.stream():
+                size += len(chunk)
+                if size > most:
+                    raise HTTPException(413, too_large)
+                file.write(chunk)
+    except OSError as error:
+        raise HTTPException(507, _DISK.format(error.strerror or error)) from error
+
+
+async def _question(request: Request) -> Mapping[str, Any]:
+    """Return the JSON object in the body of `request`."""
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > _LARGEST_QUESTION:
+            raise HTTPException(413, "The request is too long.")
+    try:
+        question: object = json.loads(body)
+    except (ValueError, RecursionError):
+        question = None
+    if not isinstance(question, dict):
+        raise HTTPException(400, "The request is not a JSON object.")
+    return cast(Mapping[str, Any], question)
+
+
+def _numbers(value: object) -> bool:
+    if not isinstance(value, list):
+        return False
+    items = cast(list[object], value)
+    return all(isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) < 1e9 for x in items)
+
+
+def _shown_name(name: str) -> str:
+    """Return a file's name that can be shown: its last part, without what cannot be printed."""
+    last = name.replace("\\", "/").rpartition("/")[2]
+    plain = "".join(c for c in unicodedata.normalize("NFC", last) if c.isprintable())
+    stem, dot, ending = plain.rpartition(".")
+    return f"{stem[:_LONGEST_NAME]}{dot}{ending[:10]}" or "The file"
+
+
+def _file(path: Path) -> Response:
+    if not path.is_file():
+        raise HTTPException(404, "There is no picture of this scan.")
+    return FileResponse(path, media_type=_BINARY)
+
+
+def _download(content: bytes, name: str) -> Response:
+    return Response(content, media_type=_BINARY, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+def _finite(value: Any) -> Any:
+    """Return `value` with numbers that JSON does not know as null."""
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in cast(Mapping[str, Any], value).items()}
+    return [_finite(item) for item in cast(list[Any], value)] if isinstance(value, list) else value
+
+
+async def _told(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    plain = "There is nothing at this address." if error.detail == "Not Found" else error.detail
+    return refusal(error.status_code, plain)
+
+
+async def _sentence(_: Request, error: Exception) -> Response:
+    return refusal(422, str(error))
+
+
+async def _left(_: Request, error: Exception) -> Response:
+    return refusal(400, "The upload ended early.")
+
+
+async def _broken(_: Request, error: Exception) -> Response:
+    return refusal(500, _BROKEN)

@@ -1,0 +1,177 @@
+"""What a viewer shows: a model, and the fits of a folder, ready to be sent to the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
+from shapespace.report.scene import pack_model
+from shapespace.types import Mesh
+from shapespace.viewer.fitting import packed
+
+MODEL_BYTES = 96 * 2**20
+"""Modes beyond this size in the browser are left out, and the page says so."""
+_ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
+_DIGITS = 6
+
+
+class Shown:
+    """A model, and perhaps a folder of fits by it.
+
+    Args:
+        model: the shape space.
+        model_name: what the page calls it.
+        folder: of the fits; None without.
+    """
+
+    def __init__(self, model: ShapeModel, model_name: str, folder: Path | None = None) -> None:
+        self.model = model
+        self.model_name = model_name
+        self.folder = None if folder is None else Folder(folder)
+        self._read: tuple[object, dict[str, SavedFit]] = (None, {})
+        self._picture = lru_cache(maxsize=4)(self._packed_fit)
+
+    @staticmethod
+    def open(path: Path, model: Path | None = None) -> Shown:
+        """Return what `path` holds: a model file, or a folder of results of `shapespace fit`.
+
+        Args:
+            path: the file or folder.
+            model: the model's file, where the records of the folder do not lead to it.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged.
+            InputError: it is neither, or the model is not that of the fits.
+        """
+        if not path.is_dir():
+            if model is not None:
+                raise InputError(f"{path} is not a folder of fits; leave --model out, or give the folder.")
+            if path.exists() and path.suffix.lower() not in (".h5", ".hdf5"):
+                raise InputError(
+                    f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
+                )
+            return Shown(ShapeModel.load(path), path.name)
+        folder = Folder(path)
+        fits = find_fits(folder)
+        found = model_of(folder, fits, model)
+        named = [str(cast(Mapping[str, Any], fit.record["model"]).get("name")) for fit in fits if "model" in fit.record]
+        return Shown(found, model.name if model else named[0], path)
+
+    def packed_model(self) -> tuple[bytes, int]:
+        """Return the model for the page, and how many of its modes that holds."""
+        modes = max(1, min(self.model.n_modes, MODEL_BYTES // (6 * self.model.n_vertices)))
+        return pack_model(self.model, modes), modes
+
+    def fits(self) -> dict[str, SavedFit]:
+        """Return the fits of the folder by name, read again when files have changed.
+
+        Raises:
+            FileError: the folder cannot be read.
+        """
+        if self.folder is None:
+            return {}
+        try:
+            now = sorted((p.name, p.stat().st_mtime_ns) for p in self.folder.root.glob("*.fit.json"))
+        except OSError as error:
+            raise FileError(
+                f"Cannot read {self.folder.root}: {error.strerror or error}; is the folder still there?"
+            ) from error
+        if self._read[0] != now:
+            self._read = (now, {fit.name: fit for fit in find_fits(self.folder)} if now else {})
+            self._picture.cache_clear()
+        return self._read[1]
+
+    def fit_list(self) -> list[dict[str, Any]]:
+        """Return what the page lists: failed and doubtful fits first, then by distance, the largest first."""
+        rows = [self._row(fit) for fit in self.fits().values()]
+        return sorted(rows, key=lambda row: (_rank(row["status"]), -(row["model_to_scan_mm"] or 0.0), row["name"]))
+
+    def packed_fit(self, name: str) -> bytes:
+        """Return the pictures of the fit `name`.
+
+        Raises:
+            FileError: its stages cannot be read.
+            FileFormatError: they were not saved, or are damaged.
+            InputError: they do not belong to the model.
+            KeyError: there is no such fit.
+        """
+        self.fits()
+        return self._picture(name)
+
+    def fitted_mesh(self, name: str) -> Mesh:
+        """Return the fitted surface of the fit `name`, in the frame and unit of its scan.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is absent or damaged.
+            KeyError: there is no such fit.
+        """
+        assert self.folder is not None
+        return self.folder.mesh(self.fits()[name].entry.get("fitted"))
+
+    def _packed_fit(self, name: str) -> bytes:
+        assert self.folder is not None
+        fit = self.fits()[name]
+        if not self._ours(fit):
+            raise InputError(f"{name} was fitted by another model; give that one with --model.")
+        return packed(staged_fit(self.folder, fit))
+
+    def _ours(self, fit: SavedFit) -> bool:
+        source: object = fit.record.get("model")
+        return isinstance(source, dict) and (cast(Mapping[str, Any], source).get("hash") == self.model.content_hash)
+
+    def _row(self, fit: SavedFit) -> dict[str, Any]:
+        pictured, why = fit.pictured, ""
+        if pictured and not self._ours(fit):
+            pictured, why = False, "It was fitted by another model."
+        elif not pictured and fit.status not in ("failed", "unreadable"):
+            why = "Its surfaces were not saved; fit the scan again with --stages."
+        row: dict[str, Any] = {
+            "name": fit.name,
+            "label": fit.label,
+            "status": fit.status,
+            "reason": fit.reason,
+            "pictured": pictured,
+            "why_not": why,
+            "fitted": "fitted" in fit.entry and fit.status not in ("failed", "unreadable"),
+            "z": None,
+        }
+        for key, direction in (("model_to_scan_mm", "model_to_scan"), ("scan_to_model_mm", "scan_to_model")):
+            row[key] = _number(fit.summary_mm("final", direction, "mean"))
+        if self._ours(fit) and "z" in fit.record:
+            try:
+                row["z"] = _rounded(fit.numbers("z"))
+            except ShapespaceError as error:
+                row |= {"status": "unreadable", "reason": str(error), "pictured": False}
+        return row
+
+
+def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
+    """Return the shape with coefficients `z` (k,) in standard deviations; missing ones are zero.
+
+    Raises:
+        InputError: more than the model has, or values that are not finite.
+    """
+    given = np.asarray(z, dtype=np.float64)
+    return model.mesh(given * model.stddev[: len(given)] if given.ndim == 1 and len(given) <= model.n_modes else given)
+
+
+def _rank(status: str) -> int:
+    return _ORDER.index(status) if status in _ORDER else 0
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.{_DIGITS}g}") for value in values]

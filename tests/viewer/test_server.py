@@ -1,0 +1,324 @@
+"""The viewer's server: who may see what, what is refused and how, and what is left behind."""
+
+import json
+import os
+import shutil
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from viewer_world import Start, drop, model, scan_file, sentence, start, told
+
+from shapespace.batch.run import Job, fit_file
+from shapespace.fit.fit import FitConfig
+from shapespace.io.meshes import read_mesh
+from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer.fitting import Upload
+from shapespace.viewer.shown import Shown
+
+__all__ = ["model", "scan_file", "start"]
+
+
+def dies(pipe: Connection, upload: Upload) -> None:
+    pipe.send_bytes(json.dumps({"event": "started fitting"}).encode())
+    os.abort()
+
+
+def waits(pipe: Connection, upload: Upload) -> None:
+    time.sleep(60)
+
+
+def agrees(pipe: Connection, upload: Upload) -> None:
+    pipe.send_bytes(json.dumps({"event": "verdict", "status": "converged", "reason": "It is good."}).encode())
+    time.sleep(60)
+
+
+def until(true: object, seconds: float = 10) -> None:
+    assert callable(true)
+    ends = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
+def test_a_dropped_scan_is_fitted_as_the_command_line_does(
+    start: Start, model: ShapeModel, scan_file: Path, tmp_path: Path
+) -> None:
+    viewer = start()
+    visitor = viewer.visitor()
+    answer = drop(visitor, scan_file.read_bytes(), scan_file.name)
+    assert answer.status_code == 201
+    key = answer.json()["id"]
+    events = told(visitor, key)
+    kinds = [event["event"] for event in events]
+    assert kinds[:3] == ["queue", "started", "scan"] and kinds[-2:] == ["verdict", "done"]
+    assert set(kinds[3:-2]) == {"state"} and len(kinds) > 8
+    verdict = events[-2]
+    assert verdict["status"] == "converged" and verdict["pictured"]
+
+    fit_file(Job("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
+    expected = json.loads((tmp_path / "cli.fit.json").read_text())
+    record = visitor.get(f"/api/scans/{key}/record").json()
+    for one in (record, expected):
+        del one["seconds"]
+        del one["scan"]["path"], one["model"]["path"]
+    assert record == expected
+    assert verdict["b"] == record["b"] == [state for state in events if state["event"] == "state"][-1]["b"]
+
+    for part in ("preview", "picture"):
+        assert len(visitor.get(f"/api/scans/{key}/{part}").content) > 10_000
+    # What was uploaded is gone, what came of it is not.
+    assert not list(viewer.root.rglob("upload-*")) and list(viewer.root.rglob("*.fitted.ply"))
+
+
+def test_two_visitors_do_not_see_each_others_scans(start: Start, scan_file: Path) -> None:
+    viewer = start(worker=agrees)
+    one, other = viewer.visitor(), viewer.visitor()
+    key = drop(one, scan_file.read_bytes()).json()["id"]
+    assert told(one, key)[-1]["event"] == "done"
+    assert [scan["id"] for scan in one.get("/api/scans").json()] == [key]
+    assert other.get("/api/scans").json() == []
+    for part in ("events", "preview", "picture", "record"):
+        assert other.get(f"/api/scans/{key}/{part}").status_code == 404
+    assert other.post(f"/api/scans/{key}/cancel").status_code == 404
+    assert other.post(f"/api/scans/{key}/landmarks", json={"landmarks": {}}).status_code == 404
+    assert other.delete(f"/api/scans/{key}").status_code == 404
+    assert other.post("/api/export?format=ply", json={"scan": key}).status_code == 404
+    stranger = viewer.stranger()
+    assert drop(stranger, b"x").status_code == 403
+    assert "HttpOnly; SameSite=Strict" in stranger.get("/").headers["set-cookie"]
+    assert one.delete(f"/api/scans/{key}").status_code == 200 and not (viewer.root / key).exists()
+
+
+def test_a_crash_in_a_fit_leaves_the_server_up_and_is_one_sentence(start: Start) -> None:
+    viewer = start(worker=dies)
+    visitor = viewer.visitor()
+    events = told(visitor, drop(visitor, b"anything").json()["id"])
+    assert events[-2]["status"] == "failed" and "memory" in events[-2]["reason"]
+    assert visitor.get("/api/about").status_code == 200 and not list(viewer.root.rglob("upload-*"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("empty.ply", b"", "empty.ply: it is empty"),
+        ("broken.ply", b"ply\nformat ascii 1.0\nelement vertex 5\n", "broken.ply"),
+        ("one.obj", b"v 0 0 0\n", "one.obj"),
+        ("../../../etc/passwd.stl", b"solid\n", "passwd.stl"),
+    ],
+)
+def test_a_broken_file_is_one_sentence_that_names_it(start: Start, name: str, content: bytes, says: str) -> None:
+    viewer = start()
+    visitor = viewer.visitor()
+    events = told(visitor, drop(visitor, content, name).json()["id"])
+    assert [event["event"] for event in events[-2:]] == ["verdict", "done"]
+    reason = events[-2]["reason"]
+    assert events[-2]["status"] == "failed" and says in reason and reason.endswith(".")
+    assert str(viewer.root) not in reason and "upload-" not in reason
+    assert not list(viewer.root.rglob("upload-*"))
+
+
+def test_scans_that_are_too_large_or_of_another_kind_are_refused(start: Start) -> None:
+    viewer = start(worker=agrees, upload_bytes=1000)
+    visitor = viewer.visitor()
+    assert drop(visitor, b"x" * 1000).status_code == 201
+    announced = drop(visitor, b"x" * 1001)
+    assert announced.status_code == 413 and "larger than" in sentence(announced)
+    grown = visitor.put("/api/scans?name=a.ply", content=iter([b"x" * 600, b"x" * 600]))
+    assert grown.status_code == 413 and "larger than" in sentence(grown)
+    for name in ("a.exe", "a", "", "a.ply.html"):
+        other = drop(visitor, b"x", name)
+        assert other.status_code == 415 and ".ply" in sentence(other)
+    assert len([path for path in viewer.root.iterdir() if path.is_dir()]) == 1
+
+
+def test_the_queue_and_the_limit_of_one_visitor(start: Start) -> None:
+    viewer = start(worker=waits, fits_at_once=1, unfinished=2)
+    visitor = viewer.visitor()
+    first, second = (drop(visitor, b"x").json()["id"] for _ in range(2))
+    full = drop(visitor, b"x")
+    assert full.status_code == 429 and "2 of your scans" in sentence(full)
+    states = {scan["id"]: scan["state"] for scan in visitor.get("/api/scans").json()}
+    until(lambda: visitor.get("/api/scans").json()[0]["state"] == "fitting")
+    assert states[second] == "waiting"
+    assert visitor.post(f"/api/scans/{first}/cancel").status_code == 200
+    assert "stopped" in told(visitor, first)[-2]["reason"]
+    until(lambda: visitor.get("/api/scans").json()[1]["state"] == "fitting")
+    assert visitor.delete(f"/api/scans/{second}").status_code == 200
+    until(lambda: not (viewer.root / second).exists())
+
+
+def test_a_fit_that_takes_too_long_is_stopped(start: Start) -> None:
+    visitor = start(worker=waits, fit_s=0.2).visitor()
+    assert "longer than" in told(visitor, drop(visitor, b"x").json()["id"])[-2]["reason"]
+
+
+def test_a_fit_that_nobody_watches_is_stopped(start: Start) -> None:
+    viewer = start(worker=waits, unwatched_s=0.5)
+    visitor = viewer.visitor()
+    key = drop(visitor, b"x").json()["id"]
+    with visitor.stream("GET", f"/api/scans/{key}/events") as answer:
+        lines = answer.iter_lines()
+        next(lines)
+        time.sleep(1.0)
+        assert visitor.get("/api/scans").json()[0]["state"] == "fitting"
+    until(lambda: visitor.get("/api/scans").json()[0]["state"] == "done")
+
+
+def test_a_visit_ends_after_a_while_and_its_scans_with_it(start: Start) -> None:
+    viewer = start(worker=agrees, idle_s=0.3)
+    visitor = viewer.visitor()
+    key = drop(visitor, b"x").json()["id"]
+    told(visitor, key)
+    until(lambda: not (viewer.root / key).exists())
+    gone = drop(visitor, b"x")
+    assert gone.status_code == 403 and "reload" in sentence(gone)
+
+
+def test_nothing_is_left_when_the_server_ends(start: Start, model: ShapeModel) -> None:
+    from viewer_world import running
+
+    from shapespace.viewer.sessions import Limits
+
+    with running(Shown(model, "m.h5"), Limits(), None, waits) as viewer:
+        visitor = viewer.visitor()
+        key = drop(visitor, b"x").json()["id"]
+        assert oct(viewer.root.stat().st_mode)[-3:] == oct((viewer.root / key).stat().st_mode)[-3:] == "700"
+        until(lambda: visitor.get("/api/scans").json()[0]["state"] == "fitting")
+        began = time.monotonic()
+    assert not viewer.root.exists() and time.monotonic() - began < 10
+
+
+def test_with_a_token_nothing_is_answered_without_it(start: Start) -> None:
+    viewer = start(token="a-secret")
+    stranger = viewer.stranger()
+    for path in ("/", "/api/about", "/api/model", "/assets/viewer.js", "/?token=wrong", "/?token="):
+        refused = stranger.get(path)
+        assert refused.status_code == 401 and "token" in sentence(refused)
+    assert drop(stranger, b"x").status_code == 401
+    invited = viewer.stranger()
+    assert invited.get("/?token=a-secret").status_code == 200
+    assert invited.get("/api/about").status_code == 200 and drop(invited, b"").status_code == 201
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
+def test_on_loopback_other_host_names_are_refused(start: Start, host: str) -> None:
+    answer = httpx.get(start().address + "/api/about", headers={"host": host})
+    assert answer.status_code in (400, 421)
+
+
+def test_other_pages_can_change_and_load_nothing(start: Start) -> None:
+    viewer = start(worker=agrees)
+    visitor = viewer.visitor()
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
+        assert visitor.put("/api/scans?name=a.ply", content=b"x", headers={"origin": origin}).status_code == 403
+        assert visitor.post("/api/export?format=ply", json={"z": []}, headers={"origin": origin}).status_code == 403
+    assert visitor.get("/api/model", headers={"sec-fetch-site": "cross-site"}).status_code == 403
+    own = {"origin": viewer.address, "sec-fetch-site": "same-origin"}
+    assert visitor.put("/api/scans?name=a.ply", content=b"x", headers=own).status_code == 201
+
+
+def test_every_answer_forbids_what_the_page_does_not_need(start: Start) -> None:
+    visitor = start().visitor()
+    for path in ("/", "/api/about", "/nothing", "/assets/viewer.js"):
+        headers = visitor.get(path).headers
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert "unsafe" not in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff" and headers["referrer-policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize("path", ["/api/fits/..%2f..%2fmodel.h5", "/assets/..%2fserver.py", "/assets/fitting.py", "/x"])
+def test_no_address_leads_out_of_what_is_shown(start: Start, path: str) -> None:
+    answer = start().visitor().get(path)
+    assert answer.status_code == 404 and sentence(answer)
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "stl"])
+def test_an_exported_shape_is_the_models(start: Start, model: ShapeModel, kind: str, tmp_path: Path) -> None:
+    z = [1.5, -2.0, 0.25]
+    answer = start().visitor().post(f"/api/export?format={kind}", json={"z": z})
+    path = tmp_path / f"shape.{kind}"
+    path.write_bytes(answer.content)
+    expected = model.reconstruct(np.array(z) * model.stddev[:3])
+    found = read_mesh(path).vertices
+    if kind == "stl":
+        found, expected = (np.array(sorted(v.round(2).tolist())) for v in (found, expected))
+    assert np.allclose(found, expected, atol=2e-2 if kind == "stl" else 1e-12)
+
+
+@pytest.mark.parametrize(
+    "question", [{"z": [0] * 99}, {"z": ["a"]}, {"z": None}, {"z": [1e300]}, {"fit": "none"}, {"scan": "none"}, []]
+)
+def test_an_export_of_what_there_is_not_is_one_sentence(start: Start, question: object) -> None:
+    answer = start().visitor().post("/api/export?format=ply", json=question)
+    assert answer.status_code in (400, 404, 422) and sentence(answer)
+
+
+def test_a_doubtful_fit_is_helped_by_landmarks_and_by_no_nonsense(
+    start: Start, model: ShapeModel, scan_file: Path
+) -> None:
+    viewer = start(worker=doubts)
+    visitor = viewer.visitor()
+    key = drop(visitor, scan_file.read_bytes()).json()["id"]
+    events = told(visitor, key)
+    assert events[-2]["status"] == "doubtful" and events[-1]["can_place_landmarks"]
+    good = {name: model.mean_vertices[vertex].tolist() for name, vertex in model.landmarks.items()}
+
+    def place(landmarks: object) -> httpx.Response:
+        return visitor.post(f"/api/scans/{key}/landmarks", json={"landmarks": landmarks})
+
+    for bad in ({}, dict(list(good.items())[:2]), good | {"=evil()": [0, 0, 0]}, good | {"tip": [0, "a", 0]}, [1]):
+        assert place(bad).status_code == 400 and sentence(place(bad))
+    assert place(good).status_code == 200
+    events = told(visitor, key)
+    assert events[-2]["status"] == "converged" and events[-2]["start"] == "landmarks"
+    assert place(good).status_code == 409 and not list(viewer.root.rglob("upload-*"))
+
+
+def doubts(pipe: Connection, upload: Upload) -> None:
+    """Doubt every scan without landmarks; with them fit it for once."""
+    from shapespace.viewer.fitting import fit_upload
+
+    if upload.landmarks:
+        fit_upload(pipe, upload)
+        return
+    for event in ({"event": "scan"}, {"event": "verdict", "status": "doubtful", "reason": "It is not."}):
+        pipe.send_bytes(json.dumps(event).encode())
+    time.sleep(60)
+
+
+@pytest.fixture
+def fits(model: ShapeModel, scan_file: Path, tmp_path: Path) -> Path:
+    """A folder of results: a good fit with stages, one without, a failed one, a damaged record."""
+    model.save(tmp_path / "model.h5")
+    folder = tmp_path / "fits"
+    folder.mkdir()
+    (tmp_path / "empty.ply").write_bytes(b"")
+    for name, file, stages in (("a", scan_file, True), ("b", scan_file, False), ("c", tmp_path / "empty.ply", True)):
+        fit_file(Job(name, file), model, tmp_path / "model.h5", folder, FitConfig(), stages=stages)
+    (folder / "d.fit.json").write_text("{")
+    return folder
+
+
+def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fits: Path, model: ShapeModel) -> None:
+    visitor = start(Shown.open(fits)).visitor()
+    listed = visitor.get("/api/fits").json()
+    assert [(row["name"], row["status"], row["pictured"]) for row in listed] == [
+        ("d", "unreadable", False),
+        ("c", "failed", False),
+        ("a", "converged", True),
+        ("b", "converged", False),
+    ]
+    assert len(listed[2]["z"]) == model.n_modes and "--stages" in listed[3]["why_not"]
+    assert len(visitor.get("/api/fits/a").content) > 10_000
+    for name in ("b", "c", "d"):
+        answer = visitor.get(f"/api/fits/{name}")
+        assert answer.status_code == 422 and sentence(answer)
+    saved = visitor.post("/api/export?format=ply", json={"fit": "a"})
+    assert saved.content == (fits / "a.fitted.ply").read_bytes()
+    shutil.copy(fits / "a.fit.json", fits / "e.fit.json")
+    assert len(visitor.get("/api/fits").json()) == 5
