@@ -109,12 +109,30 @@ def test_names_that_look_like_formulas_are_made_harmless(tmp_path: Path) -> None
     assert (said["scan"], said["reason"]) == ("'=cmd()", "'@why")
 
 
-def test_stages_are_kept_for_figures(tmp_path: Path, result: FitResult) -> None:
+def test_stages_are_kept_for_figures_in_the_frame_of_the_model(tmp_path: Path, result: FitResult) -> None:
     write_stages(tmp_path / "s.npz", result, blob_model())
     with np.load(tmp_path / "s.npz", allow_pickle=False) as stages:
-        assert np.allclose(stages["final"], 1000 * result.surface(blob_model()).vertices, rtol=1e-5, atol=1e-2)
-        assert np.allclose(stages["model_to_scan_final"], result.distances.model_to_scan_mm, rtol=1e-5)
-        assert {"before", "initial", "scan_to_model_initial", "faces"} <= set(stages.files)
+        assert np.allclose(stages["final"], blob_model().reconstruct(result.b), atol=1e-3)
+        assert np.allclose(np.abs(stages["model_to_scan_final"]), result.distances.model_to_scan_mm, rtol=1e-5)
+        assert {"before", "initial", "scan_to_model_initial", "faces", "scan", "scan_faces", "regions"} <= set(
+            stages.files
+        )
+        assert np.allclose(stages["scan"], result.T_scan_model.inverse().apply(result.scan.vertices), atol=1e-3)
+
+
+def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: FitResult) -> None:
+    write_stages(tmp_path / "s.npz", result, blob_model())
+    with np.load(tmp_path / "s.npz", allow_pickle=False) as stages:
+        assert len(stages["history_phase"]) == len(result.history)
+        assert stages["history_rms_mm"][-1] == pytest.approx(result.history[-1].rms_mm)
+        T = stages["history_T"][-1]
+        last = blob_model().reconstruct(stages["history_b"][-1].astype(float)) @ T[:, :3].T + T[:, 3]
+        assert np.allclose(last, stages["final"], atol=1e-2)
+
+
+def test_sources_are_told_relative_to_the_results(tmp_path: Path) -> None:
+    source = Source.at(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
+    assert source.as_dict() == {"name": "m.h5", "hash": "h", "path": "../models/m.h5"}
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"scan": 1', "[]", '{"format": "other"}', "nonsense"])

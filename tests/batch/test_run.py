@@ -55,7 +55,7 @@ def without_times(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     jobs = make_jobs(with_a_bad_one(scans, tmp_path))
-    records = fit_files(jobs, model, "blob.h5", tmp_path / "out", CONFIG)
+    records = fit_files(jobs, model, Path("blob.h5"), tmp_path / "out", CONFIG)
     assert [r["status"] == "failed" for r in records] == [False, True, True, False, False]
     rows = table(tmp_path / "out")
     assert [row["scan"] for row in rows] == ["scan0", "bad", "missing", "scan1", "scan2"]
@@ -73,7 +73,7 @@ def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: l
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_files(make_jobs(scans), model, "blob.h5", tmp_path, CONFIG, on_done=stop)
+        fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, on_done=stop)
     (row,) = table(tmp_path)
     assert row["scan"] == "scan0"
     assert np.isfinite(float(row["b1"]))
@@ -81,7 +81,7 @@ def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: l
     again: list[str] = []
     original, run.fit_file = run.fit_file, lambda job, *a, **k: (again.append(job.name), original(job, *a, **k))[1]
     try:
-        records = fit_files(make_jobs(scans), model, "blob.h5", tmp_path, CONFIG, resume=True)
+        records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
     finally:
         run.fit_file = original
     assert again == ["scan1", "scan2"]
@@ -95,7 +95,7 @@ def test_resume_keeps_what_still_holds_and_only_that(
 ) -> None:
     scan, out, config = tmp_path / "s.ply", tmp_path / "out", CONFIG
     scan.write_bytes(scans[0].read_bytes() if changed != "failed" else b"no mesh")
-    fit_files(make_jobs([scan]), model, "m", out, config)
+    fit_files(make_jobs([scan]), model, Path("m"), out, config)
     if changed == "scan":
         scan.write_bytes(scans[1].read_bytes())
     elif changed == "model":
@@ -109,7 +109,7 @@ def test_resume_keeps_what_still_holds_and_only_that(
     calls: list[str] = []
     original = run.fit_file
     monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
-    fit_files(make_jobs([scan]), model, "m", out, config, resume=True)
+    fit_files(make_jobs([scan]), model, Path("m"), out, config, resume=True)
     assert calls == ([] if changed == "nothing" else ["s"])
 
 
@@ -118,11 +118,11 @@ def test_every_executor_gives_what_one_after_the_other_gives(
     kind: str, model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
 ) -> None:
     jobs = make_jobs(with_a_bad_one(scans, tmp_path))
-    here = fit_files(jobs, model, "blob.h5", tmp_path / "here", CONFIG)
+    here = fit_files(jobs, model, Path("blob.h5"), tmp_path / "here", CONFIG)
     done: list[str] = []
     with make_executor(model_path, 2, kind) as executor:
         there = fit_files(
-            jobs, model, "blob.h5", tmp_path / "there", CONFIG, executor=executor,
+            jobs, model, Path("blob.h5"), tmp_path / "there", CONFIG, executor=executor,
             on_done=lambda job, _: done.append(job.name),
         )  # fmt: skip
     assert [without_times(r) for r in there] == [without_times(r) for r in here]
@@ -134,7 +134,7 @@ def test_every_executor_gives_what_one_after_the_other_gives(
 def test_a_worker_without_a_model_says_so(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     run._model = None
     with ThreadPoolExecutor(1) as executor, pytest.raises(FileError, match="no model"):
-        fit_files(make_jobs(scans[:1]), model, "m", tmp_path, CONFIG, executor=executor)
+        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, executor=executor)
 
 
 def test_scans_of_the_same_name_get_names_of_their_own() -> None:
@@ -148,10 +148,12 @@ def test_scans_of_the_same_name_get_names_of_their_own() -> None:
 def test_a_folder_that_cannot_be_made_is_named(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(FileError, match=r"Cannot write .*file"):
-        fit_files(make_jobs(scans[:1]), model, "m", tmp_path / "file" / "out", CONFIG)
+        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path / "file" / "out", CONFIG)
 
 
 def test_all_states_are_told_when_fits_run_here(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     told: list[int] = []
-    (record,) = fit_files(make_jobs(scans[:1]), model, "m", tmp_path, CONFIG, on_state=lambda s: told.append(s.phase))
+    (record,) = fit_files(
+        make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_state=lambda s: told.append(s.phase)
+    )
     assert len(told) == len(record["history"])

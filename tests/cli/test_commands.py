@@ -271,8 +271,13 @@ def test_fit_writes_the_files_of_the_contract_and_no_others(fitted: Path, world:
 def test_the_record_holds_the_keys_of_the_contract(fitted: Path, world: World) -> None:
     record = record_of(fitted)
     model = ShapeModel.load(world.model)
-    assert record["scan"] == {"name": "scan_0.ply", "hash": sha256_of_file(world.scan)}
-    assert record["model"] == {"name": "model.h5", "hash": model.content_hash}
+    for key, name, content_hash in (
+        ("scan", "scan_0.ply", sha256_of_file(world.scan)),
+        ("model", "model.h5", model.content_hash),
+    ):
+        source = record[key]
+        assert (source["name"], source["hash"]) == (name, content_hash)
+        assert sorted(source) == ["hash", "name", "path"]
     assert record["status"] == "converged" and record["reason"].endswith(".")
     assert record["method"] == "robust"
     assert record["config"]["version"] == __version__ and "seed" in record["config"]

@@ -76,3 +76,17 @@ def test_point_clouds_are_measured_to_their_points() -> None:
     assert np.allclose(d.scan_to_model_mm, 3.0)
     # A model without triangles has no rim, so the whole scan counts.
     assert surface_distances(Mesh(model.vertices), scan).scan_counted.all()
+
+
+def test_distances_are_signed_by_the_side_of_the_model_on_which_the_scan_lies() -> None:
+    above, below = (surface_distances(sheet(7), sheet(10, z=z)) for z in (1.25, -1.25))
+    assert np.allclose(above.model_to_scan_signed_mm, 1.25)
+    assert np.allclose(below.model_to_scan_signed_mm, -1.25)
+    counted = above.scan_counted
+    assert np.allclose(above.scan_to_model_signed_mm[counted], 1.25)
+    assert np.allclose(below.scan_to_model_signed_mm[counted], -1.25)
+    assert np.isnan(above.scan_to_model_signed_mm[~counted]).all()
+    cloud = surface_distances(sheet(7), Mesh(sheet(10, z=-1.25).vertices))
+    assert (cloud.model_to_scan_signed_mm < 0).all()
+    # Points have no sides.
+    assert (surface_distances(Mesh(sheet(7).vertices), sheet(10, z=-1.25)).model_to_scan_signed_mm > 0).all()

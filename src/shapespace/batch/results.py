@@ -52,8 +52,9 @@ class Source:
         return Source(file.name, content_hash, Path(path).as_posix())
 
     def as_dict(self) -> dict[str, str]:
-        """Return it as it stands in a result file."""
-        return {"name": self.name, "hash": self.content_hash, "path": self.path}
+        """Return it as it stands in a result file; a path that is not known is left out."""
+        known = {"path": self.path} if self.path else {}
+        return {"name": self.name, "hash": self.content_hash, **known}
 
 
 def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source | None = None) -> dict[str, Any]:

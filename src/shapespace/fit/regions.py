@@ -10,6 +10,7 @@ from shapespace.fit.matching import match_vertices
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.weights import match_weights
 from shapespace.geometry.closest import on_boundary
+from shapespace.geometry.surface import rms_size
 from shapespace.types import FloatArray, IntArray, Similarity
 
 REGIONS = ("followed", "rejected", "border", "unseen")
@@ -18,6 +19,10 @@ REGIONS = ("followed", "rejected", "border", "unseen")
 FOLLOWED, REJECTED, BORDER, UNSEEN = range(4)
 _COUNTS = 0.5
 """A match that counts less than this was left out, in the main."""
+_SPACINGS = 4.0
+"""Nearest points of a cloud lie to the side by half its spacing as a rule; so many times that is a hole."""
+_FINEST = 0.01
+"""Of the model's size: what lies nearer than this is followed, however exact the rest is."""
 
 
 def all_followed(vertices: int) -> IntArray:
@@ -58,12 +63,15 @@ class FinalMatches:
             self.target, self.target.engine, self.T_scan_model, self.vertices, self.normals, every, None,
             winding=self.winding, normal_cosine=self.normal_cosine,
         )  # fmt: skip
-        at_rim = on_boundary(matches.near, self.target.mesh, self.target.rim)
-        kept = np.ones(len(every), dtype=bool)
-        w = match_weights(self.weight, matches.residual, matches.distance, kept, self.width_mm, self.far_mm)
+        w = match_weights(
+            self.weight, matches.residual, np.zeros(len(every)), matches.allowed, self.width_mm, self.far_mm
+        )
+        near_mm = max(self.width_mm, _FINEST * rms_size(self.vertices))
         sideways = np.sqrt(np.maximum(matches.distance**2 - matches.residual**2, 0.0))
-        regions = np.where(matches.allowed & (w > _COUNTS), FOLLOWED, REJECTED)
+        counted = (w > _COUNTS) | (matches.allowed & (np.abs(matches.residual) < near_mm))
+        regions = np.where(counted, FOLLOWED, REJECTED)
         # Where the nearest point of the scan lies off to the side, the scan has nothing at the vertex itself.
-        regions[(regions == REJECTED) & (sideways > self.far_mm)] = UNSEEN
-        regions[at_rim] = np.where(sideways[at_rim] > self.width_mm, UNSEEN, BORDER)
+        regions[sideways > max(self.far_mm, _SPACINGS * float(np.median(sideways)))] = UNSEEN
+        at_rim = on_boundary(matches.near, self.target.mesh, self.target.rim)
+        regions[at_rim] = np.where(sideways[at_rim] > near_mm, UNSEEN, BORDER)
         return regions.astype(np.int32)

@@ -132,7 +132,8 @@ class StagedFit:
         except (KeyError, ValueError, TypeError, IndexError, ShapespaceError) as error:
             raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {again}.") from error
         V, S = len(surfaces["final"].vertices), len(scan.vertices)
-        whole = all(len(surface.vertices) == V for surface in surfaces.values())
+        whole = all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values()))
+        whole &= all(len(surface.vertices) == V for surface in surfaces.values())
         whole &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
         whole &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
         whole &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
@@ -146,5 +147,7 @@ class StagedFit:
 
 def _similarity(T: npt.NDArray[Any]) -> Similarity:
     matrix = np.asarray(T, dtype=np.float64)
+    if not np.isfinite(matrix).all():
+        raise ValueError("a pose that is not finite")
     scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
     return Similarity(scale, matrix[:, :3] / scale, matrix[:, 3])
