@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto $(PYTEST)
+	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -34,4 +34,4 @@ $(READY): pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) build demo-out bench-out .pytest_cache .ruff_cache
+	rm -rf $(VENV) build demo-out bench-out screenshots-out .pytest_cache .ruff_cache
