@@ -136,17 +136,19 @@
 
   // Light and material ----------------------------------------------------------------------------------------------
 
-  // One light for all: a soft key from the camera's upper left, and more from the sky than from the ground.
+  // One light for all: a soft key from the camera's upper left, and more from the sky than from the ground. Squares and
+  // roots stand for the sRGB curve, as powers cost a third of the frame where the processor draws.
   const LIGHT = `
     vec3 lit(vec3 colour, vec3 n, float back, float painted) {
-      vec3 base = pow(colour, vec3(2.2));
+      vec3 base = colour * colour;
       base = mix(base, base * vec3(0.42, 0.45, 0.52), back);
       float key = clamp(dot(n, vec3(-0.412, 0.514, 0.752)) * 0.92 + 0.08, 0.0, 1.0);
       float sky = 0.5 + 0.5 * n.y;
       vec3 light = key * vec3(0.80, 0.785, 0.76) + mix(vec3(0.17, 0.165, 0.17), vec3(0.33, 0.35, 0.38), sky);
-      light += 0.10 * pow(1.0 - clamp(n.z, 0.0, 1.0), 3.0);
+      float edge = 1.0 - clamp(n.z, 0.0, 1.0);
+      light += 0.10 * edge * edge * edge;
       light = mix(light, 0.55 + 0.45 * light, painted);
-      return pow(clamp(base * light, 0.0, 1.0), vec3(1.0 / 2.2));
+      return sqrt(min(base * light, 1.0));
     }`;
 
   const COLOUR = `
@@ -213,15 +215,23 @@
     shared = null;
     if (!window.THREE) return shared;
     try {
-      const canvas = document.createElement("canvas");
-      const options = { alpha: true, antialias: true, depth: true, stencil: false, premultipliedAlpha: true };
+      const aside = typeof OffscreenCanvas === "function" && new OffscreenCanvas(8, 8);
+      const probe = aside && aside.getContext("webgl2");
+      if (!aside || !probe) return shared;
+      const info = probe.getExtension("WEBGL_debug_renderer_info");
+      const name = String(probe.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : probe.RENDERER));
+      lose(probe);
+      const bySoftware = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+      const canvas = new OffscreenCanvas(8, 8);
+      canvas.style = {};
+      const options = { alpha: true, antialias: !bySoftware, depth: true, stencil: false, premultipliedAlpha: true };
       const context = canvas.getContext("webgl2", options);
       if (!context) return shared;
       const renderer = new THREE.WebGLRenderer({ canvas, context, ...options });
       renderer.autoClear = false;
       renderer.setClearColor(0x000000, 0);
       renderer.debug.checkShaderErrors = false;
-      shared = { canvas, context, renderer, lost: false };
+      shared = { canvas, context, renderer, bySoftware, lost: false };
       canvas.addEventListener("webglcontextlost", (event) => {
         event.preventDefault();
         shared.lost = true;
@@ -236,6 +246,11 @@
     return shared;
   }
 
+  function lose(context) {
+    const extension = context.getExtension("WEBGL_lose_context");
+    if (extension) extension.loseContext();
+  }
+
   const waiting = new Set();
   let scheduled = 0;
   function flush() {
@@ -247,6 +262,7 @@
 
   // A view ----------------------------------------------------------------------------------------------------------
 
+  const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws
   const FIELD = (20 * Math.PI) / 180;
   const GREY = [0.62, 0.62, 0.62];
   const SIGNAL = [0.8, 0.1, 0.45];
@@ -278,7 +294,8 @@
       this.canvas = document.createElement("canvas");
       this.canvas.className = "shapespace-canvas";
       Object.assign(this.canvas.style, {
-        display: "block", width: "100%", height: "100%", touchAction: embedded ? "pan-y" : "none", cursor: "grab",
+        position: "absolute", inset: "0", width: "100%", height: "100%", touchAction: embedded ? "pan-y" : "none",
+        cursor: "grab", background: background || "transparent",
       });
       if (!this.works) {
         this._note = document.createElement("p");
@@ -291,8 +308,16 @@
       this.label = label;
       this.canvas.tabIndex = 0;
       this.canvas.setAttribute("role", "application");
-      element.appendChild(this.canvas);
-      this._context = this.canvas.getContext("2d");
+      this._frame = document.createElement("div");
+      Object.assign(this._frame.style, { position: "relative", width: "100%", height: "100%", overflow: "hidden" });
+      this._names = document.createElement("canvas");
+      this._names.setAttribute("aria-hidden", "true");
+      Object.assign(this._names.style, {
+        position: "absolute", inset: "0", width: "100%", height: "100%", pointerEvents: "none", display: "none",
+      });
+      this._frame.append(this.canvas, this._names);
+      element.appendChild(this._frame);
+      this._shown = this.canvas.getContext("bitmaprenderer");
       this._scene = new THREE.Scene();
       this._eye = new THREE.PerspectiveCamera(20, 1, 1, 1000);
       this._eye.matrixAutoUpdate = false;
@@ -541,7 +566,7 @@
 
     _pan(dx, dy) {
       const { right, up } = this._axes();
-      const perPixel = (2 * this._distance() * Math.tan(FIELD / 2)) / Math.max(this.canvas.clientHeight, 1);
+      const perPixel = (2 * this._distance() * Math.tan(FIELD / 2)) / Math.max(this._frame.clientHeight, 1);
       this._camera.target = this._camera.target.map((t, i) => t + (-dx * right[i] + dy * up[i]) * perPixel);
       this._moved();
     }
@@ -561,9 +586,9 @@
 
     _distance() {
       const [w, h, d] = this._camera.extent;
-      const aspect = Math.max(this.canvas.clientWidth, 1) / Math.max(this.canvas.clientHeight, 1);
+      const aspect = Math.max(this._frame.clientWidth, 1) / Math.max(this._frame.clientHeight, 1);
       const half = 0.5 * Math.max(h, Math.max(w, 0.7 * d) / aspect) * 1.08;
-      return (half / Math.tan(FIELD / 2) + d / 2) * this._camera.zoom;
+      return (half / Math.tan(FIELD / 2) + 0.2 * d) * this._camera.zoom;
     }
 
     // Drawing
@@ -575,40 +600,42 @@
       if (!scheduled) scheduled = requestAnimationFrame(flush);
     }
 
-    /** Draw at once, wait until the picture is there, and return the milliseconds it took. */
+    /** Draw at once as while something moves, wait until the picture is there, and return the milliseconds it took. */
     redraw() {
       if (!this.works) return NaN;
       const start = performance.now();
       this._draw(true);
-      this._context.getImageData(0, 0, 1, 1);
       return performance.now() - start;
     }
 
-    _draw(always) {
+    _draw(wait) {
       const page = gpu();
       waiting.delete(this);
-      if (!page || page.lost || this._disposed || !(this._near || always)) return;
-      const ratio = Math.min(window.devicePixelRatio || 1, 2);
-      const width = Math.round(this.canvas.clientWidth * ratio), height = Math.round(this.canvas.clientHeight * ratio);
+      clearTimeout(this._later);
+      if (!page || page.lost || this._disposed || !(this._near || wait)) return;
+      const area = this._frame.clientWidth * this._frame.clientHeight;
+      if (!area) return;
+      let ratio = Math.min(window.devicePixelRatio || 1, 2);
+      if (page.bySoftware) {
+        // What moves is drawn coarser, and again at twice the resolution once it rests.
+        ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / area), 0.5));
+        this._later = setTimeout(() => this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area))), RESTS_MS);
+      }
+      this._present(ratio, wait);
+    }
+
+    _present(ratio, wait) {
+      const page = gpu();
+      if (page.lost || this._disposed) return;
+      const width = Math.round(this._frame.clientWidth * ratio), height = Math.round(this._frame.clientHeight * ratio);
       if (width < 1 || height < 1) return;
       const start = performance.now();
-      if (this.canvas.width !== width || this.canvas.height !== height) {
-        this.canvas.width = width;
-        this.canvas.height = height;
-      }
       if (page.canvas.width !== width || page.canvas.height !== height) page.renderer.setSize(width, height, false);
       this._aim(width, height);
       this._render(page.renderer, height, ratio);
-      const context = this._context;
-      context.globalCompositeOperation = "copy";
-      if (this._background) {
-        context.fillStyle = this._background;
-        context.fillRect(0, 0, width, height);
-        context.globalCompositeOperation = "source-over";
-      }
-      context.drawImage(page.canvas, 0, 0);
-      context.globalCompositeOperation = "source-over";
-      this._write(context, ratio);
+      if (wait) page.context.readPixels(0, 0, 1, 1, page.context.RGBA, page.context.UNSIGNED_BYTE, new Uint8Array(4));
+      this._shown.transferFromImageBitmap(page.canvas.transferToImageBitmap());
+      this._write();
       this.frames += 1;
       this.lastRedrawMs = performance.now() - start;
       this._emit("draw", this);
@@ -666,10 +693,15 @@
       });
     }
 
-    _write(context, ratio) {
+    _write() {
+      const names = this._names;
+      names.style.display = this._marks.size ? "block" : "none";
       if (!this._marks.size) return;
-      const style = getComputedStyle(this.element);
-      context.font = `${12 * ratio}px ${style.fontFamily || "sans-serif"}`;
+      const ratio = Math.min(window.devicePixelRatio || 1, 2);
+      names.width = Math.round(this._frame.clientWidth * ratio);
+      names.height = Math.round(this._frame.clientHeight * ratio);
+      const context = names.getContext("2d");
+      context.font = `${12 * ratio}px ${getComputedStyle(this.element).fontFamily || "sans-serif"}`;
       context.textBaseline = "middle";
       context.lineJoin = "round";
       for (const [id, marks] of this._marks) {
@@ -696,8 +728,8 @@
       const d = point.map((value, i) => value - this._camera.target[i]);
       const dot = (axis) => d[0] * axis[0] + d[1] * axis[1] + d[2] * axis[2];
       const depth = -dot(back);
-      const scale = this.canvas.clientHeight / (2 * Math.tan(FIELD / 2) * Math.max(distance + depth, 1e-6));
-      return [this.canvas.clientWidth / 2 + dot(right) * scale, this.canvas.clientHeight / 2 - dot(up) * scale, depth];
+      const scale = this._frame.clientHeight / (2 * Math.tan(FIELD / 2) * Math.max(distance + depth, 1e-6));
+      return [this._frame.clientWidth / 2 + dot(right) * scale, this._frame.clientHeight / 2 - dot(up) * scale, depth];
     }
 
     // Asking
@@ -745,7 +777,8 @@
     /** The picture as it stands, as PNG, on the page's own background. */
     png() {
       if (!this.works) return Promise.reject(new Error(NO_WEBGL));
-      this._draw(true);
+      clearTimeout(this._later);
+      this._present(2);
       const copyOf = document.createElement("canvas");
       copyOf.width = Math.max(this.canvas.width, 1);
       copyOf.height = Math.max(this.canvas.height, 1);
@@ -753,6 +786,7 @@
       context.fillStyle = this._background || behind(this.element);
       context.fillRect(0, 0, copyOf.width, copyOf.height);
       context.drawImage(this.canvas, 0, 0);
+      if (this._marks.size) context.drawImage(this._names, 0, 0, copyOf.width, copyOf.height);
       return new Promise((resolve, reject) =>
         copyOf.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The picture could not be made."))), "image/png")
       );
@@ -776,7 +810,8 @@
       if (this._resizes) this._resizes.disconnect();
       if (this._sees) this._sees.disconnect();
       for (const id of Array.from(this._things.keys())) this.remove(id);
-      this.canvas.remove();
+      clearTimeout(this._later);
+      if (this._frame) this._frame.remove();
       if (this._note) this._note.remove();
     }
 
