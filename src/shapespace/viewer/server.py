@@ -38,7 +38,11 @@ _OWN_ASSETS = Path(__file__).parent / "assets"
 _SHARED_ASSETS = Path(__file__).parents[1] / "report" / "assets"
 ASSETS: Mapping[str, tuple[Path, str]] = {
     "viewer.css": (_OWN_ASSETS / "viewer.css", "text/css"),
+    "charts.js": (_OWN_ASSETS / "charts.js", "text/javascript"),
+    "fit-view.js": (_OWN_ASSETS / "fit-view.js", "text/javascript"),
     "viewer.js": (_OWN_ASSETS / "viewer.js", "text/javascript"),
+    "theme.js": (_SHARED_ASSETS / "theme.js", "text/javascript"),
+    "widgets.css": (_SHARED_ASSETS / "widgets.css", "text/css"),
     "scene.js": (_SHARED_ASSETS / "scene.js", "text/javascript"),
     "three.min.js": (_SHARED_ASSETS / "vendor" / "three.min.js", "text/javascript"),
 }
@@ -163,6 +167,7 @@ class _Viewer:
                 "model": self._shown.model_name,
                 "modes": model.n_modes,
                 "modes_sent": modes,
+                "stddev": model.stddev.tolist(),
                 "vertices": model.n_vertices,
                 "triangles": 0 if model.faces is None else len(model.faces),
                 "landmarks": list(model.landmarks),

@@ -1,0 +1,968 @@
+/* The viewer's page: the model with a slider per mode, two shapes compared, saved fits, and scans dropped here. */
+(function () {
+  "use strict";
+
+  const Viewer = window.ShapespaceViewer;
+  const { h, sign, paintTrack, nice, quantile, save } = Viewer;
+  const $ = (id) => document.getElementById(id);
+  const SHOWN_AT_FIRST = 12;
+  const STATUS = {
+    converged: "You can trust this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
+    failed: "The scan could not be fitted", unreadable: "This result cannot be read",
+  };
+  const LEFT_RED = [0.83, 0.25, 0.15];
+
+  window.shapespaceReady = false;
+  window.shapespaceTimes = []; // ms from a slider's event to the picture, as drawn
+
+  let about, model, stddev, share;
+  let z; // all coefficients, standard deviations
+  let positions;
+  let stage;
+  let shown = "model";
+
+  // Messages --------------------------------------------------------------------------------------------------------
+
+  function alertUser(sentence) {
+    const close = h("button", { type: "button", class: "small quiet", onclick: () => { $("message").hidden = true; } }, "Close");
+    $("message").replaceChildren(h("span", {}, sentence), close);
+    $("message").hidden = false;
+  }
+
+  const UNREACHABLE = "The viewer's server does not answer; see whether shapespace view still runs, then reload the page.";
+
+  /** fetch, with the server's own sentence as the error. */
+  async function ask(path, options) {
+    let answer;
+    try {
+      answer = await fetch(path, options);
+    } catch (error) {
+      throw new Error(UNREACHABLE);
+    }
+    if (answer.ok) return answer;
+    let told = null;
+    try { told = (await answer.json()).error; } catch (error) { /* not one of our answers */ }
+    throw new Error(told || `The server answered with the error ${answer.status}; reload the page.`);
+  }
+
+  const guarded = (action) => async (...given) => {
+    try {
+      return await action(...given);
+    } catch (error) {
+      alertUser(error.message);
+      return undefined;
+    }
+  };
+
+  const json = async (path, options) => (await ask(path, options)).json();
+  const binary = async (path) => Shapespace.unpack(await (await ask(path)).arrayBuffer());
+  const post = (content) => ({ method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+
+  const download = guarded(async (question, kind, name) => {
+    const { fit, scan, z: shape } = question;
+    const asked = fit !== undefined ? { fit } : scan !== undefined ? { scan } : { z: Array.from(shape) };
+    const answer = await ask(`/api/export?format=${kind}`, post(asked));
+    save(await answer.blob(), `${name.replace(/[^\w.-]+/g, "_").replace(/\.(ply|obj|stl|off|vtk|vtp|glb|gltf)(?=\.|$)/i, "")}.${kind}`);
+  });
+
+  // The stage: one or two linked views ------------------------------------------------------------------------------
+
+  class Stage {
+    constructor() {
+      this.a = new Shapespace.View($("view-a"), { label: "The shape in 3-D", embedded: false });
+      this.b = null;
+      this.holds = null;
+    }
+
+    split(two) {
+      if (two && !this.b) {
+        this.b = new Shapespace.View($("view-b"), { label: "The model in 3-D", embedded: false });
+        this.a.link(this.b);
+      }
+      $("pane-b").hidden = !two;
+    }
+
+    captions(a, b) {
+      $("caption-a").textContent = a || "";
+      $("caption-b").textContent = b || "";
+    }
+
+    bar(options) {
+      $("bar").hidden = !options;
+      const wanted = options ? `${options.title} ${options.range}` : "";
+      if (options && this._bar !== wanted) Shapespace.colourBar($("bar"), options);
+      this._bar = wanted;
+    }
+
+    legend(items) {
+      $("legend").hidden = !items;
+      if (!items) return;
+      const rgb = (c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`;
+      $("legend").replaceChildren(...items.map(([text, colour]) => {
+        const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+        const spot = document.createElementNS("http://www.w3.org/2000/svg", "circle");
+        for (const [key, value] of [["cx", 6], ["cy", 6], ["r", 6], ["fill", rgb(colour)]]) spot.setAttribute(key, value);
+        svg.setAttribute("viewBox", "0 0 12 12");
+        svg.append(spot);
+        return h("li", {}, svg, text);
+      }));
+    }
+
+    clear() {
+      for (const view of [this.a, this.b]) {
+        if (view) for (const id of ["model", "scan", "landmarks", "placed"]) view.remove(id);
+      }
+      this.bar(null);
+      this.legend(null);
+      this.captions("", "");
+      this.holds = null;
+    }
+  }
+
+  // Model -----------------------------------------------------------------------------------------------------------
+
+  const rows = [];
+  let mapRange = 0;
+
+  function makeSliders() {
+    const list = $("sliders");
+    list.append(h("div", { class: "mode modes-head", "aria-hidden": "true" }, h("span"), h("span", {}, "variance"), h("span"), h("span"), h("span")));
+    for (let k = 0; k < model.K; k++) {
+      const name = `Mode ${k + 1}`;
+      const tick = h("input", { type: "checkbox", "aria-label": `Animate mode ${k + 1}`, title: `Animate mode ${k + 1}`, "data-testid": `animate-${k + 1}` });
+      tick.checked = k === 0;
+      const slider = h("input", {
+        type: "range", min: -3, max: 3, step: 0.05, value: 0, id: `mode-${k + 1}`, "data-testid": `mode-${k + 1}`,
+        "aria-label": `${name}, standard deviations`,
+      });
+      const output = h("output", { for: slider.id, "data-testid": `value-${k + 1}` });
+      const undo = h("button", { type: "button", "aria-label": `Set mode ${k + 1} back to zero`, title: "Back to zero", "data-testid": `reset-${k + 1}` }, "\u00d7");
+      slider.addEventListener("input", () => {
+        const began = performance.now();
+        stopAnimation();
+        z[k] = Number(slider.value);
+        updateRow(k);
+        drawModel(began);
+      });
+      undo.addEventListener("click", () => { stopAnimation(); z[k] = 0; updateRow(k); drawModel(); slider.focus(); });
+      const head = h("span", {}, `${k + 1} `, h("small", {}, percent(share[k])));
+      const row = h("div", { class: "mode" }, tick, head, slider, output, undo);
+      row.hidden = k >= SHOWN_AT_FIRST;
+      rows.push({ row, slider, output, undo, tick });
+      list.append(row);
+    }
+    const rest = model.K - SHOWN_AT_FIRST;
+    $("more-modes").hidden = rest <= 0;
+    $("more-modes").textContent = `Show ${rest} more modes`;
+    $("more-modes").addEventListener("click", () => {
+      rows.forEach(({ row }) => { row.hidden = false; });
+      $("more-modes").hidden = true;
+      rows[SHOWN_AT_FIRST].slider.focus();
+    });
+    updateRows();
+  }
+
+  const percent = (part) => `${(100 * part).toFixed(part >= 0.0995 ? 0 : 1)} %`;
+
+  function updateRow(k) {
+    const { slider, output, undo } = rows[k];
+    if (Number(slider.value) !== z[k]) slider.value = z[k];
+    output.textContent = sign(z[k]);
+    undo.disabled = z[k] === 0;
+    paintTrack(slider);
+  }
+
+  const updateRows = () => rows.forEach((_, k) => updateRow(k));
+
+  function setShape(values) {
+    z.fill(0);
+    for (let k = 0; k < Math.min(z.length, values.length); k++) z[k] = values[k];
+    updateRows();
+  }
+
+  let asked = 0;
+  function drawModel(began) {
+    if (shown !== "model") return;
+    if (began !== undefined && !asked) asked = began;
+    positions = model.vertices(z, positions);
+    if (stage.holds !== "model") {
+      stage.clear();
+      stage.split(false);
+      stage.holds = "model";
+      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.model_colour });
+    } else {
+      stage.a.move("model", positions);
+    }
+    const moved = z.some((value) => value !== 0);
+    stage.captions(moved ? "" : "The mean shape");
+    if ($("map").checked) {
+      const values = model.displacement(z);
+      const most = quantile(values, 0.995);
+      if (most > mapRange || most < mapRange / 4) mapRange = nice(Math.max(most, 0.1));
+      const range = [-mapRange, mapRange];
+      stage.a.paint("model", values, { map: about.diverging, range, changed: true });
+      stage.bar({ map: about.diverging, range, unit: "mm", title: "Moved inwards (\u2212) or outwards (+)" });
+    } else {
+      stage.a.paint("model", null);
+      stage.bar(null);
+    }
+    drawMarks(stage.a, $("marks").checked);
+  }
+
+  let hasMarks = false;
+  function drawMarks(view, wanted) {
+    if (!wanted && !hasMarks) return;
+    const entries = Object.entries(model.facts.landmarks);
+    view.marks("landmarks", wanted ? entries.map(([label, v]) => ({
+      position: [positions[3 * v], positions[3 * v + 1], positions[3 * v + 2]], label, colour: LEFT_RED,
+    })) : []);
+    hasMarks = wanted;
+  }
+
+  let swinging = 0;
+  function stopAnimation() {
+    cancelAnimationFrame(swinging);
+    swinging = 0;
+    $("animate").setAttribute("aria-pressed", "false");
+    $("animate").textContent = "Animate";
+  }
+
+  function startAnimation() {
+    const chosen = rows.map(({ tick }, k) => (tick.checked ? k : -1)).filter((k) => k >= 0);
+    if (!chosen.length) {
+      alertUser("No mode is ticked; tick one or more modes to animate.");
+      return;
+    }
+    $("animate").setAttribute("aria-pressed", "true");
+    $("animate").textContent = "Stop";
+    // One mode swings all the way; several together stay where shapes are likely.
+    const reach = chosen.length === 1 ? 3 : Math.max(1, 3 / Math.sqrt(chosen.length));
+    const began = performance.now();
+    const start = chosen.map((k) => Math.asin(Math.max(-1, Math.min(1, z[k] / reach))));
+    const step = (now) => {
+      const t = (now - began) / 1000;
+      chosen.forEach((k, j) => {
+        z[k] = reach * Math.sin(start[j] + (t * 2 * Math.PI) / (4 + 0.7 * j));
+        updateRow(k);
+      });
+      drawModel();
+      swinging = requestAnimationFrame(step);
+    };
+    swinging = requestAnimationFrame(step);
+  }
+
+  /** A normal deviate (Box and Muller). */
+  const normal = () => Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
+  const randomShape = () => Array.from({ length: about.modes }, () => Math.max(-3, Math.min(3, normal())));
+
+  function startModel() {
+    makeSliders();
+    $("reset").addEventListener("click", () => { stopAnimation(); setShape([]); drawModel(); });
+    $("random").addEventListener("click", () => { stopAnimation(); setShape(randomShape()); drawModel(); });
+    $("animate").addEventListener("click", () => (swinging ? stopAnimation() : startAnimation()));
+    $("map").addEventListener("change", () => drawModel());
+    $("marks").addEventListener("change", () => drawModel());
+    $("marks-label").hidden = !about.landmarks.length;
+    if (about.modes_sent < about.modes) {
+      $("animate-hint").textContent += ` The first ${about.modes_sent} of ${about.modes} modes are shown; more would not fit here.`;
+    }
+    for (const kind of about.exports) {
+      $("export-shape").append(h("button", {
+        type: "button", "data-testid": `export-${kind}`, onclick: () => download({ z }, kind, "shape"),
+      }, kind.toUpperCase()));
+    }
+    $("export-shape").append(h("button", { type: "button", "data-testid": "export-csv", onclick: () => {
+      const b = Array.from(z, (value, k) => value * (k < stddev.length ? stddev[k] : 0));
+      save(Viewer.coefficientsCsv([{ name: "shape", b, z: Array.from(z) }]), "shape.coefficients.csv");
+    } }, "Coefficients CSV"));
+  }
+
+  // Compare ---------------------------------------------------------------------------------------------------------
+
+  const shapes = new Map(); // key -> {name, z}
+  let listed = [];
+  let walking = 0;
+
+  function fillChoices() {
+    shapes.set("mean", { name: "the mean shape", z: [] });
+    shapes.set("current", { name: "the shape in Model", get z() { return Array.from(z); } });
+    for (const row of listed) if (row.z) shapes.set(`fit ${row.name}`, { name: row.label, z: row.z });
+    for (const [select, first] of [[$("compare-a"), "mean"], [$("compare-b"), "current"]]) {
+      const before = select.value || first;
+      select.replaceChildren(...Array.from(shapes, ([key, one]) => h("option", { value: key }, one.name)), h("option", { value: "random" }, "a new random shape"));
+      select.value = shapes.has(before) ? before : first;
+    }
+  }
+
+  function pair() {
+    return [$("compare-a"), $("compare-b")].map((select) => shapes.get(select.value));
+  }
+
+  function choose(event) {
+    if (event.target.value === "random") {
+      const number = Array.from(shapes.keys()).filter((key) => key.startsWith("random ")).length + 1;
+      shapes.set(`random ${number}`, { name: `random shape ${number}`, z: randomShape() });
+      fillChoices();
+      event.target.value = `random ${number}`;
+    }
+    drawCompare(true);
+  }
+
+  function drawCompare(changed) {
+    if (shown !== "compare") return;
+    const [a, b] = pair();
+    const K = about.modes, t = Number($("walk").value);
+    const za = Float64Array.from({ length: K }, (_, k) => a.z[k] || 0);
+    const zb = Float64Array.from({ length: K }, (_, k) => b.z[k] || 0);
+    const now = za.map((value, k) => value + t * (zb[k] - value));
+    const from = $("difference").checked ? model.vertices(za).slice() : null;
+    positions = model.vertices(now, positions);
+    if (stage.holds !== "compare") {
+      stage.clear();
+      stage.split(false);
+      stage.holds = "compare";
+      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.model_colour });
+    } else {
+      stage.a.move("model", positions);
+    }
+    if (from) {
+      const values = Float32Array.from({ length: model.V }, (_, v) =>
+        Math.hypot(positions[3 * v] - from[3 * v], positions[3 * v + 1] - from[3 * v + 1], positions[3 * v + 2] - from[3 * v + 2]));
+      const range = [0, differenceRange(za, zb)];
+      stage.a.paint("model", values, { map: about.sequential, range, changed: true });
+      stage.bar({ map: about.sequential, range, unit: "mm", title: `Moved from ${a.name}` });
+    } else {
+      stage.a.paint("model", null);
+      stage.bar(null);
+    }
+    $("walk-value").textContent = `${Math.round(100 * t)} %`;
+    paintTrack($("walk"));
+    stage.captions(t === 0 ? a.name : t === 1 ? b.name : `${Math.round(100 * t)} % of the way to ${b.name}`);
+    if (!changed) return;
+    const steps = za.map((value, k) => zb[k] - value);
+    let mm = 0;
+    for (let k = 0; k < model.K; k++) mm += (steps[k] * stddev[k]) ** 2;
+    const most = steps.reduce((best, value, k) => (Math.abs(value) > Math.abs(steps[best]) ? k : best), 0);
+    const facts = [
+      ["Apart", `${Math.hypot(...steps).toFixed(2)} standard deviations`],
+      ["", `${Math.sqrt(mm / model.V).toFixed(2)} mm (RMS over the vertices)`],
+      ["Most in", steps[most] ? `mode ${most + 1}, ${sign(steps[most])} standard deviations` : "no mode; they are equal"],
+    ];
+    $("compare-facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+    Viewer.coefficientChart($("compare-chart"), [{ z: Array.from(za), name: a.name }, { z: Array.from(zb), name: b.name }], K);
+  }
+
+  function differenceRange(za, zb) {
+    const a = model.vertices(za).slice(), b = model.vertices(zb);
+    const values = Float32Array.from({ length: model.V }, (_, v) =>
+      Math.hypot(a[3 * v] - b[3 * v], a[3 * v + 1] - b[3 * v + 1], a[3 * v + 2] - b[3 * v + 2]));
+    return nice(Math.max(quantile(values, 0.995), 0.1));
+  }
+
+  function stopWalk() {
+    cancelAnimationFrame(walking);
+    walking = 0;
+    $("walk-play").setAttribute("aria-pressed", "false");
+    $("walk-play").textContent = "Play";
+  }
+
+  function startWalk() {
+    $("walk-play").setAttribute("aria-pressed", "true");
+    $("walk-play").textContent = "Stop";
+    const began = performance.now(), phase = Math.acos(1 - 2 * Number($("walk").value));
+    const step = (now) => {
+      $("walk").value = 0.5 - 0.5 * Math.cos(phase + ((now - began) / 1000) * 1.6);
+      drawCompare(false);
+      walking = requestAnimationFrame(step);
+    };
+    walking = requestAnimationFrame(step);
+  }
+
+  /** Rows of a CSV text: quotes, doubled quotes and line breaks in quotes are understood. */
+  function csvRows(text) {
+    const lines = [[""]];
+    let quoted = false;
+    for (let i = 0; i < text.length; i++) {
+      const c = text[i], line = lines[lines.length - 1];
+      if (quoted && c === '"' && text[i + 1] === '"') { line[line.length - 1] += '"'; i += 1; }
+      else if (c === '"') quoted = !quoted;
+      else if (!quoted && c === ",") line.push("");
+      else if (!quoted && c === "\n") lines.push([""]);
+      else if (quoted || c !== "\r") line[line.length - 1] += c;
+    }
+    return lines.filter((line) => line.length > 1 || line[0]);
+  }
+
+  const readCsv = guarded(async (file) => {
+    if (file.size > 64 * 2 ** 20) throw new Error(`${file.name} is larger than any table of coefficients; give a coefficients.csv.`);
+    const table = csvRows(await file.text());
+    const head = table[0] || [];
+    const columns = (letter) => Array.from({ length: about.modes }, (_, k) => head.indexOf(`${letter}${k + 1}`));
+    const inZ = columns("z"), inB = columns("b");
+    const letter = inZ[0] >= 0 ? "z" : inB[0] >= 0 ? "b" : null;
+    if (!letter) throw new Error(`${file.name} has no columns z1, z2, ... or b1, b2, ...; give a coefficients.csv of shapespace fit.`);
+    let added = 0;
+    for (const line of table.slice(1)) {
+      const values = (letter === "z" ? inZ : inB).map((at, k) => {
+        const value = at >= 0 && line[at] ? Number(line[at]) : 0;
+        return letter === "z" ? value : value / (k < stddev.length ? stddev[k] : Infinity);
+      });
+      const first = (letter === "z" ? inZ : inB)[0];
+      if (!line[first] || !values.every(Number.isFinite)) continue;
+      const name = line[Math.max(head.indexOf("scan"), 0)] || `row ${added + 1}`;
+      shapes.set(`csv ${file.name} ${name}`, { name: `${name} (${file.name})`, z: values });
+      added += 1;
+      if (added === 1) $("compare-b").dataset.wanted = `csv ${file.name} ${name}`;
+    }
+    if (!added) throw new Error(`${file.name} has no row with numbers in all its coefficients; give a coefficients.csv of shapespace fit.`);
+    fillChoices();
+    $("compare-b").value = $("compare-b").dataset.wanted;
+    show("compare");
+  });
+
+  function startCompare() {
+    fillChoices();
+    for (const id of ["compare-a", "compare-b"]) $(id).addEventListener("change", choose);
+    $("walk").addEventListener("input", () => { stopWalk(); drawCompare(false); });
+    $("walk-play").addEventListener("click", () => (walking ? stopWalk() : startWalk()));
+    $("difference").addEventListener("change", () => drawCompare(false));
+    $("swap").addEventListener("click", () => {
+      const [a, b] = [$("compare-a").value, $("compare-b").value];
+      [$("compare-a").value, $("compare-b").value] = [b, a];
+      drawCompare(true);
+    });
+    $("csv-button").addEventListener("click", () => $("csv-file").click());
+    $("csv-file").addEventListener("change", () => { if ($("csv-file").files[0]) readCsv($("csv-file").files[0]); $("csv-file").value = ""; });
+  }
+
+  // Fits ------------------------------------------------------------------------------------------------------------
+
+  let fitView, scanView;
+  let selected = -1;
+
+  function verdictCard(facts) {
+    const notes = facts.notes && facts.notes.length ? h("ul", {}, ...facts.notes.map((note) => h("li", {}, note))) : null;
+    return h("div", { class: `status ${facts.status}`, "data-testid": "status", "data-status": facts.status },
+      h("strong", {}, STATUS[facts.status] || facts.status), h("span", {}, facts.reason || ""), notes);
+  }
+
+  function distanceFacts(distances) {
+    const final = distances && distances.final;
+    if (!final) return null;
+    const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
+    const told = [
+      ["Model to scan", `${mm(final.model_to_scan.mean)} mean, ${mm(final.model_to_scan.p95)} for 95 %`],
+      ["Scan to model", `${mm(final.scan_to_model.mean)} mean over ${Math.round(100 * final.scan_to_model.fraction)} % of the scan`],
+    ];
+    return h("dl", { class: "facts" }, ...told.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  }
+
+  async function startFits() {
+    $("fits-none").hidden = about.has_fits;
+    $("fits-some").hidden = !about.has_fits;
+    if (!about.has_fits) return;
+    listed = await json("/api/fits");
+    fillChoices();
+    $("fit-list").replaceChildren(...listed.map((row, i) => h("div", {
+      role: "option", id: `fit-${i}`, class: row.status, "aria-selected": "false", "data-testid": "fit", "data-name": row.name,
+      title: row.reason, onclick: () => selectFit(i),
+    }, h("i", { class: "dot" }), h("span", {}, row.label, h("b", { hidden: true }, ` ${row.status}`)),
+    h("small", {}, row.model_to_scan_mm === null ? row.status : `${row.model_to_scan_mm.toFixed(2)} mm`))));
+    $("fit-list").addEventListener("keydown", (event) => {
+      const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      selectFit(Math.max(0, Math.min(listed.length - 1, selected + step)));
+    });
+    const isDoubtful = (row) => row.status !== "converged";
+    const go = (step) => {
+      for (let i = 1; i <= listed.length; i++) {
+        const at = (((selected < 0 && step < 0 ? 0 : selected) + step * i) % listed.length + listed.length) % listed.length;
+        if (isDoubtful(listed[at])) { selectFit(at); return; }
+      }
+    };
+    $("fit-next").addEventListener("click", () => go(1));
+    $("fit-previous").addEventListener("click", () => go(-1));
+    const count = listed.filter(isDoubtful).length;
+    $("fit-next").disabled = $("fit-previous").disabled = count === 0;
+    if (!count) $("fit-next").title = $("fit-previous").title = "No fit is doubtful";
+  }
+
+  const selectFit = guarded(async (index) => {
+    selected = index;
+    const row = listed[index];
+    for (const option of $("fit-list").children) option.setAttribute("aria-selected", String(option.id === `fit-${index}`));
+    $("fit-list").setAttribute("aria-activedescendant", `fit-${index}`);
+    $(`fit-${index}`).scrollIntoView({ block: "nearest" });
+    const detail = h("div");
+    $("fit-detail").replaceChildren(verdictCard({ ...row, reason: row.reason }), detail);
+    if (!row.pictured) {
+      if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
+      if (row.z) $("fit-detail").append(h("button", { type: "button", onclick: () => apply(row.z) }, "Use in Model"));
+      fitView.clear();
+      if (shown === "fits") { stage.clear(); stage.split(false); stage.captions(`${row.label}: no picture`); }
+      return;
+    }
+    $("loading").textContent = "Loading the fit";
+    $("loading").hidden = false;
+    try {
+      const payload = await binary(`/api/fits/${encodeURIComponent(row.name)}`);
+      if (selected !== index) return;
+      fitView.element = detail;
+      fitView.show(payload, { fit: row.name });
+    } finally {
+      $("loading").hidden = true;
+    }
+  });
+
+  function apply(values) {
+    setShape(values);
+    show("model");
+    if (innerWidth <= 760) scrollTo({ top: 0 });
+  }
+
+  // Your scan -------------------------------------------------------------------------------------------------------
+
+  let own = null; // {id, name, states, preview, origin, unit, verdict, placing}
+  let stream = null;
+  const scansHere = new Map(); // id -> name
+
+  function suits(name) {
+    const ending = (/\.[^.]+$/.exec(name.toLowerCase()) || [""])[0];
+    return about.formats.includes(ending);
+  }
+
+  const dropFile = guarded(async (file) => {
+    show("scan");
+    if (/\.csv$/i.test(file.name)) { await readCsv(file); return; }
+    if (!suits(file.name)) throw new Error(`${file.name} is not a scan that can be read; drop ${about.formats.join(", ")}.`);
+    if (file.size > about.upload_bytes) {
+      throw new Error(`${file.name} is larger than the ${Math.round(about.upload_bytes / 2 ** 20)} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
+    }
+    $("message").hidden = true;
+    beginScan({ id: null, name: file.name });
+    progress(`Sending ${file.name}`, 0);
+    try {
+      const facts = await upload(file);
+      scansHere.set(facts.id, facts.name);
+      own.id = facts.id;
+      own.name = facts.name;
+      listScans();
+      follow();
+    } catch (error) {
+      $("progress").hidden = true;
+      throw error;
+    }
+  });
+
+  /** PUT with progress, which fetch does not tell. */
+  function upload(file) {
+    return new Promise((resolve, reject) => {
+      const request = new XMLHttpRequest();
+      request.open("PUT", `/api/scans?name=${encodeURIComponent(file.name)}`);
+      request.responseType = "json";
+      request.upload.onprogress = (event) => { if (event.lengthComputable) progress(`Sending ${file.name}`, event.loaded / event.total); };
+      request.onerror = () => reject(new Error(`${file.name} could not be sent; see whether shapespace view still runs, and try again.`));
+      request.onload = () => {
+        const told = request.response || {};
+        if (request.status === 201) resolve(told);
+        else reject(new Error(told.error || `The server answered with the error ${request.status}; reload the page.`));
+      };
+      request.send(file);
+    });
+  }
+
+  function progress(text, part) {
+    $("progress").hidden = false;
+    $("stop").hidden = !own || !own.id;
+    $("progress-text").textContent = text;
+    if (part === null) $("progress-bar").removeAttribute("value");
+    else $("progress-bar").value = part;
+  }
+
+  function beginScan({ id, name }) {
+    if (stream) stream.close();
+    own = { id, name, states: [], preview: null, verdict: null, placing: null, frame: null };
+    scanView.clear();
+    $("verdict").hidden = true;
+    $("placing").hidden = true;
+    $("progress-chart").replaceChildren();
+    $("zone").classList.add("compact");
+    if (shown === "scan") { stage.clear(); stage.split(false); }
+  }
+
+  function follow() {
+    const mine = own;
+    stream = new EventSource(`/api/scans/${mine.id}/events`);
+    const source = stream;
+    let scheduled = 0;
+    source.onmessage = guarded(async (event) => {
+      if (own !== mine) { source.close(); return; }
+      const told = JSON.parse(event.data);
+      if (told.event === "queue") progress(told.position > 1 ? `Waiting: ${told.position - 1} before it` : "Waiting for a free place", null);
+      else if (told.event === "started") progress("Reading the scan", null);
+      else if (told.event === "scan") {
+        Object.assign(mine, { origin: told.origin, unit: told.mm_per_scan_unit });
+        progress(`${told.vertices.toLocaleString("en")} vertices; looking for a place to start`, null);
+        mine.preview = await binary(`/api/scans/${mine.id}/preview`);
+        if (own === mine && !mine.verdict) drawScanStates();
+      } else if (told.event === "state") {
+        mine.states.push(told);
+        if (!scheduled) scheduled = requestAnimationFrame(() => { scheduled = 0; if (own === mine && !mine.verdict) tellState(); });
+      } else if (told.event === "verdict") {
+        mine.verdict = told;
+        await showVerdict(mine);
+      } else if (told.event === "done") {
+        source.close();
+        $("progress").hidden = true;
+        mine.helped = told.can_place_landmarks;
+        if (told.can_place_landmarks) offerLandmarks(mine);
+      } else if (told.event === "removed") source.close();
+    });
+    source.onerror = () => {
+      if (source.readyState === EventSource.CLOSED && own === mine && !mine.verdict) {
+        $("progress").hidden = true;
+        alertUser(UNREACHABLE);
+      }
+    };
+  }
+
+  function tellState() {
+    const last = own.states[own.states.length - 1];
+    const what = last.phase === 1 ? "Finding the pose" : "Fitting pose and shape";
+    progress(`${what}: iteration ${last.iteration}, RMS ${last.rms_mm.toFixed(2)} mm`, null);
+    Viewer.rmsChart($("progress-chart"), own.states.map((s) => s.rms_mm), own.states.map((s) => s.phase), null);
+    drawScanStates();
+  }
+
+  /** R, t, s of a state as a function of a point array, or its inverse. */
+  function mapping(state, inverse) {
+    const { scale: s, rotation: R, translation: t } = state;
+    return (from, to) => {
+      for (let i = 0; i < from.length; i += 3) {
+        const [x, y, w] = inverse ? [from[i] - t[0], from[i + 1] - t[1], from[i + 2] - t[2]] : [from[i], from[i + 1], from[i + 2]];
+        for (let r = 0; r < 3; r++) {
+          to[i + r] = inverse ? (R[0][r] * x + R[1][r] * y + R[2][r] * w) / s : s * (R[r][0] * x + R[r][1] * y + R[r][2] * w) + t[r];
+        }
+      }
+      return to;
+    };
+  }
+
+  /** The scan, and the model on its way to it. What is shown stands as the model does at its first state. */
+  function drawScanStates() {
+    if (shown !== "scan" || !own || !own.preview) return;
+    const { preview, states } = own;
+    const first = states[0] || null;
+    const raw = preview.arrays.vertices, faces = preview.arrays.faces || null;
+    let framed = false;
+    if (stage.holds !== own || own.frame !== first) {
+      if (stage.holds !== own) { stage.clear(); stage.split(false); }
+      stage.holds = own;
+      own.frame = first;
+      const placed = first ? mapping(first, true)(raw, new Float32Array(raw.length)) : raw;
+      stage.a.setSurface("scan", { positions: placed, faces, colour: about.scan_colour });
+      framed = true;
+    }
+    const last = states[states.length - 1];
+    if (last) {
+      const shape = Float64Array.from({ length: model.K }, (_, k) => (k < last.b.length ? last.b[k] / stddev[k] : 0));
+      positions = model.vertices(shape, positions);
+      const there = new Float32Array(positions.length);
+      mapping(first, true)(mapping(last, false)(positions, there), there);
+      if (stage.a.has("model")) stage.a.move("model", there);
+      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour, opacity: 0.75 });
+      stage.captions(`${own.name}: the model moves onto the scan`);
+      stage.legend([["scan", about.scan_colour], ["model", about.model_colour]]);
+    } else {
+      stage.captions(own.name);
+    }
+    if (framed) stage.a.frame(["scan", "model"].filter((id) => stage.a.has(id)));
+  }
+
+  async function showVerdict(mine) {
+    const told = mine.verdict;
+    const card = verdictCard(told);
+    $("verdict").replaceChildren(...[card, distanceFacts(told.distances_mm), told.why_not ? h("p", {}, told.why_not) : null].filter(Boolean));
+    $("verdict").hidden = false;
+    $("progress").hidden = true;
+    if (!told.b) { drawScanStates(); return; }
+    const start = { landmarks: "landmarks", upright: "the scan as it stands", rotations: "a search over rotations", given: "a given pose" }[told.start];
+    const seconds = Object.values(told.seconds || {}).reduce((sum, value) => sum + value, 0);
+    $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)} s.`));
+    shapes.set(`scan ${mine.id}`, { name: mine.name, z: told.z });
+    fillChoices();
+    if (!told.pictured) return;
+    const payload = await binary(`/api/scans/${mine.id}/picture`);
+    if (own !== mine || mine.placing) return;
+    scanView.show(payload, { scan: mine.id, b: told.b, z: told.z, b_stddev: told.b_stddev });
+    $("scan-detail").append(h("div", { class: "row" },
+      h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {
+        save(await (await ask(`/api/scans/${mine.id}/record`)).blob(), `${mine.name.replace(/\.[^.]*$/, "")}.fit.json`);
+      }) }, "Record (JSON)"),
+      h("button", { type: "button", "data-testid": "scan-remove", onclick: guarded(async () => {
+        await ask(`/api/scans/${mine.id}`, { method: "DELETE" });
+        forget(mine.id);
+      }) }, "Remove from the server")));
+  }
+
+  function forget(id) {
+    scansHere.delete(id);
+    shapes.delete(`scan ${id}`);
+    fillChoices();
+    listScans();
+    if (!own || own.id !== id) return;
+    own = null;
+    scanView.clear();
+    for (const part of ["verdict", "placing", "progress"]) $(part).hidden = true;
+    $("zone").classList.remove("compact");
+    stage.clear();
+    stage.split(false);
+  }
+
+  function listScans() {
+    const several = scansHere.size > 1;
+    $("own").replaceChildren();
+    if (!several) return;
+    const select = h("select", { "data-testid": "own-select", "aria-label": "Your scans" }, ...Array.from(scansHere, ([id, name]) => h("option", { value: id }, name)));
+    if (own && own.id) select.value = own.id;
+    select.addEventListener("change", () => {
+      beginScan({ id: select.value, name: scansHere.get(select.value) });
+      follow();
+    });
+    $("own").append(h("label", { class: "field" }, "Scan ", select));
+  }
+
+  // Landmarks on a scan
+
+  function offerLandmarks(mine) {
+    $("placing").replaceChildren(
+      h("p", {}, "Landmarks can help this scan: click a few points on it, and the fit starts from them."),
+      h("button", { type: "button", class: "strong", "data-testid": "place", onclick: () => startPlacing(mine) }, "Place landmarks"));
+    $("placing").hidden = false;
+  }
+
+  function startPlacing(mine) {
+    mine.placing = { placed: new Map(), current: about.landmarks[0] };
+    scanView.active = false;
+    scanView.stop();
+    $("scan-detail").hidden = true;
+    stage.clear();
+    stage.holds = null;
+    own.frame = null;
+    drawPlacing(true);
+  }
+
+  function drawPlacing(first) {
+    const mine = own, { placed } = mine.placing;
+    if (shown === "scan") {
+      stage.split(true);
+      if (first || stage.holds !== mine.placing) {
+        stage.clear();
+        stage.holds = mine.placing;
+        const raw = mine.preview.arrays.vertices, turn = mine.states[0];
+        const at = turn ? mapping(turn, true)(raw, new Float32Array(raw.length)) : raw;
+        stage.a.setSurface("scan", { positions: at, faces: mine.preview.arrays.faces || null, colour: about.scan_colour });
+        stage.b.setSurface("model", { positions: model.mean, faces: model.faces, colour: about.model_colour });
+        stage.a.frame(["scan"]);
+        stage.captions(`${mine.name}: click where the landmark is`, "The model: where it belongs");
+      }
+      stage.a.marks("placed", Array.from(placed, ([label, position]) => ({ position, label, colour: LEFT_RED })));
+      stage.b.marks("landmarks", about.landmarks.map((name) => {
+        const v = model.facts.landmarks[name], wanted = name === mine.placing.current;
+        return { position: Array.from(model.mean.slice(3 * v, 3 * v + 3)), label: wanted ? name : "", colour: wanted ? LEFT_RED : placed.has(name) ? [0.1, 0.45, 0.28] : [0.6, 0.6, 0.6] };
+      }));
+    }
+    const names = h("div", { class: "names", role: "group", "aria-label": "Which landmark" }, ...about.landmarks.map((name) => h("button", {
+      type: "button", class: placed.has(name) ? "placed" : "", "aria-pressed": String(name === mine.placing.current), "data-testid": `landmark-${name}`,
+      onclick: () => { mine.placing.current = name; drawPlacing(); },
+    }, name)));
+    const missing = 3 - placed.size;
+    $("placing").replaceChildren(
+      h("p", { role: "status", "data-testid": "placing-text" }, `Click ${mine.placing.current} on the scan. ${missing > 0 ? `${missing} more ${missing === 1 ? "is" : "are"} needed.` : "More landmarks make the start safer."}`),
+      names,
+      h("div", { class: "row" },
+        h("button", { type: "button", "data-testid": "undo", onclick: () => undo(mine) , disabled: placed.size === 0 }, "Undo"),
+        h("button", { type: "button", class: "strong", "data-testid": "refit", disabled: missing > 0, onclick: () => refit(mine) }, "Fit again"),
+        h("button", { type: "button", "data-testid": "placing-cancel", onclick: () => endPlacing(mine) }, "Cancel")));
+  }
+
+  function undo(mine) {
+    const last = Array.from(mine.placing.placed.keys()).pop();
+    mine.placing.placed.delete(last);
+    mine.placing.current = last;
+    drawPlacing();
+  }
+
+  function endPlacing(mine) {
+    mine.placing = null;
+    $("scan-detail").hidden = false;
+    stage.clear();
+    stage.split(false);
+    offerLandmarks(mine);
+    show("scan");
+  }
+
+  function placeAt(event) {
+    if (shown !== "scan" || !own || !own.placing) return;
+    const hit = stage.a.pick(event.clientX, event.clientY, ["scan"]);
+    if (!hit) return;
+    const { placed } = own.placing;
+    placed.delete(own.placing.current);
+    placed.set(own.placing.current, hit.point);
+    const open = about.landmarks.find((name) => !placed.has(name));
+    if (open) own.placing.current = open;
+    drawPlacing();
+  }
+
+  const refit = guarded(async (mine) => {
+    const turn = mine.states[0];
+    const landmarks = {};
+    for (const [name, point] of mine.placing.placed) {
+      const there = Float64Array.from(point);
+      if (turn) mapping(turn, false)(Float64Array.from(point), there);
+      landmarks[name] = Array.from(there, (value, i) => value / mine.unit + mine.origin[i]);
+    }
+    await ask(`/api/scans/${mine.id}/landmarks`, post({ landmarks }));
+    $("scan-detail").hidden = false;
+    beginScan({ id: mine.id, name: mine.name });
+    progress("Starting from your landmarks", null);
+    follow();
+  });
+
+  async function startScan() {
+    $("zone-hint").textContent = `${about.formats.map((ending) => ending.slice(1).toUpperCase()).join(", ")}, up to ${Math.round(about.upload_bytes / 2 ** 20)} MB. It is fitted on the machine where the viewer runs; no other visitor sees it, and the file is removed after the fit.`;
+    $("file").accept = about.formats.join(",");
+    $("choose").addEventListener("click", () => $("file").click());
+    $("file").addEventListener("change", () => { if ($("file").files[0]) dropFile($("file").files[0]); $("file").value = ""; });
+    $("stop").addEventListener("click", guarded(async () => { if (own && own.id) await ask(`/api/scans/${own.id}/cancel`, post({})); }));
+    let depth = 0;
+    const withFiles = (event) => event.dataTransfer && Array.from(event.dataTransfer.types).includes("Files");
+    addEventListener("dragenter", (event) => { if (withFiles(event)) { event.preventDefault(); depth += 1; $("cover").hidden = false; } });
+    addEventListener("dragover", (event) => { if (withFiles(event)) event.preventDefault(); });
+    addEventListener("dragleave", (event) => { if (withFiles(event)) { depth = Math.max(0, depth - 1); $("cover").hidden = depth === 0; } });
+    addEventListener("drop", (event) => {
+      if (!withFiles(event)) return;
+      event.preventDefault();
+      depth = 0;
+      $("cover").hidden = true;
+      const files = Array.from(event.dataTransfer.files);
+      if (files.length > 1) alertUser("One scan at a time can be dropped; the first one is taken.");
+      if (files[0]) dropFile(files[0]);
+    });
+    const earlier = await json("/api/scans");
+    for (const facts of earlier) scansHere.set(facts.id, facts.name);
+    const last = earlier[earlier.length - 1];
+    if (last) {
+      beginScan(last);
+      listScans();
+      show("scan");
+      follow();
+    }
+  }
+
+  // Tabs and the rest -----------------------------------------------------------------------------------------------
+
+  const TABS = ["model", "compare", "fits", "scan"];
+
+  function show(name) {
+    shown = name;
+    stopAnimation();
+    stopWalk();
+    for (const tab of TABS) {
+      $(`tab-${tab}`).setAttribute("aria-selected", String(tab === name));
+      $(`tab-${tab}`).tabIndex = tab === name ? 0 : -1;
+      $(tab).hidden = tab !== name;
+    }
+    fitView.stop();
+    scanView.stop();
+    fitView.active = name === "fits";
+    scanView.active = name === "scan" && !(own && own.placing);
+    if (name === "model") drawModel();
+    else if (name === "compare") drawCompare(true);
+    else {
+      stage.clear();
+      stage.split(false);
+      if (name === "fits") {
+        if (selected < 0 && listed.length) selectFit(0);
+        else if (fitView.payload) fitView.draw(true);
+        else if (selected < 0) drawEmpty();
+      } else if (own && own.placing) drawPlacing(true);
+      else if (scanView.payload) scanView.draw(true);
+      else if (own && own.preview) drawScanStates();
+      else drawEmpty();
+    }
+    if (name === "model" || name === "compare") stage.a.frame(["model"]);
+  }
+
+  /** Nothing to show yet: the mean, faint. */
+  function drawEmpty() {
+    stage.a.setSurface("model", { positions: model.mean, faces: model.faces, colour: about.model_colour, opacity: 0.35 });
+    stage.holds = "empty";
+    stage.a.frame(["model"]);
+  }
+
+  function startTabs() {
+    for (const tab of TABS) {
+      $(`tab-${tab}`).addEventListener("click", () => show(tab));
+      $(`tab-${tab}`).addEventListener("keydown", (event) => {
+        const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+        if (!step) return;
+        const next = TABS[(TABS.indexOf(tab) + step + TABS.length) % TABS.length];
+        show(next);
+        $(`tab-${next}`).focus();
+      });
+    }
+    $("theme").addEventListener("click", () => {
+      const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+      const now = document.documentElement.dataset.theme || (dark ? "dark" : "light");
+      const next = now === "dark" ? "light" : "dark";
+      document.documentElement.dataset.theme = next;
+      try { localStorage.setItem("shapespace-theme", next); } catch (refused) { /* the choice lasts for this visit */ }
+      for (const view of [stage.a, stage.b]) if (view) view.request();
+    });
+    $("view-home").addEventListener("click", () => stage.a.reset());
+    $("picture").addEventListener("click", guarded(async () => save(await stage.a.png(), "shapespace.png")));
+  }
+
+  function ready() {
+    window.shapespaceReady = true;
+    document.body.dataset.ready = "true";
+  }
+
+  async function begin() {
+    // The token is in a cookie now, and need not stay in the address or the history.
+    if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", location.pathname);
+    about = await json("/api/about");
+    const unpacked = await binary("/api/model");
+    model = new Shapespace.Model(unpacked);
+    stddev = about.stddev;
+    share = unpacked.arrays.share;
+    z = new Float64Array(about.modes);
+    document.title = `${about.model} \u2013 shapespace`;
+    $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}`;
+    stage = new Stage();
+    const context = { stage, model, about, apply, download, alert: alertUser };
+    fitView = new Viewer.FitView($("fit-detail"), context, "fit");
+    scanView = new Viewer.FitView($("scan-detail"), context, "scan");
+    stage.a.on("click", placeAt);
+    stage.a.on("draw", () => {
+      if (asked) window.shapespaceTimes.push(performance.now() - asked);
+      asked = 0;
+      ready();
+    });
+    window.shapespaceStage = stage;
+    startModel();
+    startCompare();
+    startTabs();
+    drawModel();
+    stage.a.frame(["model"]);
+    $("loading").hidden = true;
+    if (!stage.a.works) ready();
+    await startFits();
+    if (about.has_fits) show("fits");
+    await startScan();
+  }
+
+  guarded(begin)();
+})();
