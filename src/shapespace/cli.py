@@ -72,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     _add_build(commands)
     _add_info(commands)
     _add_fit(commands)
+    _add_report(commands)
     _add_view(commands)
     return top
 
@@ -201,12 +202,41 @@ def _add_view(commands: Any) -> None:
     sub.set_defaults(run=_view)
 
 
+def _add_report(commands: Any) -> None:
+    sub = _add(commands, "report", "one HTML file on the results in a folder: summary, model, fits, settings",
+               "shapespace fit model.h5 scans -o out --stages\n         shapespace report out")  # fmt: skip
+    sub.add_argument("folder", type=Path, metavar="DIR", help="written by shapespace fit or shapespace demo")
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
+    sub.add_argument("--labels", type=Path, metavar="FILE",
+                     help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=_report)
+
+
 def _demo(arguments: argparse.Namespace) -> int:
     from shapespace.demo import run_demo
 
     report = run_demo(arguments.out, quick=arguments.quick, quiet=arguments.quiet)
     if arguments.json:
         _print_json({"report": str(report)})
+    else:
+        _print(f"The report is {report}")
+    if not arguments.no_open:
+        import webbrowser
+
+        webbrowser.open(report.absolute().as_uri())
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    report = commands.report(
+        arguments.folder, arguments.output, model=arguments.model, labels=arguments.labels, quiet=arguments.quiet
+    )
+    if arguments.json:
+        _print_json({"report": str(report), "bytes": report.stat().st_size})
     else:
         _print(f"The report is {report}")
     if not arguments.no_open:

@@ -328,6 +328,25 @@ def write_simulated_faces(
     return total
 
 
+def report(folder: Path, output: Path | None, *, model: Path | None, labels: Path | None, quiet: bool) -> Path:
+    """Write the report on the results in `folder`, and return its path.
+
+    Raises:
+        FileError: something in it cannot be read, or the report not written.
+        InputError: the folder holds no results, or `model` is not of its fits.
+        ShapespaceError: the extra `report` is not installed.
+    """
+    from shapespace.report.html import write_report
+
+    with progress_bar(None, "drawing", "picture", quiet=quiet) as bar:
+
+        def step(what: str, planned: int) -> None:
+            bar.total = max(planned, bar.n + 1)
+            bar.update()
+
+        return write_report(folder, output, model=model, labels=labels, on_step=step)
+
+
 def data_list() -> list[dict[str, object]]:
     """Return the open data sets with licence, size, hash, and whether they are here already."""
     return fetch.data_list()

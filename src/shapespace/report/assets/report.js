@@ -1,0 +1,115 @@
+// What the report does beyond being read: another theme, tables that sort, pictures that turn.
+(function () {
+  "use strict";
+  const root = document.documentElement;
+  const system = window.matchMedia("(prefers-color-scheme: dark)");
+
+  // Theme: the system's, unless the reader chose the other one.
+  const button = document.getElementById("theme");
+  const shown = () => root.dataset.theme || (system.matches ? "dark" : "light");
+  function nameButton() {
+    button.textContent = shown() === "dark" ? "Light colours" : "Dark colours";
+  }
+  function remember(theme) {
+    try {
+      if (theme) window.localStorage.setItem("shapespace-theme", theme);
+      else window.localStorage.removeItem("shapespace-theme");
+    } catch (refused) {
+      // A page from file:// may be refused; the choice then lasts as long as the page.
+    }
+  }
+  function tellTheme() {
+    nameButton();
+    document.dispatchEvent(new CustomEvent("shapespace:theme", { detail: shown() }));
+  }
+  button.addEventListener("click", () => {
+    const wanted = shown() === "dark" ? "light" : "dark";
+    if (wanted === (system.matches ? "dark" : "light")) delete root.dataset.theme;
+    else root.dataset.theme = wanted;
+    remember(root.dataset.theme);
+    tellTheme();
+  });
+  system.addEventListener("change", tellTheme);
+  nameButton();
+  button.hidden = false;
+
+  // Tables: numbers by their value, texts as people order them; rows without a number stay last.
+  const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
+  function key(row, column) {
+    const cell = row.cells[column];
+    if (!cell.hasAttribute("data-value")) return cell.textContent.trim();
+    return cell.dataset.value === "" ? NaN : Number(cell.dataset.value);
+  }
+  function compare(a, b, sign) {
+    if (typeof a === "number" && typeof b === "number") {
+      if (Number.isNaN(a) || Number.isNaN(b)) return Number.isNaN(a) - Number.isNaN(b);
+      return sign * (a - b);
+    }
+    return sign * collator.compare(String(a), String(b));
+  }
+  function sort(table, column, sign) {
+    const body = table.tBodies[0];
+    const rows = Array.from(body.rows, (row) => ({ row, key: key(row, column) }));
+    rows.sort((a, b) => compare(a.key, b.key, sign));
+    body.append(...rows.map((entry) => entry.row));
+  }
+  for (const table of document.querySelectorAll("table.sortable")) {
+    const heads = Array.from(table.tHead.rows[0].cells);
+    heads.forEach((head, column) => {
+      const sorter = document.createElement("button");
+      sorter.type = "button";
+      sorter.append(...head.childNodes);
+      head.append(sorter);
+      head.setAttribute("aria-sort", "none");
+      sorter.addEventListener("click", () => {
+        const up = head.getAttribute("aria-sort") !== "ascending";
+        heads.forEach((other) => other.setAttribute("aria-sort", "none"));
+        head.setAttribute("aria-sort", up ? "ascending" : "descending");
+        sort(table, column, up ? 1 : -1);
+      });
+    });
+  }
+
+  // Paper has no folds.
+  let folded = [];
+  window.addEventListener("beforeprint", () => {
+    folded = Array.from(document.querySelectorAll("details:not([open])"));
+    folded.forEach((part) => { part.open = true; });
+  });
+  window.addEventListener("afterprint", () => folded.forEach((part) => { part.open = false; }));
+
+  // What turns: unpacked when it comes near the window, and the still stays where it cannot be.
+  async function unpack(id) {
+    const packed = window.Shapespace.fromBase64(document.getElementById(id).textContent);
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return window.Shapespace.unpack(await new Response(stream).arrayBuffer());
+  }
+  function refuse(widget, why) {
+    widget.hidden = true;
+    const note = document.createElement("p");
+    note.className = "soft";
+    note.textContent = "This is a still: " + why;
+    widget.after(note);
+  }
+  async function start(widget) {
+    try {
+      const content = await unpack(widget.dataset.payload);
+      widget.hidden = false;
+      window.Shapespace.widgets[widget.dataset.widget](widget, content);
+      widget.parentElement.classList.add("running");
+    } catch (error) {
+      refuse(widget, "this browser cannot turn it (" + error.message + ").");
+    }
+  }
+  const widgets = document.querySelectorAll(".widget");
+  if (widgets.length && window.Shapespace && "IntersectionObserver" in window) {
+    const near = new IntersectionObserver((entries) => {
+      for (const entry of entries) {
+        if (!entry.isIntersecting) continue;
+        near.unobserve(entry.target);
+        start(entry.target.querySelector(".widget"));
+      }
+    }, { rootMargin: "600px" });
+    for (const widget of widgets) near.observe(widget.parentElement);
+  }
+})();

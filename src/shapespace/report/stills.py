@@ -1,0 +1,82 @@
+"""Small stills for cards: one strip of equal panels for each fit, all on one scale, as WebP."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image as PillowImage
+
+from shapespace.report.colours import CLAY, DIVERGING, MODEL_COLOUR, SCAN_COLOUR
+from shapespace.report.render import Camera, Image, Layer, render_series
+from shapespace.types import Mesh
+
+if TYPE_CHECKING:
+    from shapespace.report.staged import StagedFit
+
+PANEL = (168, 208)
+"""Width and height of a panel in pixels."""
+
+
+@dataclass(frozen=True)
+class Still:
+    """A picture ready to embed.
+
+    Args:
+        data: WebP.
+        size: width and height in pixels.
+    """
+
+    data: bytes
+    size: tuple[int, int]
+
+
+def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
+    """Return three panels: the scan, scan and model over each other, signed distances from model to scan.
+
+    Args:
+        fit: with its stages.
+        limit_mm: both ends of the scale of the distances.
+        panel: width and height of each panel in pixels.
+    """
+    surface = fit.surfaces["final"]
+    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.06)
+    scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
+    plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
+    distances = Layer(surface, scalars=fit.model_to_scan_mm["final"], colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
+    (seen,) = render_series([[distances]], camera=camera, size=panel)
+    return encoded(np.concatenate([plain, both, seen], axis=1))
+
+
+def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
+    """Return one mesh from the front, as its axes stand."""
+    camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
+    # Points are drawn as balls, of a size that joins them whatever the unit of the file.
+    radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    (image,) = render_series([[Layer(mesh, CLAY, point_radius_mm=max(radius, 1e-9))]], camera=camera, size=panel)
+    return encoded(image)
+
+
+def posed_pair(scan: Mesh, surface: Mesh, panel: tuple[int, int] = (336, 416)) -> Still:
+    """Return two panels: the model's surface, and the scan and it over each other."""
+    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.06)
+    above, below = Layer(scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
+    return encoded(np.concatenate(render_series([[below], [above, below]], camera=camera, size=panel), axis=1))
+
+
+def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:
+    """Return a map as a bar of 256 by 10 pixels."""
+    row = np.rint(255 * np.asarray(colours)).astype(np.uint8)
+    return encoded(np.repeat(row[None], 10, axis=0), lossless=True)
+
+
+def encoded(image: Image, *, lossless: bool = False) -> Still:
+    """Return pixels (H, W, 3) uint8 as WebP."""
+    stream = io.BytesIO()
+    PillowImage.fromarray(np.ascontiguousarray(image)).save(
+        stream, format="WEBP", lossless=lossless, quality=84, method=3
+    )
+    return Still(stream.getvalue(), (image.shape[1], image.shape[0]))
