@@ -22,6 +22,7 @@ NAMES = (
     "DoubleSide",
     "DynamicDrawUsage",
     "LinearFilter",
+    "LineSegments",
     "Mesh",
     "PerspectiveCamera",
     "Points",

@@ -10,7 +10,8 @@ import base64
 import json
 import math
 import struct
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -202,6 +203,40 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
     return pack(arrays, facts)
 
 
+def pack_scatter(
+    points: FloatArray, labels: Sequence[str], names: Sequence[str], *, axes: Sequence[str], unit: str = "mm"
+) -> bytes:
+    """Return what the widget of a scatter needs.
+
+    Arrays: `points` (n, K) float32; `labels` (n,) int32 codes into the fact `labels`, by first appearance.
+
+    Args:
+        points: (n, K) coefficients, K at least 1.
+        labels: n labels, which give the colours.
+        names: n names.
+        axes: K names of the coefficients.
+        unit: of the coefficients, in words.
+
+    Raises:
+        InputError: lengths that do not go together.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if (
+        points.ndim != 2
+        or not len(points) == len(labels) == len(names)
+        or points.shape[1] != len(axes)
+        or not len(axes)
+    ):
+        raise InputError(
+            f"A scatter of points {points.shape} needs a label and a name for each point and a name for each "
+            f"coefficient, not {len(labels)}, {len(names)} and {len(axes)}."
+        )
+    kinds = list(dict.fromkeys(labels))
+    codes = np.array([kinds.index(label) for label in labels], dtype=np.int32)
+    facts = {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit}
+    return pack({"points": points, "labels": codes}, facts)
+
+
 def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
 
@@ -276,7 +311,7 @@ def scripts() -> str:
         "model": list(colours.MODEL_COLOUR),
         "dense": list(colours.DENSE_COLOUR),
         "unknown": list(colours.UNKNOWN_COLOUR),
-        "beyond": list(colours.BEYOND_COLOUR),
+        "signal": list(colours.BEYOND_COLOUR),
     }
     texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS]
     texts.insert(-1, f"Shapespace.colours = {json.dumps(shared)};\n")
@@ -289,14 +324,15 @@ def style() -> str:
 
 
 def payload_html(identifier: str, payload: bytes) -> str:
-    """Return `payload` as a script element of a type that browsers keep but never run, base64 inside.
+    """Return `payload` as a script element of a type that browsers keep but never run: deflated, in base64.
 
     Args:
         identifier: its id, escaped here; widgets are given the element or this id.
         payload: from `pack`.
     """
-    text = base64.b64encode(payload).decode("ascii")
-    return f'<script type="application/octet-stream" id="{escape(identifier, quote=True)}">{text}</script>\n'
+    text = base64.b64encode(zlib.compress(payload, 9)).decode("ascii")
+    mark = escape(identifier, quote=True)
+    return f'<script type="application/octet-stream" data-coding="deflate" id="{mark}">{text}</script>\n'
 
 
 def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:

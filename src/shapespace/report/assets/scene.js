@@ -164,10 +164,13 @@
 
   const SURFACE_VERTEX = `
     attribute vec2 value; attribute vec3 own;
+    uniform float nearer;
     varying vec3 vNormal; varying vec2 vValue; varying vec3 vOwn;
     void main() {
       vNormal = normalMatrix * normal; vValue = value; vOwn = own;
-      gl_Position = projectionMatrix * (modelViewMatrix * vec4(position, 1.0));
+      vec4 seen = modelViewMatrix * vec4(position, 1.0);
+      seen.xyz *= 1.0 - nearer;
+      gl_Position = projectionMatrix * seen;
     }`;
   const SURFACE_FRAGMENT = LIGHT + COLOUR + `
     uniform float opacity;
@@ -285,6 +288,7 @@
       this._embedded = embedded;
       this._things = new Map();
       this._marks = new Map();
+      this._texts = new Map();
       this._linked = new Set();
       this._listeners = {};
       this._camera = { yaw: 0, pitch: 0, roll: 0, zoom: 1, target: [0, 0, 0], extent: [100, 100, 100] };
@@ -457,7 +461,7 @@
       if (opacity !== undefined) thing.opacity = Math.min(Math.max(Number(opacity) || 0, 0), 1);
       if (colour !== undefined) thing.colour = colour;
       thing.material.uniforms.colour.value.fromArray(thing.colour);
-      thing.material.uniforms.opacity.value = thing.opacity;
+      if (!thing.isLines) thing.material.uniforms.opacity.value = thing.opacity;
       this.request();
     }
 
@@ -475,6 +479,7 @@
         this._things.delete(id);
       }
       this._marks.delete(id);
+      this._texts.delete(id);
       this.request();
     }
 
@@ -497,15 +502,39 @@
       this.request();
     }
 
+    /** Show straight lines: points [[x,y,z], ...], each two joined. */
+    lines(id, points, colour) {
+      if (!this.works) return;
+      this.remove(id);
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(points.flat()), 3));
+      const line = new THREE.ShaderMaterial({
+        uniforms: { colour: { value: new THREE.Vector3(...colour) } },
+        vertexShader: "void main() { gl_Position = projectionMatrix * (modelViewMatrix * vec4(position, 1.0)); }",
+        fragmentShader: "uniform vec3 colour; void main() { gl_FragColor = vec4(colour, 1.0); }",
+      });
+      const object = new THREE.LineSegments(geometry, line);
+      object.frustumCulled = object.matrixAutoUpdate = false;
+      this._scene.add(object);
+      this._things.set(id, { id, object, material: line, colour, opacity: 1, visible: true, isLines: true });
+      this.request();
+    }
+
+    /** Write words at places: [{position, label}]. */
+    texts(id, texts) {
+      this._texts.set(id, texts);
+      this.request();
+    }
+
     // Camera
 
-    /** Go to where all that is visible, or the given ids, fills the picture from the front. */
-    frame(ids) {
+    /** Go to where all that is visible, or the given ids, fills the picture from the front; margin 1.1 leaves more. */
+    frame(ids, margin = 1) {
       if (!this.works) return;
       const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
       for (const thing of this._things.values()) {
         if (ids ? !ids.includes(thing.id) : !thing.visible || thing.isMarks) continue;
-        const p = thing.positions === undefined ? [] : thing.object.geometry.attributes.position.array;
+        const p = thing.object.geometry.attributes.position.array;
         for (let i = 0; i < p.length; i++) {
           const axis = i % 3;
           if (p[i] < low[axis]) low[axis] = p[i];
@@ -514,7 +543,7 @@
       }
       if (!(low[0] <= high[0])) return;
       this._camera.target = low.map((value, axis) => (value + high[axis]) / 2);
-      this._camera.extent = low.map((value, axis) => Math.max(high[axis] - value, 1e-3));
+      this._camera.extent = low.map((value, axis) => Math.max((high[axis] - value) * margin, 1e-3));
       Object.assign(this._camera, { yaw: 0, pitch: 0, roll: 0, zoom: 1 });
       this._home = copy(this._camera);
       this._moved();
@@ -664,13 +693,15 @@
       const shown = all.filter((thing) => thing.visible && thing.opacity > 0.004);
       const solid = shown.filter((thing) => thing.opacity > 0.996 || thing.isMarks);
       const clear = shown.filter((thing) => !solid.includes(thing));
+      // A clear surface comes nearer by a little, or it would dapple a solid one that it nearly coincides with.
+      const nearer = (0.008 * Math.hypot(...this._camera.extent)) / this._distance();
       const pass = (things, colour, blend) => {
         if (!things.length) return;
         for (const thing of all) thing.object.visible = things.includes(thing);
         for (const thing of things) {
           thing.material.colorWrite = colour;
           thing.material.transparent = blend;
-          thing.material.depthFunc = 3; // less or equal
+          if (!thing.isMarks && !thing.isLines) thing.material.uniforms.nearer.value = clear.includes(thing) ? nearer : 0;
           if (thing.isPoints) {
             const uniforms = thing.material.uniforms;
             uniforms.inPixels.value = thing.isMarks ? 1 : 0;
@@ -694,35 +725,44 @@
     }
 
     _write() {
-      const names = this._names;
-      names.style.display = this._marks.size ? "block" : "none";
-      if (!this._marks.size) return;
+      const names = this._names, some = this._marks.size + this._texts.size > 0;
+      names.style.display = some ? "block" : "none";
+      if (!some) return;
       const ratio = Math.min(window.devicePixelRatio || 1, 2);
       names.width = Math.round(this._frame.clientWidth * ratio);
       names.height = Math.round(this._frame.clientHeight * ratio);
-      const context = names.getContext("2d");
-      context.font = `${12 * ratio}px ${getComputedStyle(this.element).fontFamily || "sans-serif"}`;
+      const context = names.getContext("2d"), style = getComputedStyle(this.element);
+      const page = this._background || behind(this.element), ink = style.color;
+      context.font = `${12 * ratio}px ${style.fontFamily || "sans-serif"}`;
       context.textBaseline = "middle";
       context.lineJoin = "round";
+      context.lineWidth = 3.5 * ratio;
+      const write = (label, x, y) => {
+        context.strokeStyle = page;
+        context.strokeText(label, x * ratio, y * ratio);
+        context.fillStyle = ink;
+        context.fillText(label, x * ratio, y * ratio);
+      };
       for (const [id, marks] of this._marks) {
         const thing = this._things.get(id);
         if (!thing || !thing.visible) continue;
         marks.forEach((mark, k) => {
           const named = marks.length <= 12 || (this._hovered && this._hovered.id === id && this._hovered.vertex === k);
-          if (!mark.label || !named) return;
-          const [x, y, depth] = this._project(mark.position);
-          if (depth > 0.02 * Math.hypot(...this._camera.extent)) return; // on the far side
-          context.lineWidth = 3.5 * ratio;
-          context.strokeStyle = "rgba(255,255,255,0.85)";
-          context.strokeText(mark.label, (x + 10) * ratio, y * ratio);
-          context.fillStyle = "#16181b";
-          context.fillText(mark.label, (x + 10) * ratio, y * ratio);
+          const [x, y, depth] = this.project(mark.position);
+          // What is well behind the middle is on the far side of the surface.
+          if (mark.label && named && depth < 0.02 * Math.hypot(...this._camera.extent)) write(mark.label, x + 10, y);
         });
+      }
+      for (const texts of this._texts.values()) {
+        for (const text of texts) {
+          const [x, y] = this.project(text.position);
+          write(text.label, x + 4, y);
+        }
       }
     }
 
     /** CSS pixels of a point in the canvas, and how far it lies behind the camera's target. */
-    _project(point) {
+    project(point) {
       const { right, up, back } = this._axes();
       const distance = this._distance();
       const d = point.map((value, i) => value - this._camera.target[i]);
@@ -745,7 +785,7 @@
       ray.setFromCamera(new THREE.Vector2((2 * x) / box.width - 1, 1 - (2 * y) / box.height), this._eye);
       let best = null, nearest = Infinity;
       for (const thing of this._things.values()) {
-        if (ids ? !ids.includes(thing.id) : !thing.visible) continue;
+        if (thing.isLines || (ids ? !ids.includes(thing.id) : !thing.visible)) continue;
         const p = thing.object.geometry.attributes.position.array;
         if (!thing.isPoints) {
           const hit = ray.intersectObject(thing.object, false)[0];
@@ -763,7 +803,7 @@
         const distance = this._distance();
         for (let v = 0; v < p.length / 3; v++) {
           const point = [p[3 * v], p[3 * v + 1], p[3 * v + 2]];
-          const [px, py, depth] = this._project(point);
+          const [px, py, depth] = this.project(point);
           const reach = thing.isMarks ? 12 : 9;
           if ((px - x) ** 2 + (py - y) ** 2 > reach * reach) continue;
           // Marks win over the surface that they stand on.
@@ -786,7 +826,7 @@
       context.fillStyle = this._background || behind(this.element);
       context.fillRect(0, 0, copyOf.width, copyOf.height);
       context.drawImage(this.canvas, 0, 0);
-      if (this._marks.size) context.drawImage(this._names, 0, 0, copyOf.width, copyOf.height);
+      if (this._names.style.display === "block") context.drawImage(this._names, 0, 0, copyOf.width, copyOf.height);
       return new Promise((resolve, reject) =>
         copyOf.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The picture could not be made."))), "image/png")
       );
@@ -815,6 +855,16 @@
       if (this._note) this._note.remove();
     }
 
+    _hover(event) {
+      const crowded = Array.from(this._marks).filter(([, marks]) => marks.length > 12).map(([id]) => id);
+      if (crowded.length) {
+        const before = this._hovered;
+        this._hovered = this.pick(event.clientX, event.clientY, crowded);
+        if (before || this._hovered) this._write();
+      }
+      this._emit("hover", event);
+    }
+
     _listen() {
       const canvas = this.canvas;
       this._resizes = new ResizeObserver(() => this.request());
@@ -835,7 +885,7 @@
       canvas.addEventListener("pointermove", (event) => {
         const last = down.get(event.pointerId);
         if (!last) {
-          this._emit("hover", event);
+          this._hover(event);
           return;
         }
         const dx = event.clientX - last[0], dy = event.clientY - last[1];
@@ -863,7 +913,7 @@
       };
       canvas.addEventListener("pointerup", up);
       canvas.addEventListener("pointercancel", up);
-      canvas.addEventListener("pointerleave", (event) => this._emit("hover", event));
+      canvas.addEventListener("pointerleave", (event) => this._hover(event));
       canvas.addEventListener("contextmenu", (event) => event.preventDefault());
       canvas.addEventListener("dblclick", () => this.reset());
       canvas.addEventListener("wheel", (event) => {
@@ -949,11 +999,11 @@
     const uniforms = {
       colour: { value: new THREE.Vector3() }, signal: { value: new THREE.Vector3() },
       unknown: { value: new THREE.Vector3() }, map: { value: null }, range: { value: new THREE.Vector2(0, 1) },
-      threshold: { value: 1e30 }, paint: { value: 0 }, opacity: { value: 1 },
+      threshold: { value: 1e30 }, paint: { value: 0 }, opacity: { value: 1 }, nearer: { value: 0 },
     };
     if (isPoints) {
       Object.assign(uniforms, {
-        size: { value: 1 }, pixels: { value: 1 }, inPixels: { value: 0 }, nearer: { value: 0 }, rim: { value: 0 },
+        size: { value: 1 }, pixels: { value: 1 }, inPixels: { value: 0 }, rim: { value: 0 },
       });
     }
     return new THREE.ShaderMaterial({
@@ -974,8 +1024,8 @@
 
   // Colour bar ------------------------------------------------------------------------------------------------------
 
-  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit. */
-  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "" }) {
+  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond. */
+  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false }) {
     const css = map.map((c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`);
     const middle = (range[0] + range[1]) / 2;
     element.replaceChildren();
@@ -992,7 +1042,8 @@
     ticks.className = "shapespace-bar-ticks";
     for (const value of [range[0], middle, range[1]]) {
       const tick = document.createElement("span");
-      tick.textContent = number(value);
+      const beyond = !open || value === middle || (value === range[0] && value === 0) ? "" : value < middle ? "\u2264 " : "\u2265 ";
+      tick.textContent = beyond + number(value);
       ticks.appendChild(tick);
     }
     element.append(heading, bar, ticks);

@@ -1,0 +1,493 @@
+/* Views with their controls, for report and viewer. Needs scene.js and Shapespace.colours before it. */
+(function () {
+  "use strict";
+
+  const Shapespace = window.Shapespace;
+  const colours = () => Shapespace.colours;
+  let counted = 0;
+
+  // Pieces ----------------------------------------------------------------------------------------------------------
+
+  function make(tag, attributes, ...children) {
+    const element = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes || {})) {
+      if (name === "text") element.textContent = value;
+      else if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+      else if (value === true) element.setAttribute(name, "");
+      else if (value !== false && value !== null && value !== undefined) element.setAttribute(name, value);
+    }
+    element.append(...children);
+    return element;
+  }
+
+  const signed = (value, digits) => (value > 0 ? "+" : value < 0 ? "\u2212" : "") + Math.abs(value).toFixed(digits);
+
+  /** A named range input with its value beside it. */
+  function slider({ label, note = "", min, max, step, value, show, input }) {
+    const id = `ss-${++counted}`;
+    const output = make("output", { for: id, text: show(value) });
+    const range = make("input", { type: "range", id, min, max, step, value, "aria-valuetext": show(value) });
+    const told = () => {
+      output.textContent = show(Number(range.value));
+      range.setAttribute("aria-valuetext", output.textContent);
+    };
+    range.addEventListener("input", () => {
+      told();
+      input(Number(range.value));
+    });
+    const name = make("label", { for: id, text: label });
+    if (note) name.append(make("small", { text: note }));
+    const row = make("div", { class: "ss-slider" }, name, range, output);
+    return {
+      row,
+      get: () => Number(range.value),
+      put: (to) => {
+        range.value = to;
+        told();
+      },
+      limit: (to) => {
+        range.max = to;
+        told();
+      },
+    };
+  }
+
+  function button(text, click, attributes) {
+    return make("button", { type: "button", class: "ss-button", text, onclick: click, ...attributes });
+  }
+
+  function tick(text, checked, change) {
+    const box = make("input", { type: "checkbox" });
+    box.checked = checked;
+    box.addEventListener("change", () => change(box.checked));
+    return make("label", { class: "ss-tick" }, box, make("span", { text }));
+  }
+
+  function select(label, options, value, change) {
+    const id = `ss-${++counted}`;
+    const list = make("select", { id });
+    for (const [key, text] of options) list.append(make("option", { value: key, text }));
+    list.value = value;
+    list.addEventListener("change", () => change(list.value));
+    return { row: make("div", { class: "ss-select" }, make("label", { for: id, text: label }), list), list };
+  }
+
+  /** One of a few: radio buttons that look like one bar. */
+  function choice(legend, options, value, change) {
+    const name = `ss-${++counted}`;
+    const set = make("fieldset", { class: "ss-choice" }, make("legend", { text: legend }));
+    for (const [key, text] of options) {
+      const radio = make("input", { type: "radio", name, value: key });
+      radio.checked = key === value;
+      radio.addEventListener("change", () => change(key));
+      set.append(make("label", {}, radio, make("span", { text })));
+    }
+    return set;
+  }
+
+  function swatches(entries) {
+    const list = make("ul", { class: "ss-swatches" });
+    for (const [text, colour] of entries) {
+      const dot = make("span", { class: "ss-dot", "aria-hidden": "true" });
+      dot.style.background = `rgb(${colour.map((c) => Math.round(255 * c)).join(",")})`;
+      list.append(make("li", {}, dot, make("span", { text })));
+    }
+    return list;
+  }
+
+  /** The next round number that is not below value. */
+  function niceCeiling(value) {
+    if (!(value > 0)) return 1;
+    const power = 10 ** Math.floor(Math.log10(value));
+    for (const factor of [1, 1.5, 2, 3, 4, 5, 6, 8, 10]) if (factor * power >= value * 0.999) return factor * power;
+    return 10 * power;
+  }
+
+  /** What share of known values lies below, in order of size: quantile(values, 0.98). */
+  function quantile(values, share) {
+    const known = Float32Array.from(values).filter(Number.isFinite).map(Math.abs).sort();
+    return known.length ? known[Math.min(known.length - 1, Math.floor(share * known.length))] : NaN;
+  }
+
+  /** The unpacked arrays of a payload: an id or element with base64 inside, bytes, or what is unpacked already. */
+  Shapespace.load = async function (source) {
+    if (source && source.arrays) return source;
+    if (source instanceof ArrayBuffer) return Shapespace.unpack(source);
+    const element = typeof source === "string" ? document.getElementById(source) : source;
+    if (!element) throw new Error("The data of this picture are not in the page.");
+    let bytes = Shapespace.fromBase64(element.textContent);
+    if (element.dataset.coding === "deflate") {
+      if (typeof DecompressionStream !== "function") {
+        throw new Error("This browser is too old for the pictures that turn; the still pictures show the same.");
+      }
+      const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+      bytes = await new Response(plain).arrayBuffer();
+    }
+    return Shapespace.unpack(bytes);
+  };
+
+  /** Build when the element comes near the screen; what goes wrong is said in its place. */
+  function lazily(element, payload, build) {
+    element.classList.add("ss-widget");
+    return new Promise((resolve) => {
+      const start = async () => {
+        try {
+          const unpacked = await Shapespace.load(payload);
+          element.replaceChildren();
+          resolve(build(unpacked));
+        } catch (error) {
+          element.replaceChildren(make("p", { class: "shapespace-note", role: "note", text: error.message }));
+          resolve(null);
+        }
+      };
+      const observer = new IntersectionObserver((entries) => {
+        if (!entries.some((entry) => entry.isIntersecting)) return;
+        observer.disconnect();
+        start();
+      }, { rootMargin: "300px" });
+      observer.observe(element);
+    });
+  }
+
+  function stage(element, label) {
+    const plate = make("div", { class: "ss-plate" });
+    const controls = make("div", { class: "ss-controls" });
+    element.append(plate, controls);
+    return { view: new Shapespace.View(plate, { label }), plate, controls };
+  }
+
+  Shapespace.widgets = {};
+
+  // Modes -----------------------------------------------------------------------------------------------------------
+
+  /** Sliders that move a shape model along its modes. */
+  Shapespace.widgets.modes = (element, payload, options) =>
+    lazily(element, payload, (unpacked) => {
+      const { most = 8, reach = 3 } = options || {};
+      const model = new Shapespace.Model(unpacked);
+      const { view, controls } = stage(element, "The shape model, as the sliders say");
+      const K = Math.min(most, model.K);
+      const z = new Float32Array(model.K), positions = new Float32Array(3 * model.V);
+      view.setSurface("shape", { positions: model.vertices(z), faces: model.faces, colour: colours().clay });
+      view.frame();
+
+      let coloured = false, playing = 0, top = 0;
+      const bar = make("div", { class: "ss-bar", hidden: true });
+      const draw = () => {
+        view.move("shape", model.vertices(z, positions));
+        if (coloured) paint();
+      };
+      const paint = () =>
+        view.paint("shape", model.displacement(z), { map: model.faces ? colours().diverging : colours().sequential,
+          range: [model.faces ? -top : 0, top] });
+
+      const share = unpacked.arrays.share;
+      const rows = [];
+      for (let k = 0; k < K; k++) {
+        const percent = share ? 100 * share[k] : NaN;
+        rows.push(slider({
+          label: `Mode ${k + 1}`, min: -reach, max: reach, step: 0.1, value: 0,
+          note: Number.isFinite(percent) ? `${percent.toFixed(percent < 9.95 ? 1 : 0)} %` : "",
+          show: (value) => `${signed(value, 1)} sd`,
+          input: (value) => {
+            stop();
+            z[k] = value;
+            draw();
+          },
+        }));
+      }
+      const put = (values) => {
+        for (let k = 0; k < z.length; k++) z[k] = values(k);
+        rows.forEach((row, k) => row.put(z[k]));
+        draw();
+      };
+      const which = select("Mode to animate", rows.map((_, k) => [String(k), `Mode ${k + 1}`]), "0", () => {
+        if (playing) stop(), play();
+      });
+      which.row.classList.add("ss-inline");
+      const toggle = button("Animate", () => (playing ? stop() : play()), { "aria-pressed": "false" });
+      function play() {
+        const k = Number(which.list.value), start = performance.now(), phase = Math.asin(Math.max(-1, Math.min(1, z[k] / reach)));
+        toggle.textContent = "Pause";
+        toggle.setAttribute("aria-pressed", "true");
+        const step = (now) => {
+          if (!element.isConnected) return;
+          playing = requestAnimationFrame(step);
+          z[k] = reach * Math.sin(phase + Math.max(now - start, 0) * 0.0016);
+          rows[k].put(z[k]);
+          draw();
+        };
+        playing = requestAnimationFrame(step);
+      }
+      function stop() {
+        cancelAnimationFrame(playing);
+        playing = 0;
+        toggle.textContent = "Animate";
+        toggle.setAttribute("aria-pressed", "false");
+      }
+
+      controls.append(
+        make("div", { class: "ss-sliders", role: "group", "aria-label": "Modes, in standard deviations" },
+          ...rows.map((row) => row.row)),
+        make("div", { class: "ss-buttons" },
+          button("Reset", () => { stop(); put(() => 0); }),
+          button("Random", () => { stop(); put(() => Math.max(-reach, Math.min(reach, normal()))); })),
+        make("div", { class: "ss-buttons" }, toggle, which.row),
+        tick("Colour by distance from the mean", false, (on) => {
+          coloured = on;
+          if (on && !top) {
+            const one = new Float32Array(model.K);
+            let most = 0;
+            for (let k = 0; k < Math.min(3, model.K); k++) {
+              one.fill(0);
+              one[k] = reach;
+              most = Math.max(most, quantile(model.displacement(one), 0.95) || 0);
+            }
+            top = niceCeiling(most);
+            Shapespace.colourBar(bar, {
+              map: model.faces ? colours().diverging : colours().sequential, range: [model.faces ? -top : 0, top],
+              unit: "mm", title: model.faces ? "Moved inwards (\u2212) or outwards (+)" : "Moved", open: true,
+            });
+          }
+          bar.hidden = !on;
+          if (on) paint();
+          else view.paint("shape", null);
+        }),
+        bar
+      );
+      return { view, model, z, draw };
+    });
+
+  /** A number from the standard normal distribution. */
+  function normal() {
+    return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
+  }
+
+  // One fit ---------------------------------------------------------------------------------------------------------
+
+  const STAGES = { before: "Before", initial: "Phase 1", final: "Phase 2", dense: "Dense" };
+  const REGIONS = ["followed", "rejected", "border", "unseen"];
+  const REGION_WORDS = {
+    followed: "follows the scan", rejected: "does not match", border: "at the scan\u2019s border", unseen: "not seen by the scan",
+  };
+
+  /** A scan and the model that was fitted to it: stages, opacity, distances, regions. */
+  Shapespace.widgets.fit = (element, payload) =>
+    lazily(element, payload, (unpacked) => {
+      const { facts, arrays } = unpacked;
+      const { view, controls } = stage(element, `Scan and fitted model of ${facts.label || facts.name}`);
+      const stages = facts.stages;
+      const state = { stage: stages.includes("dense") ? "dense" : "final", map: "none", threshold: null };
+      const scanShown = { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan };
+      view.setSurface("scan", { ...scanShown, opacity: 0.5 });
+      view.setSurface("model", {
+        positions: arrays[`surface_${state.stage}`], faces: arrays.faces || null, colour: colours().model,
+      });
+      view.frame(["model"], 1.12);
+
+      const last = arrays[`model_to_scan_${state.stage}`];
+      const top = niceCeiling(Math.max(quantile(arrays.model_to_scan_final || last, 0.9) || 0, 0.5));
+      const bar = make("div", { class: "ss-bar" }), legend = make("div", { class: "ss-bar" });
+      Shapespace.colourBar(bar, {
+        map: colours().diverging, range: [-top, top], unit: "mm", title: "The scan lies behind the model (\u2212) or in front (+)", open: true,
+      });
+      legend.append(swatches(REGIONS.map((name) => [REGION_WORDS[name], colours().regions[name]])));
+      const said = make("p", { class: "ss-said", "aria-live": "polite" });
+
+      const values = () =>
+        state.map === "model" ? arrays[`model_to_scan_${state.stage}`]
+          : state.map === "scan" ? arrays[`scan_to_model_${state.stage}`] : null;
+
+      function paint() {
+        const map = { map: colours().diverging, range: [-top, top], threshold: state.threshold, signal: colours().signal };
+        view.paint("scan", state.map === "scan" ? values() : null, map);
+        if (state.map === "regions") {
+          view.paint("model", arrays.regions, { categories: REGIONS.map((name) => colours().regions[name]) });
+        } else {
+          view.paint("model", state.map === "model" ? values() : null, map);
+        }
+        const distances = state.map === "model" || state.map === "scan";
+        bar.hidden = beyond.row.hidden = limit.hidden = !distances;
+        beyond.row.hidden = !distances || state.threshold === null;
+        legend.hidden = state.map !== "regions";
+        said.textContent = distances ? sentence(values()) : state.map === "regions" ? regions() : "";
+        said.hidden = !said.textContent;
+      }
+
+      function sentence(d) {
+        let known = 0, sum = 0, far = 0;
+        const threshold = state.threshold === null ? Infinity : state.threshold;
+        for (let v = 0; v < d.length; v++) {
+          if (!Number.isFinite(d[v])) continue;
+          known += 1;
+          sum += Math.abs(d[v]);
+          if (Math.abs(d[v]) > threshold) far += 1;
+        }
+        if (!known) return "No distance is known here.";
+        const mean = `Mean distance ${(sum / known).toFixed(2)} mm.`;
+        return state.threshold === null ? mean
+          : `${mean} ${((100 * far) / known).toFixed(far / known < 0.0995 ? 1 : 0)} % lie beyond ${state.threshold.toFixed(1)} mm.`;
+      }
+
+      function regions() {
+        const counts = [0, 0, 0, 0];
+        for (const code of arrays.regions) counts[code] += 1;
+        return REGIONS.map((name, k) => `${REGION_WORDS[name]}: ${Math.round((100 * counts[k]) / arrays.regions.length)} %`)
+          .join("; ") + ".";
+      }
+
+      const beyond = slider({
+        label: "Threshold", min: 0.2, max: Math.max(10, top), step: 0.1, value: Math.min(2, top),
+        show: (value) => `${value.toFixed(1)} mm`,
+        input: (value) => {
+          state.threshold = value;
+          paint();
+        },
+      });
+      const limit = tick("Mark what lies beyond a threshold", false, (on) => {
+        state.threshold = on ? beyond.get() : null;
+        paint();
+      });
+      const layer = (id, name, opacity) => {
+        const row = slider({
+          label: name, min: 0, max: 100, step: 5, value: opacity, show: (value) => `${value} %`,
+          input: (value) => {
+            box.checked = value > 0;
+            view.set(id, { opacity: value / 100, visible: value > 0 });
+          },
+        });
+        const box = make("input", { type: "checkbox", "aria-label": `Show ${name.toLowerCase()}` });
+        box.checked = true;
+        box.addEventListener("change", () => {
+          if (box.checked && row.get() === 0) row.put(100);
+          view.set(id, { visible: box.checked, opacity: row.get() / 100 });
+        });
+        const dot = make("span", { class: "ss-dot", "aria-hidden": "true" });
+        dot.style.background = `rgb(${colours()[id].map((c) => Math.round(255 * c)).join(",")})`;
+        row.row.classList.add("ss-layer");
+        row.row.prepend(box, dot);
+        return { row: row.row, show: (percent) => {
+          row.put(percent);
+          box.checked = percent > 0;
+          view.set(id, { visible: percent > 0, opacity: percent / 100 });
+        } };
+      };
+      const scan = layer("scan", "Scan", 50), model = layer("model", "Model", 100);
+      controls.append(
+        choice("Stage", stages.map((name) => [name, STAGES[name] || name]), state.stage, (name) => {
+          state.stage = name;
+          view.move("model", arrays[`surface_${name}`]);
+          paint();
+        }),
+        make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, scan.row, model.row),
+        select("Colour", [
+          ["none", "plain"], ["model", "distance, model to scan"], ["scan", "distance, scan to model"], ["regions", "what the fit used"],
+        ], "none", (key) => {
+          state.map = key;
+          // The coloured surface is seen alone; the sliders bring the other one back.
+          scan.show(key === "scan" ? 100 : key === "none" ? 50 : 0);
+          model.show(key === "scan" ? 0 : 100);
+          paint();
+        }).row,
+        bar, legend, limit, beyond.row, said
+      );
+      if (facts.thinned) {
+        controls.append(make("p", { class: "ss-hint", text: "The scan is drawn with fewer points than it has." }));
+      }
+      paint();
+      return { view, state };
+    });
+
+  // Scatter ---------------------------------------------------------------------------------------------------------
+
+  /** Coefficients as points in three dimensions, coloured by label. */
+  Shapespace.widgets.scatter = (element, payload) =>
+    lazily(element, payload, (unpacked) => {
+      const { facts, arrays } = unpacked;
+      const [n, K] = arrays.points.shape;
+      const { view, plate, controls } = stage(element, `${n} points in the space of coefficients`);
+      const tip = make("div", { class: "ss-tip", hidden: true });
+      plate.append(tip);
+      const axes = [0, 1, 2].map((k) => Math.min(k, K - 1));
+      const colourOf = (v) => colours().categories[arrays.labels[v] % colours().categories.length];
+      const value = (v, axis) => arrays.points[v * K + axes[axis]];
+      let size = 1;
+
+      function place() {
+        const positions = new Float32Array(3 * n);
+        let most = 1e-6;
+        for (let v = 0; v < n; v++) {
+          for (let axis = 0; axis < 3; axis++) {
+            const at = axis < K ? value(v, axis) : 0;
+            positions[3 * v + axis] = at;
+            if (Number.isFinite(at)) most = Math.max(most, Math.abs(at));
+          }
+        }
+        size = 1.08 * most;
+        view.setSurface("points", { positions, faces: null, size: 0.055 * size });
+        view.paint("points", arrays.labels, { categories: [...new Set(arrays.labels)].length ? palette() : [] });
+        const s = size, axisNames = axes.map((k) => facts.axes[k] || `b${k + 1}`);
+        view.lines("axes", [[-s, 0, 0], [s, 0, 0], [0, -s, 0], [0, s, 0], [0, 0, -s], [0, 0, s]], [0.55, 0.55, 0.55]);
+        view.texts("axes", [
+          { position: [s, 0, 0], label: axisNames[0] }, { position: [0, s, 0], label: axisNames[1] },
+          { position: [0, 0, s], label: axisNames[2] },
+        ]);
+        if (!framed) view.frame(["axes"]), (view.camera = { yaw: 0.55, pitch: 0.35 });
+        framed = true;
+        show(null);
+      }
+      let framed = false;
+      const palette = () => facts.labels.map((_, k) => colours().categories[k % colours().categories.length]);
+
+      function show(v, at) {
+        tip.hidden = v === null;
+        view.remove("chosen");
+        if (v === null) return;
+        const label = facts.labels[arrays.labels[v]];
+        tip.textContent = label && label !== facts.names[v] ? `${facts.names[v]}: ${label}` : facts.names[v];
+        const point = [0, 1, 2].map((axis) => (axis < K ? value(v, axis) : 0));
+        view.marks("chosen", [{ position: point, label: "", colour: colourOf(v) }]);
+        const [x, y] = at || view.project(point);
+        tip.style.left = `${Math.max(4, Math.min(x + 12, plate.clientWidth - tip.offsetWidth - 4))}px`;
+        tip.style.top = `${Math.max(4, Math.min(y - tip.offsetHeight - 8, plate.clientHeight - tip.offsetHeight - 4))}px`;
+      }
+
+      const names = select("Point", [["", "none chosen"], ...facts.names.map((name, v) => [String(v), name])], "", (key) =>
+        show(key === "" ? null : Number(key))
+      );
+      let over = null;
+      const under = (event) => {
+        const hit = view.pick(event.clientX, event.clientY, ["points"]);
+        return hit ? hit.vertex : null;
+      };
+      view.on("hover", (event) => {
+        const v = under(event);
+        if (v === over) return;
+        over = v;
+        show(v === null && names.list.value !== "" ? Number(names.list.value) : v);
+      });
+      view.on("click", (event) => {
+        const v = under(event);
+        names.list.value = v === null ? "" : String(v);
+        show(v);
+      });
+      view.on("camera", () => {
+        if (names.list.value !== "" && !tip.hidden) show(Number(names.list.value));
+        else if (!tip.hidden) show(null);
+      });
+      const choices = facts.axes.map((name, k) => [String(k), name]);
+      ["Across", "Up", "Deep"].slice(0, Math.min(3, K)).forEach((name, axis) => {
+        controls.append(select(name, choices, String(axes[axis]), (key) => {
+          axes[axis] = Number(key);
+          place();
+        }).row);
+      });
+      controls.append(
+        names.row,
+        swatches(facts.labels.map((label, k) => [label, palette()[k]])),
+        make("p", { class: "ss-hint", text: facts.unit ? `Axes in ${facts.unit}.` : "" })
+      );
+      place();
+      return { view, axes };
+    });
+})();
