@@ -9,25 +9,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeAlias
+from typing import TypeAlias, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
+from shapespace.report.colours import CLAY, UNKNOWN_COLOUR, WHITE, Colour
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
-Colour: TypeAlias = tuple[float, float, float]
-"""Red, green, blue in [0, 1], sRGB."""
-
 _Single: TypeAlias = npt.NDArray[np.float32]
-
-WHITE: Colour = (1.0, 1.0, 1.0)
-CLAY: Colour = (0.80, 0.755, 0.715)
 
 _FRAGMENTS_AT_ONCE = 2_000_000
 _LARGEST_SIDE = 8192
@@ -112,7 +109,9 @@ class Layer:
         vmin: scalar of the first colour.
         vmax: scalar of the last colour.
         opacity: 1 hides what is behind; less blends.
-        point_radius_mm: radius of the balls of a point cloud.
+        point_radius_mm: radius of the balls of a point cloud; None takes one by their spacing, and shades them as the
+            surface that they lie on.
+        categories: the scalars are codes: a pixel takes that of most of its triangle, and nothing between two of them.
 
     Raises:
         InputError: scalars without a map, of another length, or an empty range.
@@ -125,7 +124,8 @@ class Layer:
     vmin: float = 0.0
     vmax: float = 1.0
     opacity: float = 1.0
-    point_radius_mm: float = 0.8
+    point_radius_mm: float | None = None
+    categories: bool = False
 
     def __post_init__(self) -> None:
         if self.scalars is None:
@@ -453,7 +453,8 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     normal = _unit(_blend(shares, normals[faces].reshape(-1, 9)[shown]) * np.where(back, -1, 1).astype(np.float32))
     scalar = None
     if layer.scalars is not None:
-        scalar = _blend(shares, layer.scalars.astype(np.float32)[faces][shown])[0]
+        at_corners = layer.scalars.astype(np.float32)[faces][shown]
+        scalar = _commonest(shares, at_corners) if layer.categories else _blend(shares, at_corners)[0]
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
     return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
 
@@ -472,6 +473,12 @@ def _blend(shares: Sequence[_Single], values: _Single) -> _Single:
     return np.stack([sum(share * values[:, k * size + d] for k, share in enumerate(shares)) for d in range(size)])
 
 
+def _commonest(shares: Sequence[_Single], codes: _Single) -> _Single:
+    """Return for each pixel, (n,), the one of its three `codes` (n, 3) whose corners have the largest share."""
+    weight = np.stack([sum(shares[j] * (codes[:, j] == codes[:, k]) for j in range(3)) for k in range(3)])
+    return codes[np.arange(len(codes)), weight.argmax(axis=0)]
+
+
 def _unit(vectors: _Single) -> _Single:
     """Return (d, n) vectors at length one."""
     squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
@@ -479,11 +486,14 @@ def _unit(vectors: _Single) -> _Single:
 
 
 def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
-    """Draw each vertex as a ball: a disc of pixels with the depth and the normals of a sphere."""
+    """Draw each vertex as a ball: a disc of pixels with the depth and the normals of a sphere, or of its surface."""
     width, height = size
+    own_radius = layer.point_radius_mm
+    spacing, surface = (0.0, None) if own_radius is not None else _cloud_surface(layer.mesh)
+    radius_mm = _CLOSING * spacing if own_radius is None else own_radius
     screen, depth = _project(layer.mesh.vertices, camera, size)
     behind = _depth_mm(depth, camera)
-    radius = max(layer.point_radius_mm * height / camera.height_mm, 0.75)
+    radius = max(radius_mm * height / camera.height_mm, 0.75)
     reach = int(np.ceil(radius))
     step_y, step_x = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     nearest = np.full(width * height, np.inf)
@@ -495,7 +505,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
         off = (column + 0.5 - screen[usable, 0]) ** 2 + (row + 0.5 - screen[usable, 1]) ** 2
         hit = np.flatnonzero((off <= radius**2) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
         pixel = row[hit] * width + column[hit]
-        rise = np.sqrt(radius**2 - off[hit]) / radius * layer.point_radius_mm
+        rise = np.sqrt(radius**2 - off[hit]) / radius * radius_mm
         value = behind[usable[hit]] - rise
         before = nearest[pixel]
         np.minimum.at(nearest, pixel, value)
@@ -507,10 +517,39 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     flat = (at - screen[owner]) / radius * [1.0, -1.0]
     up = np.sqrt(np.clip(1 - (flat**2).sum(axis=1), 0, 1))
     normal = np.concatenate([flat.T, up[None]]).astype(np.float32)
+    if surface is not None:
+        seen = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
+        seen *= np.where(seen[:, 2:] < 0, np.float32(-1), np.float32(1))
+        # A little of the ball is kept, by which a cloud is told from a closed surface.
+        normal = _unit((seen[owner].T + 0.35 * normal).astype(np.float32))
     scalar = None if layer.scalars is None else layer.scalars[owner].astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
     back = np.zeros(len(pixel), dtype=np.bool_)
     return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
+
+
+_CLOSING = 0.8
+_NEIGHBOURS = 10
+_clouds: WeakKeyDictionary[Mesh, tuple[float, FloatArray | None]] = WeakKeyDictionary()
+
+
+def _cloud_surface(mesh: Mesh) -> tuple[float, FloatArray | None]:
+    """Return the spacing of points in mm, and unit normals (V, 3) of either sign; None for too few points."""
+    if mesh not in _clouds:
+        points = mesh.vertices
+        if len(points) <= _NEIGHBOURS:
+            _clouds[mesh] = (1.0, None)
+        else:
+            away, near = cast(tuple[FloatArray, npt.NDArray[np.int64]], cKDTree(points).query(points, k=_NEIGHBOURS))
+            offset = points[near] - points[near].mean(axis=1, keepdims=True)
+            normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+            _clouds[mesh] = (float(np.median(away[:, 4])), np.asarray(normals))
+    return _clouds[mesh]
+
+
+def point_spacing(mesh: Mesh) -> float:
+    """Return about how far the points of a cloud lie from each other, mm."""
+    return _cloud_surface(mesh)[0]
 
 
 def _direction(x: float, y: float, z: float) -> _Single:
@@ -520,6 +559,8 @@ def _direction(x: float, y: float, z: float) -> _Single:
 
 _KEY = _direction(-0.50, 0.58, 0.64)
 _FILL = _direction(0.80, 0.05, 0.60)
+_WARM = np.array([1.00, 0.965, 0.92], dtype=np.float32)
+_COOL = np.array([0.86, 0.95, 1.10], dtype=np.float32)
 _HALF = _direction(*(float(v) for v in _KEY + np.array([0, 0, 1])))
 
 
@@ -533,19 +574,23 @@ def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
         finite = np.isfinite(surfels.scalar)
         share = (np.where(finite, surfels.scalar, 0) - layer.vmin) / (layer.vmax - layer.vmin)
         base = table[np.clip(share * len(table), 0, len(table) - 1).astype(np.int64)]
-        base[~finite] = 0.35
+        base[~finite] = np.asarray(UNKNOWN_COLOUR, dtype=np.float32) ** _GAMMA
     # Wrapped diffuse light keeps the shadow side of a face readable.
-    key = np.clip((_KEY @ normal + 0.15) / 1.15, 0, 1)
+    key = np.clip((_KEY @ normal + 0.18) / 1.18, 0, 1)
     fill = np.clip(_FILL @ normal, 0, 1)
+    sky = 0.5 + 0.5 * normal[1]
     rim = np.clip(1 - np.abs(normal[2]), 0, 1)
     gloss = np.clip(_HALF @ normal, 0, 1)
     for _ in range(5):
         gloss *= gloss
-    # A map is read by its colours: less shading there, so that they stay close to the scale's.
-    ambient, key_share, fill_share, shine = (0.50, 0.55, 0.10, 0.02) if mapped else (0.08, 0.94, 0.12, 0.05)
-    light = (ambient + key_share * key + fill_share * fill) * surfels.occlusion
-    edge = 0.0 if mapped else 0.03
-    out = base * light[:, None] + (shine * gloss * surfels.occlusion + edge * rim * rim * rim)[:, None]
+    if mapped:
+        # A map is read by its colours: less shading there, and none of it coloured, so that they stay the scale's.
+        light = (0.50 + 0.48 * key + 0.08 * fill) * surfels.occlusion * (1 - 0.45 * rim**4)
+        out = base * light[:, None] + (0.02 * gloss * surfels.occlusion)[:, None]
+    else:
+        light = key[:, None] * _WARM + (0.15 * fill + 0.13 * sky)[:, None] * _COOL + np.float32(0.035)
+        out = base * (light * surfels.occlusion[:, None])
+        out += (0.07 * gloss * surfels.occlusion + 0.035 * rim**3)[:, None]
     if surfels.back.any():
         out[surfels.back] = 0.4 * out[surfels.back] + 0.02
     return np.clip(out, 0, 1).astype(np.float32)
@@ -561,9 +606,13 @@ def _occlusion(
     depth = np.zeros((height, width), dtype=np.float32)
     depth.ravel()[pixel] = depth_mm
     coarse = (slice(None, None, supersample), slice(None, None, supersample))
-    sigma = 0.022 * height / supersample
-    total = gaussian_filter(there[coarse], sigma, truncate=2.5)
-    mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
-    mean_here = mean[pixel // width // supersample, pixel % width // supersample]
-    behind = np.clip(depth_mm - mean_here, 0, 0.03 * camera.height_mm)
-    return np.exp(np.float32(-30.0 / camera.height_mm) * behind)
+    out = np.ones(len(pixel), dtype=np.float32)
+    row, column = pixel // width // supersample, pixel % width // supersample
+    # The wide one shades the eye sockets and below the chin, the narrow one draws lips, lids and folds.
+    for reach, most, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
+        sigma = reach * height / supersample
+        total = gaussian_filter(there[coarse], sigma, truncate=2.5)
+        mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
+        behind = np.clip(depth_mm - mean[row, column], 0, most * camera.height_mm)
+        out *= np.exp(np.float32(-strength / camera.height_mm) * behind)
+    return out

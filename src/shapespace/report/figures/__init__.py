@@ -1,0 +1,81 @@
+"""Figures of shape spaces and fits: a model or a `StagedFit` in, a matplotlib figure out.
+
+    import shapespace as ss
+    from shapespace.report import figures
+    from shapespace.report.staged import StagedFit
+
+    result = ss.fit_scan(model, scan)
+    figures.signed_maps(StagedFit.of(model, result)).savefig("distances.png")
+
+Pictures of one row share camera and light, one figure has one scale, and the maps can be told apart by colour-blind
+readers. Importing this package needs the extra `report`.
+"""
+
+from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
+from shapespace.report.figures.fit import (
+    THRESHOLDS_MM,
+    coefficients_figure,
+    distance_histograms,
+    history_figure,
+    overlay_figure,
+    regions_figure,
+    signed_maps,
+    stages_figure,
+    threshold_figure,
+)
+from shapespace.report.figures.many import (
+    Coefficients,
+    Entry,
+    aligned_grid,
+    b_plane,
+    b_space,
+    distance_maps,
+    error_curves,
+    faces_grid,
+    gallery,
+    portrait_figure,
+    scatter_3d,
+    scatter_matrix,
+    worst_first,
+)
+from shapespace.report.figures.model import (
+    mean_figure,
+    mode_animation,
+    modes_figure,
+    quality_figure,
+    spectrum_figure,
+)
+from shapespace.report.staged import StagedFit
+
+__all__ = [
+    "STAGE_WORDS",
+    "THRESHOLDS_MM",
+    "Coefficients",
+    "Entry",
+    "StagedFit",
+    "aligned_grid",
+    "b_plane",
+    "b_space",
+    "coefficients_figure",
+    "distance_histograms",
+    "distance_maps",
+    "encode_webp",
+    "error_curves",
+    "faces_grid",
+    "gallery",
+    "history_figure",
+    "mean_figure",
+    "mode_animation",
+    "modes_figure",
+    "overlay_figure",
+    "portrait_figure",
+    "quality_figure",
+    "regions_figure",
+    "scatter_3d",
+    "scatter_matrix",
+    "signed_maps",
+    "spectrum_figure",
+    "stages_figure",
+    "threshold_figure",
+    "worst_first",
+]

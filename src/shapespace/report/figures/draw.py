@@ -1,0 +1,489 @@
+"""What all figures share: one width, one type, panels in rows pixel for pixel, charts, scales and keys, WebP.
+
+A figure is 960 pixels wide, and its smallest type stays legible when a phone shows it 340 wide.
+"""
+
+from __future__ import annotations
+
+import io
+import unicodedata
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from PIL import Image as PillowImage
+
+from shapespace.errors import InputError
+from shapespace.report.colours import SCAN_COLOUR, Colour
+from shapespace.report.render import Camera, Image, Layer, point_spacing
+from shapespace.types import FloatArray, Mesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from shapespace.report.staged import StagedFit
+
+STAGE_WORDS = {
+    "before": "before",
+    "initial": "after phase 1: pose",
+    "final": "after phase 2: pose and shape",
+    "dense": "dense",
+}
+"""The moments of a fit whose surfaces are kept, in order, and what they are called."""
+
+INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
+FORWARD, BACKWARD = "#0072B2", "#D55E00"
+WIDTH, DPI = 960, 160
+TITLE, TEXT, SMALL = 12.0, 11.0, 9.5
+MOST_PANELS = 48
+_GAP, _EDGE = 8, 4
+_MOST_LINES = 4
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera, and the size in pixels of the panels that it fills."""
+
+    camera: Camera
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A row of panels of one size.
+
+    Args:
+        panels: (H, W, 3) pictures.
+        captions: one above each panel; empty for none.
+        heading: above the row.
+        notes: one below each panel; empty for none.
+        frames: colour of the line around each panel, None for no line; empty for none at all.
+    """
+
+    panels: Sequence[Image]
+    captions: Sequence[str] = ()
+    heading: str = ""
+    notes: Sequence[str] = ()
+    frames: Sequence[Colour | None] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """A colour bar.
+
+    Args:
+        label: what is shown, with its unit.
+        colours: (N, 3).
+        low: value of the first colour.
+        high: value of the last one.
+        open_ends: whether values beyond are drawn in the outermost colours: `low`, `high`, `both` or neither.
+        low_word: what the low end means.
+        high_word: what the high end means.
+    """
+
+    label: str
+    colours: FloatArray
+    low: float
+    high: float
+    open_ends: str = "neither"
+    low_word: str = ""
+    high_word: str = ""
+
+
+def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = WIDTH, margin: float = 0.04) -> View:
+    """Return a camera that sees all `points` (N, 3) in panels of which `columns` fill the figure."""
+    across = (width - (columns - 1) * _GAP) // columns
+    flat = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e-3, margin=0.0, perspective=False)
+    tall = Camera.framing(points, yaw_deg=yaw_deg, aspect=1e3, margin=0.0, perspective=False)
+    aspect = min(max(1e-3 * flat.height_mm / tall.height_mm, 0.68), 1.5)
+    size = (across, round(across / aspect))
+    return View(Camera.framing(points, yaw_deg=yaw_deg, aspect=size[0] / size[1], margin=margin), size)
+
+
+def surroundings(fit: StagedFit) -> FloatArray:
+    """Return the points (N, 3) that a picture of `fit` frames: its surface, and the scan near it."""
+    surface = fit.surfaces["final"].vertices
+    low, high = surface.min(axis=0), surface.max(axis=0)
+    room = 0.16 * float((high - low).max())
+    scan = fit.scan.vertices
+    near = ((scan > low - room) & (scan < high + room)).all(axis=1)
+    # Shreds that float near a scan are seen where they are, but do not make the rest small.
+    kept = scan[near]
+    if len(kept) > 100:
+        inner, outer = np.percentile(kept, [0.3, 99.7], axis=0)
+        kept = kept[((kept >= inner) & (kept <= outer)).all(axis=1)]
+    return np.concatenate([surface, kept])
+
+
+def grid(
+    rows: Sequence[Row],
+    *,
+    title: str,
+    note: str = "",
+    scale: Scale | None = None,
+    keys: Sequence[tuple[str, Colour]] = (),
+) -> Figure:
+    """Lay out pictures pixel for pixel in rows below `title`, with a key or a scale and a `note` below them.
+
+    Raises:
+        InputError: there are no pictures.
+    """
+    if not rows or not rows[0].panels:
+        raise InputError(f"{plain(title)}: there is nothing to draw.")
+    columns = max(len(row.panels) for row in rows)
+    widest = max(row.panels[0].shape[1] for row in rows)
+    total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
+    texts: list[tuple[float, float, str, dict[str, Any]]] = []
+    pictures: list[tuple[int, float, Image, Colour | None]] = []
+    y = 6.0
+
+    def write(x: float, text: str, width: float, size: float, **style: Any) -> float:
+        """Put wrapped `text` at the height `y` and return the height that it takes."""
+        wrapped = wrap(text, width, size, bold=style.get("fontweight") == "bold")
+        for k, line in enumerate(wrapped.split("\n")):
+            texts.append((x, y + baseline(k, size), line, {"fontsize": size, "va": "baseline", **style}))
+        return height_of(wrapped, size)
+
+    y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
+    for row in rows:
+        panels = row.panels if any(row.frames) else without_empty_rows(row.panels)
+        high, wide = panels[0].shape[:2]
+        left = (total_w - len(row.panels) * wide - (len(row.panels) - 1) * _GAP) // 2 if len(rows) == 1 else 0
+        if row.heading:
+            y += 8 + write(_EDGE, row.heading, total_w - 2 * _EDGE, TEXT, fontweight="bold", color=INK)
+        centres = [left + k * (wide + _GAP) + wide / 2 for k in range(len(row.panels))]
+        if any(row.captions):
+            y += 2 + max(
+                write(x, text, wide, TEXT, ha="center", color=INK)
+                for x, text in zip(centres, row.captions, strict=True)
+            )
+        frames = row.frames or [None] * len(row.panels)
+        for k, (panel, frame) in enumerate(zip(panels, frames, strict=True)):
+            pictures.append((left + k * (wide + _GAP), y, panel, frame))
+        y += high + _GAP
+        if any(row.notes):
+            y += 4 + max(
+                write(x, text, wide - 6, SMALL, ha="center", color=GREY)
+                for x, text in zip(centres, row.notes, strict=True)
+            )
+    if keys:
+        y += 4
+        y += _place_keys(texts, keys, y, total_w)
+    bar_at = y + 10
+    if scale is not None:
+        y = bar_at + 24 + 2.5 * line_height(TEXT)
+    if note:
+        y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
+    total_h = int(np.ceil(y + 6))
+    figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    for x, top, image, frame in pictures:
+        high, wide = image.shape[:2]
+        axes = figure.add_axes(
+            (x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h), frameon=frame is not None
+        )
+        axes.imshow(image, interpolation="nearest", aspect="auto")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        if frame is not None:
+            for spine in axes.spines.values():
+                spine.set(color=frame, linewidth=2.2)
+    for x, top, text, style in texts:
+        figure.text(x / total_w, 1 - top / total_h, escaped(text), **style)
+    if scale is not None:
+        _colour_bar(figure, scale, bar_at, total_w, total_h)
+    return figure
+
+
+def _place_keys(
+    texts: list[tuple[float, float, str, dict[str, Any]]], keys: Sequence[tuple[str, Colour]], y: float, total_w: int
+) -> float:
+    """Put coloured squares and their names in centred lines, and return the height that they take."""
+    square, between = measured("■ ", TEXT + 2), 28.0
+    lines: list[list[tuple[str, Colour, float]]] = [[]]
+    for name, colour in keys:
+        width = square + measured(name, TEXT) + between
+        if lines[-1] and sum(item[2] for item in lines[-1]) + width > total_w:
+            lines.append([])
+        lines[-1].append((name, colour, width))
+    step = 1.25 * line_height(TEXT)
+    for k, line in enumerate(lines):
+        x = (total_w - sum(item[2] for item in line) + between) / 2
+        middle = y + (k + 0.5) * step
+        for name, colour, width in line:
+            texts.append((x, middle, "■", {"color": colour, "fontsize": TEXT + 2, "va": "center_baseline"}))
+            texts.append((x + square, middle, name, {"color": INK, "fontsize": TEXT, "va": "center_baseline"}))
+            x += width
+    return step * len(lines)
+
+
+def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h: int) -> None:
+    axes = figure.add_axes((0.18, 1 - (top + 18) / total_h, 0.64, 18 / total_h))
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(scale.colours)),
+        cax=axes,
+        orientation="horizontal",
+        extend={"low": "min", "high": "max", "both": "both"}.get(scale.open_ends, "neither"),
+        extendfrac=0.04,
+    )
+    bar.ax.tick_params(labelsize=SMALL, colors=INK, length=3, pad=2)
+    bar.ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
+    cast(Any, bar).outline.set_visible(False)
+    left, right = scale.low_word and f"← {scale.low_word}", scale.high_word and f"{scale.high_word} →"
+    label = "    ".join(word for word in (left, scale.label, right) if word)
+    size = SMALL + 0.5 if left or right else TEXT
+    up = 1 - (top + 24 + 1.05 * line_height(SMALL) + baseline(0, TEXT)) / total_h
+    figure.text(0.5, up, escaped(label), ha="center", va="baseline", fontsize=size, color=INK)
+
+
+def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
+    """Return pictures of one row without the white rows of pixels that all of them have above and below."""
+    used = np.zeros(panels[0].shape[0], dtype=bool)
+    for panel in panels:
+        used |= (panel < 255).any(axis=(1, 2))
+    at = np.flatnonzero(used)
+    if not len(at):
+        return list(panels)
+    return [panel[max(at[0] - _EDGE, 0) : at[-1] + 1 + _EDGE] for panel in panels]
+
+
+def chart(title: str, *, height: float, note: str = "") -> tuple[Figure, Axes]:
+    """Return a figure with one plot `height` inches high below its wrapped `title`, and the plot."""
+    figure, (axes,) = charts(title, [height], note=note)
+    return figure, axes
+
+
+def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure with rows of plots of `heights` in inches, and the plots row by row."""
+    wrapped = wrap(title, WIDTH - 2 * _EDGE, TITLE, bold=True)
+    below = wrap(note, WIDTH - 2 * _EDGE, SMALL) if note else ""
+    top = (height_of(wrapped, TITLE) + 14) / DPI
+    bottom = (height_of(below, SMALL) + 12) / DPI if below else 0.03
+    total = sum(heights) + top + bottom
+    figure = Figure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
+    axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
+    start = total * DPI - height_of(below, SMALL) - 2
+    for text, first, size, look in (
+        (wrapped, 6.0, TITLE, {"color": INK, "fontweight": "bold"}),
+        (below, start, SMALL, {"color": GREY}),
+    ):
+        for k, line in enumerate(text.split("\n")):
+            up = 1 - (first + baseline(k, size)) / DPI / total
+            figure.text(_EDGE / WIDTH, up, escaped(line), in_layout=False, fontsize=size, **cast(Any, look))
+    # Where the plots may stand, for `finish`.
+    cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
+    return figure, axes
+
+
+def finish(figure: Figure, **spaces: float) -> Figure:
+    """Style the plots of a chart, and place them so that nothing of them is cut."""
+    for axes in figure.axes:
+        if axes.name != "3d" and axes.axison:
+            style(axes)
+    with without_glyph_warnings():
+        figure.tight_layout(rect=cast(Any, figure).plots_within, pad=0.4, **spaces)
+    return figure
+
+
+def style(axes: Axes) -> None:
+    """Give a plot the type and the quiet lines of all of them."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("#9a9da3")
+    axes.tick_params(which="both", colors=INK, labelsize=SMALL, color="#9a9da3")
+    axes.xaxis.label.set(fontsize=TEXT, color=INK)
+    axes.yaxis.label.set(fontsize=TEXT, color=INK)
+    axes.grid(True, color=RULE, lw=0.8)
+    axes.set_axisbelow(True)
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """Add the legend of a plot."""
+    made = cast(Any, axes).legend(fontsize=SMALL, labelcolor=INK, framealpha=0.9, **{"handlelength": 1.5, **options})
+    made.get_frame().set_linewidth(0.0)
+
+
+@contextmanager
+def without_glyph_warnings() -> Generator[None]:
+    """Return a block in which a script that the font lacks is drawn as boxes without a warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
+        yield
+
+
+def encode_webp(figure: Figure, *, lossless: bool = False) -> tuple[bytes, tuple[int, int]]:
+    """Return `figure` as WebP bytes and its size in pixels; flat charts are smaller lossless, stills are not."""
+    with without_glyph_warnings():
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
+    stream = io.BytesIO()
+    PillowImage.fromarray(np.ascontiguousarray(pixels)).save(
+        stream, format="WEBP", lossless=lossless, quality=20 if lossless else 84, method=1 if lossless else 2
+    )
+    return stream.getvalue(), (pixels.shape[1], pixels.shape[0])
+
+
+@lru_cache(maxsize=1)
+def _renderer() -> RendererAgg:
+    return RendererAgg(1, 1, DPI)
+
+
+@lru_cache(maxsize=4096)
+def measured(text: str, size: float, *, bold: bool = False) -> float:
+    """Return the width of one line of `text` in pixels at `size` points."""
+    with without_glyph_warnings():
+        width, _, _ = _renderer().get_text_width_height_descent(
+            text, FontProperties(size=size, weight="bold" if bold else "normal"), False
+        )
+    return float(width)
+
+
+def line_height(size: float) -> float:
+    """Return the height in pixels of a line of type of `size` points."""
+    return 1.3 * size * DPI / 72
+
+
+def baseline(line: int, size: float) -> float:
+    """Return how far below the top of a text its line number `line` (from 0) stands, in pixels."""
+    return 0.97 * size * DPI / 72 + line * line_height(size)
+
+
+def height_of(text: str, size: float) -> float:
+    """Return the height of lines of `text` in pixels, 0 for none."""
+    return line_height(size) * (1 + text.count("\n")) if text else 0.0
+
+
+def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int = _MOST_LINES) -> str:
+    """Return `text` in at most `most` lines, none wider than `width` pixels, those of a paragraph of like length.
+
+    What is left out ends in `…`.
+    """
+    lines: list[str] = []
+    for part in plain(text).split("\n"):
+        filled = _filled(part, width, size, bold)
+        if 1 < len(filled) <= most:
+            low, high = width / len(filled), width
+            while high - low > 8:
+                middle = (low + high) / 2
+                low, high = (low, middle) if len(_filled(part, middle, size, bold)) == len(filled) else (middle, high)
+            filled = _filled(part, high, size, bold)
+        lines += filled
+    if len(lines) <= most:
+        return "\n".join(lines).rstrip("\n")
+    last = lines[most - 1]
+    while last and measured(last + "…", size, bold=bold) > width:
+        last = last[:-1]
+    return "\n".join([*lines[: most - 1], last.rstrip() + "…"])
+
+
+def _filled(text: str, width: float, size: float, bold: bool) -> list[str]:
+    """Return `text` in lines, each as full as can be."""
+    lines: list[str] = []
+    line = ""
+    for word in _pieces(text, width, size, bold):
+        longer = f"{line} {word}" if line else word
+        if line and measured(longer, size, bold=bold) > width:
+            lines.append(line)
+            longer = word
+        line = longer
+    return [*lines, line]
+
+
+def _pieces(text: str, width: float, size: float, bold: bool) -> Generator[str]:
+    """Yield words, those that are wider than `width` in parts."""
+    for word in text.split(" "):
+        while word and measured(word, size, bold=bold) > width:
+            low, high = 1, len(word)
+            while low < high:
+                middle = (low + high + 1) // 2
+                low, high = (middle, high) if measured(word[:middle], size, bold=bold) <= width else (low, middle - 1)
+            yield word[:low]
+            word = word[low:]
+        if word:
+            yield word
+
+
+_LONGEST = 400
+
+
+def plain(text: str) -> str:
+    """Return `text` of a user without what cannot be printed, and no longer than a caption could be."""
+    kept = "".join(
+        c
+        if c == "\n"
+        else " "
+        if c.isspace()
+        else "\N{REPLACEMENT CHARACTER}"
+        if unicodedata.category(c)[0] == "C"
+        else c
+        for c in str(text)[: _LONGEST + 1]
+    )
+    return kept if len(kept) <= _LONGEST else kept[: _LONGEST - 1] + "…"
+
+
+def escaped(text: str) -> str:
+    """Return `text` so that matplotlib does not read dollars as mathematics."""
+    return text.replace("$", r"\$")
+
+
+def short(text: str, most: int = 28) -> str:
+    """Return one line of at most `most` characters."""
+    line = " ".join(plain(text).split())
+    return line if len(line) <= most else line[: most - 1] + "…"
+
+
+def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
+    """Cut `items` into rows of at most `columns`."""
+    return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
+
+
+def nice_ceiling(value: float) -> float:
+    """Return a round number at or a little above `value`, 1 where that is not positive."""
+    if not (value > 0 and np.isfinite(value)):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
+
+
+def mm(value: float) -> str:
+    """Return a length with three or so digits and its unit."""
+    if not np.isfinite(value):
+        return "–"
+    size = abs(value)
+    digits = 0 if size >= 99.95 else 1 if size >= 9.995 else 2
+    return f"{value:.{digits}f} mm".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """Return a percentage that says 100 only when it is all, and 0 only when it is none."""
+    if share in (0.0, 1.0):
+        return f"{100 * share:.0f} %"
+    if share < 0.01:
+        return f"{max(100 * share, 0.1):.1f} %"
+    return f"{min(100 * share, 99.9):.1f} %" if share > 0.99 else f"{100 * share:.0f} %"
+
+
+def counted(number: int, word: str) -> str:
+    """Return `1 shape` or `60 shapes`."""
+    return f"{number:,} {word}" + ("" if number == 1 else "s")
+
+
+def scan_over(mesh: Mesh) -> Layer:
+    """Return the layer of a scan that lies over a model: points are drawn so small that the model is seen between."""
+    return Layer(mesh, SCAN_COLOUR, point_radius_mm=None if mesh.faces is not None else 0.3 * point_spacing(mesh))
+
+
+def absolute(values: FloatArray) -> FloatArray:
+    """Return the lengths of signed distances that were measured, (n,)."""
+    return np.abs(values[np.isfinite(values)])

@@ -1,0 +1,311 @@
+"""Figures of a shape space: its mean, what its modes do, and how many of them it needs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from PIL import Image as PillowImage
+from PIL import ImageDraw, ImageFont
+
+from shapespace.errors import InputError
+from shapespace.model.shape_model import ShapeModel
+from shapespace.report.colours import CLAY, SEQUENTIAL
+from shapespace.report.figures.draw import (
+    FORWARD,
+    INK,
+    TEXT,
+    Row,
+    Scale,
+    chart,
+    charts,
+    counted,
+    finish,
+    grid,
+    legend,
+    mm,
+    nice_ceiling,
+    percent,
+    view,
+)
+from shapespace.report.render import Camera, Image, Layer, render, render_layers
+from shapespace.types import FloatArray, Mesh
+
+SHARES = (0.90, 0.95, 0.98, 0.99)
+"""Shares of the variance for which the number of modes is told."""
+
+_LANDMARK = (0.78, 0.20, 0.14)
+_BARS = "#a9c9e2"
+_QUALITY = {
+    "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
+    "generalisation": ("Generalisation: error on shapes left out", "mean error (mm)"),
+    "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
+}
+
+
+def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
+    """Draw the mean shape from three sides, with the model's landmarks where it has any.
+
+    Args:
+        model: the shape space.
+        title: above the figure; by default it says how many shapes the mean is of.
+    """
+    mean = model.mesh()
+    layers = [Layer(mean)]
+    if model.landmarks:
+        at = mean.vertices[list(model.landmarks.values())]
+        size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
+        layers.append(Layer(Mesh(at), _LANDMARK, point_radius_mm=size))
+    panels: list[Image] = []
+    sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
+    # One height in mm for all three, so that they can be compared.
+    front = view(mean.vertices, len(sides))
+    for _, yaw in sides:
+        camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
+        height = max(camera.height_mm, front.camera.height_mm)
+        turned = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
+        panels.append(render_layers(layers, camera=turned, size=front.size))
+    marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
+    return grid(
+        [Row(panels, [name for name, _ in sides])],
+        title=title or f"The mean of {counted(model.n_training, 'shape')}{marks}",
+    )
+
+
+def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
+    """Draw what each of the first modes does (the paper's figures 2 and 3).
+
+    A row a mode: the mean less and plus `deviations` standard deviations of it, and how far each vertex then moves; one
+    camera and one scale for all rows.
+
+    Args:
+        model: the shape space.
+        modes: how many to draw at most.
+        deviations: how many standard deviations to each side.
+        title: above the figure.
+
+    Raises:
+        InputError: no mode is asked for, or deviations that are not positive.
+    """
+    if modes < 1 or not deviations > 0:
+        raise InputError(f"There is nothing to draw of {modes} modes at {deviations} standard deviations.")
+    shown = min(modes, model.n_modes)
+    moves = [mode_displacement(model, k, deviations) for k in range(shown)]
+    mean = model.mesh()
+    seen = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
+    lengths = [np.linalg.norm(move, axis=1) for move in moves]
+    top = nice_ceiling(max(float(length.max()) for length in lengths))
+    middle = render(mean, camera=seen.camera, size=seen.size)
+    rows: list[Row] = []
+    for k, (move, length) in enumerate(zip(moves, lengths, strict=True)):
+        low, high = (
+            render(mean.with_vertices(mean.vertices + sign * move), camera=seen.camera, size=seen.size)
+            for sign in (-1, 1)
+        )
+        mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
+        far = render_layers([mapped], camera=seen.camera, size=seen.size)
+        share = float(model.stddev[k] ** 2 / model.total_variance)
+        rows.append(
+            Row(
+                [low, middle, high, far],
+                [f"−{deviations:g} sd", "mean", f"+{deviations:g} sd", "movement"] if k == 0 else [],
+                f"Mode {k + 1}: {percent(share)} of the variance, moves up to {mm(float(length.max()))}",
+            )
+        )
+    return grid(
+        rows,
+        title=title or ("What the one mode does to the mean" if shown == 1 else "What each mode does to the mean"),
+        scale=Scale(f"how far a point moves at {deviations:g} standard deviations (mm)", SEQUENTIAL, 0.0, top),
+    )
+
+
+def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
+    """Return how far each vertex moves, (V, 3) mm, when coefficient `mode` (from 0) rises by `deviations` of its own.
+
+    Raises:
+        InputError: the model has no such mode.
+    """
+    if not 0 <= mode < model.n_modes:
+        raise InputError(f"The model has {counted(model.n_modes, 'mode')}, so there is no mode with index {mode}.")
+    b = np.zeros(model.n_modes)
+    b[mode] = deviations * model.stddev[mode]
+    return model.reconstruct(b) - model.mean_vertices
+
+
+def mode_animation(
+    model: ShapeModel,
+    mode: int = 0,
+    *,
+    deviations: float = 3.0,
+    frames: int = 24,
+    width: int = 320,
+    yaw_deg: float = 25.0,
+    milliseconds: int = 80,
+) -> bytes:
+    """Return an animated WebP in which the mean sways along one mode and back, for ever.
+
+        Path("mode1.webp").write_bytes(mode_animation(model, 0))
+
+    Args:
+        model: the shape space.
+        mode: which, from 0.
+        deviations: how many standard deviations to each side.
+        frames: of one period, at least 4.
+        width: of the picture in pixels.
+        yaw_deg: how far the shape is turned from the front.
+        milliseconds: that a frame stands.
+
+    Raises:
+        InputError: the model has no such mode, or there are too few frames.
+    """
+    if frames < 4 or milliseconds < 1:
+        raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
+    move = mode_displacement(model, mode, 1.0)
+    mean = model.mesh()
+    ends = np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)])
+    seen = view(ends, 1, yaw_deg=yaw_deg, width=width)
+    half = frames // 2
+    swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
+    forth = [
+        _labelled(
+            render(mean.with_vertices(mean.vertices + z * move), camera=seen.camera, size=seen.size, colour=CLAY),
+            f"mode {mode + 1}",
+            float(z),
+            deviations,
+        )
+        for z in swings
+    ]
+    cycle = forth + forth[-2:0:-1]
+    stream = io.BytesIO()
+    cycle[0].save(
+        stream,
+        format="WEBP",
+        save_all=True,
+        append_images=cycle[1:],
+        duration=milliseconds,
+        loop=0,
+        quality=72,
+        method=2,
+    )
+    return stream.getvalue()
+
+
+def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
+    """Add below a picture which mode it is, and where on its way from one end to the other."""
+    height, width = image.shape[:2]
+    type_size = max(11, round(width / 19))
+    strip = round(2.1 * type_size)
+    picture = PillowImage.new("RGB", (width, height + strip), "white")
+    picture.paste(PillowImage.fromarray(image), (0, 0))
+    draw = ImageDraw.Draw(picture)
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), type_size)
+    middle = height + strip // 2
+    draw.text((4, middle), name, fill=INK, font=font, anchor="lm")
+    draw.text((width - 4, middle), f"{z:+.1f} sd".replace("-", "−"), fill=INK, font=font, anchor="rm")
+    left, right = round(0.34 * width), round(0.66 * width)
+    draw.line([(left, middle), (right, middle)], fill="#b9bcc2", width=2)
+    draw.line([((left + right) // 2, middle - 4), ((left + right) // 2, middle + 4)], fill="#b9bcc2", width=2)
+    at = round(left + (right - left) * (z + deviations) / (2 * deviations))
+    radius = max(4, type_size // 3)
+    draw.ellipse((at - radius, middle - radius, at + radius, middle + radius), fill=FORWARD)
+    return picture
+
+
+def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, title: str = "") -> Figure:
+    """Draw how much variance the first modes hold, and how many it takes for each of `shares`."""
+    cumulative = model.cumulative_variance
+    needed = {share: model.modes_for_variance(share) for share in shares}
+    reached = [count for count in needed.values() if count is not None]
+    shown = min(len(cumulative), max(8, (max(reached) if len(reached) == len(needed) else len(cumulative)) + 3), 120)
+    count = np.arange(1, shown + 1)
+    figure, axes = chart(
+        title or f"How many modes the variance of {counted(model.n_training, 'shape')} needs", height=3.3
+    )
+    axes.bar(count, 100 * np.diff(cumulative[:shown], prepend=0.0), color=_BARS, label="each mode")
+    axes.plot(
+        count,
+        100 * cumulative[:shown],
+        color=FORWARD,
+        lw=2,
+        marker="o" if shown < 40 else "",
+        ms=4,
+        label="all up to it",
+    )
+    lines: list[str] = []
+    for share, modes in needed.items():
+        if modes is None:
+            lines.append(f"{100 * share:g} %: more than {len(cumulative)}")
+            continue
+        lines.append(f"{100 * share:g} %: {counted(modes, 'mode')}")
+        if modes <= shown:
+            axes.plot([modes], [100 * cumulative[modes - 1]], "o", ms=9, mfc="none", mec=INK, mew=1.4, zorder=5)
+    axes.plot([], [], "o", ms=9, mfc="none", mec=INK, mew=1.4, ls="", label="\n".join(lines))
+    axes.set(
+        xlabel="number of modes", ylabel="share of the variance (%)", ylim=(0, 104), xlim=(0.2, max(shown, 4) + 0.8)
+    )
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend(axes, loc="center right", bbox_to_anchor=(1.0, 0.42), labelspacing=0.6)
+    return finish(figure)
+
+
+def quality_figure(
+    quality: Mapping[str, Any], *, title: str = "How good the shape space is, by its number of modes"
+) -> Figure:
+    """Draw compactness, generalisation and specificity, those of them that are there, over the number of modes.
+
+    Args:
+        quality: from `compactness` (shares of the variance, 0 to 1), `generalisation` and `specificity` (mm) to a list
+            with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`, `mean` and, if known, `stddev`.
+        title: above the figure.
+
+    Raises:
+        InputError: none of the three is there, or one is no such list.
+    """
+    parts = {key: _measured(key, quality[key]) for key in _QUALITY if quality.get(key) is not None}
+    if not parts:
+        raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
+    figure, plots = charts(title, [2.5] * len(parts))
+    for axes, (key, (modes, mean, spread)) in zip(plots, parts.items(), strict=True):
+        scale = 100.0 if key == "compactness" else 1.0
+        dots = "o" if len(modes) < 40 else ""
+        axes.plot(modes, scale * mean, color=FORWARD, lw=2, marker=dots, ms=4)
+        if spread is not None:
+            axes.fill_between(
+                modes, scale * (mean - spread), scale * (mean + spread), color=_BARS, alpha=0.5, lw=0, label="± 1 sd"
+            )
+            legend(axes, loc="best")
+        heading, unit = _QUALITY[key]
+        axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
+        axes.set_ylabel(unit)
+        axes.set_ylim(0, 104 if key == "compactness" else None)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    plots[-1].set_xlabel("number of modes")
+    return finish(figure, h_pad=1.2)
+
+
+def _measured(key: str, value: object) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    try:
+        if isinstance(value, Mapping):
+            inner = cast(Mapping[str, Any], value)
+            mean = np.asarray(inner["mean"], dtype=np.float64)
+            modes = np.asarray(inner.get("modes", np.arange(1, len(mean) + 1)), dtype=np.float64)
+            spread = None if inner.get("stddev") is None else np.asarray(inner["stddev"], dtype=np.float64)
+        else:
+            mean = np.asarray(value, dtype=np.float64)
+            modes, spread = np.arange(1.0, len(mean) + 1), None
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.") from error
+    if (
+        mean.ndim != 1
+        or not len(mean)
+        or modes.shape != mean.shape
+        or (spread is not None and spread.shape != mean.shape)
+    ):
+        raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
+    return modes, mean, spread
