@@ -44,7 +44,9 @@ if TYPE_CHECKING:
 MOST_CARDS = 24
 MOST_DETAILS = 3
 MOST_ROWS = 2000
+MOST_CURVES = 100
 _MOST_NAMED = 12
+_FEWEST_POINTS = 20
 _ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
 _DETAIL_BYTES = 1_300_000
@@ -153,8 +155,8 @@ class FolderPage:
             {str(as_mapping(fit.record.get("model")).get("name") or "an unknown model") for fit in self.fits}
         )
         methods = sorted({str(fit.record["method"]) for fit in self.fits if fit.record.get("method")})
-        told = f"{counted(total, 'scan was', 'scans were')} fitted by {listed(models)}"
-        told += f" with the method {listed(methods)}. " if methods else ". "
+        told = f"{counted(total, 'scan was', 'scans were')} fitted with {listed(models)}"
+        told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
         told += f"{counted(len(trusted), 'fit')} can be trusted as far as the fit itself can tell"
         rest = [
             f"{counts[key]} {word}"
@@ -182,7 +184,7 @@ class FolderPage:
         ):
             if np.isfinite(value):
                 rows.append((mm(value).removesuffix(" mm"), "mm", what))
-        return paragraph(told) + tiles(rows) + self.doubts() + self.page.guarded("Main figure", self.main_figure)
+        return paragraph(told) + tiles(rows) + self.doubts() + self.page.guarded("Main figures", self.main_figures)
 
     def doubts(self) -> str:
         """Return the fits that need a look, by name and reason."""
@@ -199,8 +201,8 @@ class FolderPage:
             items += f"<li>{counted(more, 'other')}, in the table of all fits.</li>"
         return f'<div class="notice"><strong>Not to be trusted without a look</strong><ul>{items}</ul></div>\n'
 
-    def main_figure(self) -> str:
-        """Return the main fits side by side."""
+    def main_figures(self) -> str:
+        """Return the main fits side by side, and how near all of them come."""
         from shapespace.report import figures
 
         shown, problems = sections.usable(self.main_fits(), self.staged)
@@ -219,11 +221,28 @@ class FolderPage:
             if any(fit.status == "doubtful" for fit in shown)
             else "The worst and the median fit. "
         )
-        return self.page.figure(
+        pictures = self.page.figure(
             figure,
             f"{which}The last column maps the distance from the model to the scan, all rows on one scale.",
             alt="Scan, fitted model, both over each other, and a distance map, for "
             + listed([f"{fit.name} ({status[fit.name]})" for fit in shown]),
+        )
+        if len(self.fits) > 1:
+            pictures += self.page.tried(self.curves)
+        return sections.in_columns(pictures) + notice("Not in the pictures", problems)
+
+    def curves(self) -> str:
+        """Return which share of the surface lies within each distance."""
+        from shapespace.report import figures
+
+        pictured = [fit for fit in self.fits if fit.pictured]
+        shown, _ = sections.usable(pictured[:MOST_CURVES], self.staged)
+        some = f" The first {MOST_CURVES} fits of the table." if len(pictured) > MOST_CURVES else ""
+        return self.page.figure(
+            figures.error_curves(shown),
+            f"Share of the model's surface that lies within each distance of the scan, one curve a fit.{some}",
+            alt=f"Cumulative distances of {counted(len(shown), 'fit')}",
+            chart=True,
         )
 
     def without_stages(self, problems: Sequence[str]) -> str:
@@ -314,7 +333,13 @@ class FolderPage:
         file = self.folder.root / path
         if not file.is_file() or sha256_of_file(file) != source.get("hash"):
             raise FileFormatError("the scan is no longer where it was, or has changed.")
-        return read_mesh(file)
+        try:
+            mesh = read_mesh(file)
+        except ShapespaceError as error:
+            raise FileFormatError("the scan cannot be read.") from error
+        if len(mesh.vertices) < _FEWEST_POINTS:
+            raise FileFormatError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
+        return mesh
 
     def numbers(self) -> str:
         """Return the table of all fits."""
@@ -336,25 +361,8 @@ class FolderPage:
         return [fit for fit in self.fits if fit.status not in ("failed", "unreadable") and fit.record.get("b")]
 
     def together(self) -> str:
-        """Return error curves and the coefficients against each other."""
-        from shapespace.report import figures
-
-        page = self.page
-        known = self.coefficients()
-        points = [sections.coefficients_of(fit) for fit in known]
-        shown, _ = sections.usable([fit for fit in known[:200] if fit.pictured], self.staged)
-        out = ""
-        if shown:
-            out += page.tried(
-                lambda: page.figure(
-                    figures.error_curves(shown),
-                    "Share of the surface that lies within each distance, one curve a fit.",
-                    alt=f"Cumulative distances of {counted(len(shown), 'fit')}",
-                    chart=True,
-                )
-            )
-        out += page.tried(lambda: sections.scatter(page, points))
-        return out
+        """Return the coefficients of all fits against each other."""
+        return sections.scatter(self.page, [sections.coefficients_of(fit) for fit in self.coefficients()])
 
     def detail(self, fit: SavedFit) -> str:
         """Return one fit with every picture, as far as the file's size allows."""

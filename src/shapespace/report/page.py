@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -105,7 +104,7 @@ class Page:
         from shapespace.report.figures import encode_webp
 
         data, size = encode_webp(figure, lossless=chart)
-        return self.picture(data, size, caption, alt=alt, kind="chart" if chart else "wide")
+        return self.picture(data, size, caption, alt=alt, kind="chart" if chart else "drawing")
 
     def picture(
         self,
@@ -114,13 +113,12 @@ class Page:
         caption: str,
         *,
         alt: str,
-        kind: Literal["chart", "wide", "plain"] = "plain",
+        kind: Literal["chart", "drawing", "plain"] = "plain",
     ) -> str:
         """Return WebP `data` of `size` pixels with its caption."""
-        box = f' tabindex="0" role="region" aria-label="{esc(caption)}"' if kind == "wide" else ""
         self.step(caption)
         return (
-            f'<figure class="{kind}"><div class="plate"{box}>{self.image(data, size, alt=alt)}</div>\n'
+            f'<figure class="{kind}"><div class="plate">{self.image(data, size, alt=alt)}</div>\n'
             f"<figcaption>{esc(caption)}</figcaption></figure>\n"
         )
 
@@ -150,7 +148,7 @@ class Page:
         name = f"payload-{len(self._payloads) + 1}"
         if not self._payloads:
             self._spent += len(scene.scripts()) + len(scene.style())
-        text = base64.b64encode(gzip.compress(payload, 6, mtime=0)).decode("ascii")
+        text = scene.payload_html(name, payload)
         self.step(caption)
         if len(text) > self.left - _RESERVE_BYTES:
             return (
@@ -158,10 +156,10 @@ class Page:
                 f"turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB.</figcaption></figure>\n"
             )
         self._spent += len(text)
-        self._payloads.append(f'<script type="application/octet-stream" id="{name}">{text}</script>\n')
+        self._payloads.append(text)
         return (
             f'<figure class="turning"><div class="widget" data-widget="{widget}" data-payload="{name}" role="group" '
-            f'aria-label="{esc(label)}" hidden></div>\n<div class="plate poster">{poster}</div>\n'
+            f'aria-label="{esc(label)}"></div>\n<div class="plate poster">{poster}</div>\n'
             f"<figcaption>{esc(caption)}</figcaption></figure>\n"
         )
 

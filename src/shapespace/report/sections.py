@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
 """Statuses, those first that somebody must look at."""
 
-MODEL_PICTURES, FIT_PICTURES = 3, 9
+MODEL_PICTURES, FIT_PICTURES = 4, 9
 """How many pictures `model_part`, and `fit_to_turn` with `fit_pictures`, make."""
 
 MODES_IN_WIDGET = 8
@@ -66,6 +66,11 @@ def expected_error_mm(fit: SavedFit) -> float:
     """Return the vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
     value = as_mapping(fit.record.get("evidence")).get("expected_error_mm")
     return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def in_columns(pictures: str) -> str:
+    """Return pictures in two columns where the window has room for them."""
+    return f'<div class="columns">{pictures}</div>\n'
 
 
 # The model
@@ -91,20 +96,25 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "") -> str:
     ]
     shown = min(5, model.n_modes)
     out = facts(rows, caption="The shape model") + modes_to_move(page, model)
-    out += page.figure(
+    pictures = page.figure(
         figures.modes_figure(model, modes=shown),
         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each point "
         "moves at 3. One scale for all rows.",
         alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard deviations, with maps "
         "of the displacement",
     )
-    out += page.figure(
+    pictures += page.figure(
         figures.spectrum_figure(model),
         "Share of the training set's variance that the first modes hold.",
         alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
         chart=True,
     )
-    return out
+    sides = page.figure(
+        figures.mean_figure(model),
+        "The mean shape from three sides" + (", with the model's landmarks." if model.landmarks else "."),
+        alt="The mean shape from three sides",
+    )
+    return out + in_columns(pictures + sides)
 
 
 def modes_to_move(page: Page, model: ShapeModel) -> str:
@@ -221,7 +231,7 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = Non
             chart=True,
         ),
     ]
-    return "".join(page.tried(part) for part in parts)
+    return in_columns("".join(page.tried(part) for part in parts))
 
 
 def region_shares(fit: StagedFit) -> str:
@@ -428,20 +438,20 @@ def scatter(page: Page, points: Sequence[Coefficients]) -> str:
 def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> str:
     """Return b1, b2 and b3 in space, as a still where nothing turns."""
     from shapespace.report import figures
-    from shapespace.report.scene import pack
+    from shapespace.report.scene import pack_scatter
 
     data, size = figures.encode_webp(figures.scatter_3d(points), lossless=True)
-    about = {
-        "kind": "scatter",
-        "names": [point.name for point in points],
-        "labels": [point.expression for point in points],
-        "sizes": [point.intensity for point in points],
-    }
+    first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
     return page.turning(
         "scatter",
-        pack({"points": np.stack([point.b[:3] for point in points])}, about),
+        pack_scatter(
+            first,
+            [point.expression or "no label" for point in points],
+            [point.name for point in points],
+            axes=[f"b{k + 1}" for k in range(first.shape[1])],
+        ),
         page.image(data, size, alt=f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
-        "The first three coefficients in space, in mm.",
+        "The first three coefficients in space, in mm; the boxes choose others.",
         label="Scatter of b1, b2 and b3, to be turned",
     )
 

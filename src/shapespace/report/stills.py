@@ -17,7 +17,7 @@ from shapespace.types import Mesh
 if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
 
-PANEL = (168, 208)
+PANEL = (176, 232)
 """Width and height of a panel in pixels."""
 
 
@@ -43,7 +43,7 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
         panel: width and height of each panel in pixels.
     """
     surface = fit.surfaces["final"]
-    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.06)
+    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
     plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
     distances = Layer(surface, scalars=fit.model_to_scan_mm["final"], colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)

@@ -78,38 +78,10 @@
   });
   window.addEventListener("afterprint", () => folded.forEach((part) => { part.open = false; }));
 
-  // What turns: unpacked when it comes near the window, and the still stays where it cannot be.
-  async function unpack(id) {
-    const packed = window.Shapespace.fromBase64(document.getElementById(id).textContent);
-    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return window.Shapespace.unpack(await new Response(stream).arrayBuffer());
-  }
-  function refuse(widget, why) {
-    widget.hidden = true;
-    const note = document.createElement("p");
-    note.className = "soft";
-    note.textContent = "This is a still: " + why;
-    widget.after(note);
-  }
-  async function start(widget) {
-    try {
-      const content = await unpack(widget.dataset.payload);
-      widget.hidden = false;
-      window.Shapespace.widgets[widget.dataset.widget](widget, content);
-      widget.parentElement.classList.add("running");
-    } catch (error) {
-      refuse(widget, "this browser cannot turn it (" + error.message + ").");
-    }
-  }
-  const widgets = document.querySelectorAll(".widget");
-  if (widgets.length && window.Shapespace && "IntersectionObserver" in window) {
-    const near = new IntersectionObserver((entries) => {
-      for (const entry of entries) {
-        if (!entry.isIntersecting) continue;
-        near.unobserve(entry.target);
-        start(entry.target.querySelector(".widget"));
-      }
-    }, { rootMargin: "600px" });
-    for (const widget of widgets) near.observe(widget.parentElement);
+  // What turns builds itself when it comes near the window; the still stays where that fails, and for paper.
+  for (const widget of document.querySelectorAll(".widget")) {
+    Promise.resolve(window.Shapespace.widgets[widget.dataset.widget](widget, widget.dataset.payload)).then((made) => {
+      widget.parentElement.classList.add(made && made.view && !made.view.failed ? "running" : "refused");
+    });
   }
 })();
