@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 
 from shapespace.errors import InputError
@@ -48,24 +50,24 @@ def make_fit(head: Mesh, *, dense: bool = False, cloud: bool = False, modes: int
     return replace(fit, **changes)
 
 
-def decoded(figure: object) -> np.ndarray:
-    data, size = figures.encode_webp(figure, lossless=True)  # type: ignore[arg-type]
-    picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-    assert picture.shape == (size[1], size[0], 3)
-    return picture
+def decoded(figure: Figure) -> np.ndarray:
+    with draw.without_glyph_warnings():
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3]
 
 
-def words(figure: object) -> str:
-    found = [text.get_text() for text in figure.texts]  # type: ignore[attr-defined]
-    for axes in figure.axes:  # type: ignore[attr-defined]
+def words(figure: Figure) -> str:
+    found = [text.get_text() for text in figure.texts]
+    for axes in figure.axes:
         found += [text.get_text() for text in axes.texts]
         legend = axes.get_legend()
         found += [text.get_text() for text in legend.get_texts()] if legend else []
     return "\n".join(found).replace(r"\$", "$")
 
 
-def pictures(figure: object) -> list[np.ndarray]:
-    return [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]  # type: ignore[attr-defined]
+def pictures(figure: Figure) -> list[np.ndarray]:
+    return [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]
 
 
 OF_ONE_FIT = [
@@ -86,9 +88,9 @@ def model() -> ShapeModel:
 
 
 @pytest.mark.parametrize("draw_it", OF_ONE_FIT)
-@pytest.mark.parametrize("kind", [{}, {"dense": True}, {"cloud": True}, {"modes": 1}])
+@pytest.mark.parametrize("kind", [{}, {"dense": True, "cloud": True}, {"modes": 1}])
 def test_every_figure_of_a_fit_is_drawn_for_every_kind_of_fit(
-    head: MakeHead, draw_it: Callable[..., object], kind: dict[str, bool]
+    head: MakeHead, draw_it: Callable[..., Figure], kind: dict[str, bool]
 ) -> None:
     picture = decoded(draw_it(make_fit(head(10), **kind)))
     assert picture.shape[1] == draw.WIDTH
@@ -97,7 +99,7 @@ def test_every_figure_of_a_fit_is_drawn_for_every_kind_of_fit(
 
 @pytest.mark.parametrize("draw_it", OF_ONE_FIT)
 def test_labels_that_are_long_or_hold_what_cannot_be_printed_stay_within_the_figure(
-    head: MakeHead, draw_it: Callable[..., object]
+    head: MakeHead, draw_it: Callable[..., Figure]
 ) -> None:
     picture = decoded(draw_it(make_fit(head(6), label=NASTY)))
     assert (picture[:, -2:] == 255).all() and (picture[:, :2] == 255).all()
@@ -113,7 +115,7 @@ def test_a_result_goes_into_a_figure_as_a_notebook_would_do_it(model: ShapeModel
 def test_stages_come_in_order_with_their_mean_distances(head: MakeHead) -> None:
     fit = make_fit(head(8), dense=True)
     told = words(figures.stages_figure(fit))
-    places = [told.index(word) for word in ("scan\n", "before", "phase 1", "phase 2", "dense")]
+    places = [told.index(word) for word in ("\nscan\n", "\nbefore", "\nphase 1", "\nphase 2", "\ndense")]
     assert places == sorted(places)
     for stage in fit.surfaces:
         assert draw.mm(float(np.abs(fit.model_to_scan_mm[stage]).mean())) in told
@@ -236,14 +238,14 @@ def test_a_mode_moves_the_mean_by_its_standard_deviations_to_both_sides(model: S
 def test_an_animation_sways_from_one_end_to_the_other_and_back(model: ShapeModel) -> None:
     data = figures.mode_animation(model, 0, frames=8, width=120)
     with Image.open(io.BytesIO(data)) as film:
-        assert film.n_frames == 8 and film.info["loop"] == 0  # type: ignore[attr-defined]
+        assert film.n_frames == 8 and film.info["loop"] == 0
         shots = []
         for k in range(8):
             film.seek(k)
             shots.append(np.asarray(film.convert("RGB")).astype(int))
     apart = [np.abs(shot - shots[0]).mean() for shot in shots]
     assert np.argmax(apart) == 4
-    np.testing.assert_allclose(apart[1:4], apart[:4:-1], atol=1.0)
+    np.testing.assert_allclose(apart[1:4], apart[:4:-1], atol=3.0)
     with pytest.raises(InputError, match="4 frames"):
         figures.mode_animation(model, 0, frames=2)
 
@@ -345,11 +347,9 @@ def test_coefficients_are_scattered_for_any_number_of_labels_and_modes(labels: l
     rng = np.random.default_rng(0)
     points = [scans(rng.normal(size=(3, modes)), label, np.ones(modes)) for label in labels]
     every = [point for some in points for point in some]
-    picture = decoded(figures.scatter_matrix(every))
-    assert (picture[:, -1] == 255).all()
-    told = words(figures.scatter_matrix(every)) + "".join(
-        text.get_text() for legend in figures.scatter_matrix(every).legends for text in legend.get_texts()
-    )
+    figure = figures.scatter_matrix(every)
+    assert (decoded(figure)[:, -1] == 255).all()
+    told = words(figure) + "".join(text.get_text() for legend in figure.legends for text in legend.get_texts())
     assert ("and 4 more" in told) == (len(labels) == 20)
     if modes >= 3:
         decoded(figures.scatter_3d(every))
@@ -419,6 +419,15 @@ def test_wrapped_lines_fit_their_width_and_nothing_is_lost_but_what_the_dots_say
 def test_characters_that_cannot_be_printed_are_replaced() -> None:
     assert draw.plain("a\x00b\x1b\u202ec\td") == "a\ufffdb\ufffd\ufffdc d"
     assert draw.short("one\ntwo " * 30, 12) == "one two one…"
+
+
+def test_a_figure_is_encoded_as_it_is_drawn(head: MakeHead) -> None:
+    figure = figures.faces_grid([head(6)], ["a"], title="t")
+    for lossless, most in ((True, 0), (False, 6)):
+        data, size = figures.encode_webp(figure, lossless=lossless)
+        picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+        assert picture.shape == (size[1], size[0], 3)
+        assert np.abs(picture.astype(int) - decoded(figure)).mean() <= most
 
 
 def test_the_smallest_type_is_legible_on_a_phone() -> None:

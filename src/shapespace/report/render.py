@@ -1,14 +1,12 @@
-"""Stills of meshes and point clouds by a z-buffer in numpy: no GPU, no window, the same bytes every time.
+"""Stills of meshes and point clouds by a z-buffer: no GPU, no window, the same bytes every time.
 
-A triangle is turned into rows, a row into the exact span of pixel centres inside it, and a fragment survives when
-it is the nearest of its pixel; normals and scalars are interpolated for the surviving fragments only.
+The nearest triangle of each pixel is found first; normals and scalars are interpolated for what is seen only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeAlias, cast
 from weakref import WeakKeyDictionary
 
@@ -20,13 +18,13 @@ from scipy.spatial import cKDTree
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.report.colours import CLAY, UNKNOWN_COLOUR, WHITE, Colour
+from shapespace.report.raster import interpolated, nearest_balls, nearest_triangles
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 _Single: TypeAlias = npt.NDArray[np.float32]
 
-_FRAGMENTS_AT_ONCE = 2_000_000
 _LARGEST_SIDE = 8192
 _GAMMA = 2.2
 
@@ -337,94 +335,12 @@ def _depth_mm(depth: FloatArray, camera: Camera) -> FloatArray:
 
 def _rasterise(
     screen: FloatArray, depth: FloatArray, faces: IntArray, size: tuple[int, int]
-) -> tuple[npt.NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return for each pixel, row by row, the nearest triangle at its centre (-1 for none) and its depth."""
-    width, height = size
-    nearest = np.full(width * height, np.inf)
-    triangle = np.full(width * height, -1, dtype=np.int64)
-    x, y, z = screen[faces, 0], screen[faces, 1], depth[faces]
-    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
-    tiny = 1e-9
-    with np.errstate(invalid="ignore"):
-        inside = (
-            (np.abs(area) > 1e-12)
-            & (_largest(x) > 0)
-            & (_smallest(x) < width)
-            & (_largest(y) > 0)
-            & (_smallest(y) < height)
-            & np.isfinite(z[:, 0] + z[:, 1] + z[:, 2])
-        )
-    kept = np.flatnonzero(inside)
-    if not len(kept):
-        return triangle, nearest
-    x, y, z, area = x[kept], y[kept], z[kept], area[kept]
-    flip = area < 0
-    x[flip], y[flip], z[flip] = x[flip][:, ::-1], y[flip][:, ::-1], z[flip][:, ::-1]
-    area = np.abs(area)
-    slope_x = ((z[:, 1] - z[:, 0]) * (y[:, 2] - y[:, 0]) - (z[:, 2] - z[:, 0]) * (y[:, 1] - y[:, 0])) / area
-    slope_y = ((x[:, 1] - x[:, 0]) * (z[:, 2] - z[:, 0]) - (x[:, 2] - x[:, 0]) * (z[:, 1] - z[:, 0])) / area
-    top = np.maximum(np.ceil(_smallest(y) - 0.5 - tiny), 0).astype(np.int64)
-    bottom = np.minimum(np.floor(_largest(y) - 0.5 + tiny), height - 1).astype(np.int64)
-    rows = np.maximum(bottom - top + 1, 0)
-    near, far = _smallest(z), _largest(z)
-    for first, last in _chunks(rows, _FRAGMENTS_AT_ONCE // 4):
-        part = slice(first, last)
-        owner = first + np.repeat(np.arange(last - first), rows[part])
-        row = top[owner] + _counting(rows[part])
-        low, high = np.full(len(row), -np.inf), np.full(len(row), np.inf)
-        centre_y = row + 0.5
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            # Inside is rise * px <= reach for each edge of a triangle that turns the positive way.
-            rise = (y[:, b] - y[:, a])[owner]
-            reach = rise * x[owner, a] + (x[:, b] - x[:, a])[owner] * (centre_y - y[owner, a])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                crossing = reach / rise
-            np.minimum(high, crossing, out=high, where=rise > 0)
-            np.maximum(low, crossing, out=low, where=rise < 0)
-        left = np.ceil(np.clip(low - 0.5 - tiny, 0, width)).astype(np.int64)
-        right = np.floor(np.clip(high - 0.5 + tiny, -1, width - 1)).astype(np.int64)
-        spans = np.maximum(right - left + 1, 0)
-        for start, stop in _chunks(spans, _FRAGMENTS_AT_ONCE):
-            span = slice(start, stop)
-            source = start + np.repeat(np.arange(stop - start), spans[span])
-            column = left[source] + _counting(spans[span])
-            tri = owner[source]
-            value = (
-                z[tri, 0] + slope_x[tri] * (column + 0.5 - x[tri, 0]) + slope_y[tri] * (centre_y[source] - y[tri, 0])
-            )
-            # A sliver's slopes are mostly rounding: its depth stays between its corners.
-            value = np.clip(value, near[tri], far[tri])
-            pixel = row[source] * width + column
-            before = nearest[pixel]
-            np.minimum.at(nearest, pixel, value)
-            won = np.flatnonzero((value == nearest[pixel]) & (value < before))[::-1]
-            # Reversed, so that of equally near triangles the first one stays.
-            triangle[pixel[won]] = kept[tri[won]]
+    count = size[0] * size[1]
+    triangle, nearest = np.empty(count, dtype=np.int32), np.empty(count)
+    nearest_triangles(screen, depth, faces, size[0], size[1], triangle, nearest)
     return triangle, nearest
-
-
-def _smallest(corners: FloatArray) -> FloatArray:
-    # Much faster than a reduction over an axis of three.
-    return np.minimum(np.minimum(corners[:, 0], corners[:, 1]), corners[:, 2])
-
-
-def _largest(corners: FloatArray) -> FloatArray:
-    return np.maximum(np.maximum(corners[:, 0], corners[:, 1]), corners[:, 2])
-
-
-def _counting(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return 0..n-1 for each n in `counts`, joined."""
-    ends = np.cumsum(counts)
-    return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)
-
-
-def _chunks(counts: npt.NDArray[np.int64], most: int) -> list[tuple[int, int]]:
-    """Cut the list of `counts` into runs that sum to about `most` each."""
-    if not len(counts):
-        return []
-    part = np.cumsum(counts) // most
-    cuts = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(counts)]
-    return list(pairwise(cuts))
 
 
 def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
@@ -434,49 +350,19 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     screen, depth = _project(vertices, camera, size)
     triangle, nearest = _rasterise(screen, depth, faces, size)
     pixel = np.flatnonzero(triangle >= 0)
-    shown = triangle[pixel]
-    # Colours bear single precision, and gathering a triangle's numbers in one go is most of the speed.
-    at = np.stack([pixel % size[0] + 0.5, pixel // size[0] + 0.5], axis=1)
-    corners = screen[faces].reshape(-1, 6)[shown]
-    a, b, c = ((corners[:, 2 * k : 2 * k + 2] - at).T.astype(np.float32) for k in range(3))
-    turns = [_turn(b, c), _turn(c, a), _turn(a, b)]
-    area = turns[0] + turns[1] + turns[2]
-    back = area > 0
-    shares: list[_Single] = [_share(turn, area) for turn in turns]
-    if camera.distance_mm is not None:
-        nearness = -depth.astype(np.float32)[faces][shown]
-        shares = [shares[k] * nearness[:, k] for k in range(3)]
-    total = np.maximum(shares[0] + shares[1] + shares[2], 1e-30)
-    shares = [(part / total).astype(np.float32, copy=False) for part in shares]
-    normals = (vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
-    # On the screen y points down, so a triangle that faces the eye turns the negative way.
-    normal = _unit(_blend(shares, normals[faces].reshape(-1, 9)[shown]) * np.where(back, -1, 1).astype(np.float32))
-    scalar = None
-    if layer.scalars is not None:
-        at_corners = layer.scalars.astype(np.float32)[faces][shown]
-        scalar = _commonest(shares, at_corners) if layer.categories else _blend(shares, at_corners)[0]
+    # Colours bear single precision.
+    normal, back = np.empty((3, len(pixel)), dtype=np.float32), np.empty(len(pixel), dtype=np.bool_)
+    scalars = read_only(np.zeros(0)) if layer.scalars is None else layer.scalars
+    scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
+    nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
+    normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    interpolated(
+        pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
+        normal, scalar, back,
+    )  # fmt: skip
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
-    return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
-
-
-def _turn(p: _Single, q: _Single) -> _Single:
-    return p[0] * q[1] - p[1] * q[0]
-
-
-def _share(part: _Single, whole: _Single) -> _Single:
-    return np.clip(part / np.where(whole == 0, np.float32(1), whole), 0, 1).astype(np.float32)
-
-
-def _blend(shares: Sequence[_Single], values: _Single) -> _Single:
-    """Return (d, n) from the shares of three corners, (n,) each, and their values (n, 3 d)."""
-    size = values.shape[1] // 3
-    return np.stack([sum(share * values[:, k * size + d] for k, share in enumerate(shares)) for d in range(size)])
-
-
-def _commonest(shares: Sequence[_Single], codes: _Single) -> _Single:
-    """Return for each pixel, (n,), the one of its three `codes` (n, 3) whose corners have the largest share."""
-    weight = np.stack([sum(shares[j] * (codes[:, j] == codes[:, k]) for j in range(3)) for k in range(3)])
-    return codes[np.arange(len(codes)), weight.argmax(axis=0)]
+    occlusion = _occlusion(pixel, depth_mm, size, supersample, camera)
+    return _Surfels(pixel, depth_mm, normal, scalar if len(scalars) else None, back, occlusion)
 
 
 def _unit(vectors: _Single) -> _Single:
@@ -494,23 +380,8 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     screen, depth = _project(layer.mesh.vertices, camera, size)
     behind = _depth_mm(depth, camera)
     radius = max(radius_mm * height / camera.height_mm, 0.75)
-    reach = int(np.ceil(radius))
-    step_y, step_x = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-    nearest = np.full(width * height, np.inf)
-    winner = np.full(width * height, -1, dtype=np.int64)
-    usable = np.flatnonzero(np.isfinite(screen).all(axis=1))
-    corner = np.floor(screen[usable]).astype(np.int64)
-    for dx, dy in zip(step_x.tolist(), step_y.tolist(), strict=True):
-        column, row = corner[:, 0] + dx, corner[:, 1] + dy
-        off = (column + 0.5 - screen[usable, 0]) ** 2 + (row + 0.5 - screen[usable, 1]) ** 2
-        hit = np.flatnonzero((off <= radius**2) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
-        pixel = row[hit] * width + column[hit]
-        rise = np.sqrt(radius**2 - off[hit]) / radius * radius_mm
-        value = behind[usable[hit]] - rise
-        before = nearest[pixel]
-        np.minimum.at(nearest, pixel, value)
-        won = np.flatnonzero((value == nearest[pixel]) & (value < before))[::-1]
-        winner[pixel[won]] = usable[hit[won]]
+    winner, nearest = np.empty(width * height, dtype=np.int32), np.empty(width * height)
+    nearest_balls(screen, behind, radius, radius_mm, width, height, winner, nearest)
     pixel = np.flatnonzero(winner >= 0)
     owner = winner[pixel]
     at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)

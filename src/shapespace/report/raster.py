@@ -1,0 +1,198 @@
+"""The compiled loops of the renderer: which triangle or ball a pixel shows, and what is interpolated there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.compiled import compiled
+from shapespace.types import FloatArray, IntArray
+
+_TINY = 1e-9
+
+
+@compiled
+def nearest_triangles(
+    screen: FloatArray,
+    depth: FloatArray,
+    faces: IntArray,
+    width: int,
+    height: int,
+    triangle: npt.NDArray[np.int32],
+    nearest: FloatArray,
+) -> None:
+    """Fill in for each pixel, row by row, the nearest triangle at its centre (-1 for none) and its depth.
+
+    A triangle is cut into rows, and a row into the exact span of pixel centres inside it. Of equally near triangles the
+    first one stays.
+
+    Args:
+        screen: (V, 2) pixels, y down; not-a-number drops the triangles of a vertex.
+        depth: (V,) linear across a triangle on the screen, growing away from the eye.
+        faces: (F, 3).
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+        triangle: (height * width,), written.
+        nearest: (height * width,), written.
+    """
+    triangle[:] = -1
+    nearest[:] = np.inf
+    for t in range(len(faces)):
+        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+        xa, ya, za = screen[a, 0], screen[a, 1], depth[a]
+        xb, yb, zb = screen[b, 0], screen[b, 1], depth[b]
+        xc, yc, zc = screen[c, 0], screen[c, 1], depth[c]
+        if not math.isfinite(za + zb + zc + xa + xb + xc):
+            continue
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        if abs(area) <= 1e-12:
+            continue
+        if area < 0:
+            xa, ya, za, xc, yc, zc = xc, yc, zc, xa, ya, za
+            area = -area
+        if max(xa, xb, xc) <= 0 or min(xa, xb, xc) >= width or max(ya, yb, yc) <= 0 or min(ya, yb, yc) >= height:
+            continue
+        slope_x = ((zb - za) * (yc - ya) - (zc - za) * (yb - ya)) / area
+        slope_y = ((xb - xa) * (zc - za) - (xc - xa) * (zb - za)) / area
+        closest, farthest = min(za, zb, zc), max(za, zb, zc)
+        top = max(int(np.ceil(min(ya, yb, yc) - 0.5 - _TINY)), 0)
+        bottom = min(int(np.floor(max(ya, yb, yc) - 0.5 + _TINY)), height - 1)
+        for row in range(top, bottom + 1):
+            y = row + 0.5
+            low, high = 0.0, float(width)
+            # Inside is rise * x <= reach for each edge of a triangle that turns the positive way.
+            for edge in range(3):
+                if edge == 0:
+                    px, py, qx, qy = xa, ya, xb, yb
+                elif edge == 1:
+                    px, py, qx, qy = xb, yb, xc, yc
+                else:
+                    px, py, qx, qy = xc, yc, xa, ya
+                rise = qy - py
+                if rise != 0.0:
+                    crossing = (rise * px + (qx - px) * (y - py)) / rise
+                    if rise > 0.0:
+                        high = min(high, crossing)
+                    else:
+                        low = max(low, crossing)
+            left = max(int(np.ceil(low - 0.5 - _TINY)), 0)
+            right = min(int(np.floor(high - 0.5 + _TINY)), width - 1)
+            for column in range(left, right + 1):
+                # A sliver's slopes are mostly rounding: its depth stays between its corners.
+                value = za + slope_x * (column + 0.5 - xa) + slope_y * (y - ya)
+                value = min(max(value, closest), farthest)
+                pixel = row * width + column
+                if value < nearest[pixel]:
+                    nearest[pixel] = value
+                    triangle[pixel] = t
+
+
+@compiled
+def interpolated(
+    pixel: npt.NDArray[np.int64],
+    shown: npt.NDArray[np.int32],
+    screen: FloatArray,
+    nearness: FloatArray,
+    faces: IntArray,
+    normals: FloatArray,
+    scalars: FloatArray,
+    categories: bool,
+    width: int,
+    normal: npt.NDArray[np.float32],
+    scalar: npt.NDArray[np.float32],
+    back: npt.NDArray[np.bool_],
+) -> None:
+    """Fill in the normal, the scalar and the side of each covered pixel.
+
+    Args:
+        pixel: (n,) covered pixels, row by row.
+        shown: (n,) the triangle of each.
+        screen: (V, 2) pixels.
+        nearness: (V,) one over the distance from the eye, or one where the picture is orthographic.
+        faces: (F, 3).
+        normals: (V, 3) unit normals as seen from the eye.
+        scalars: (V,), or (0,) for none.
+        categories: whether scalars are codes, of which the one with the largest share is taken.
+        width: of the picture in pixels.
+        normal: (3, n), written: of unit length, towards the eye.
+        scalar: (n,) or (0,), written.
+        back: (n,), written: whether the triangle is seen from behind.
+    """
+    for i in range(len(pixel)):
+        x, y = pixel[i] % width + 0.5, pixel[i] // width + 0.5
+        a, b, c = faces[shown[i], 0], faces[shown[i], 1], faces[shown[i], 2]
+        ax, ay = screen[a, 0] - x, screen[a, 1] - y
+        bx, by = screen[b, 0] - x, screen[b, 1] - y
+        cx, cy = screen[c, 0] - x, screen[c, 1] - y
+        wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+        area = wa + wb + wc
+        # On the screen y points down, so a triangle that faces the eye turns the negative way.
+        behind = area > 0
+        back[i] = behind
+        if area == 0:
+            area = 1.0
+        wa = min(max(wa / area, 0.0), 1.0) * nearness[a]
+        wb = min(max(wb / area, 0.0), 1.0) * nearness[b]
+        wc = min(max(wc / area, 0.0), 1.0) * nearness[c]
+        total = max(wa + wb + wc, 1e-30)
+        wa, wb, wc = wa / total, wb / total, wc / total
+        nx = wa * normals[a, 0] + wb * normals[b, 0] + wc * normals[c, 0]
+        ny = wa * normals[a, 1] + wb * normals[b, 1] + wc * normals[c, 1]
+        nz = wa * normals[a, 2] + wb * normals[b, 2] + wc * normals[c, 2]
+        length = math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-24))
+        if behind:
+            length = -length
+        normal[0, i], normal[1, i], normal[2, i] = nx / length, ny / length, nz / length
+        if len(scalars):
+            va, vb, vc = scalars[a], scalars[b], scalars[c]
+            if not categories:
+                scalar[i] = wa * va + wb * vb + wc * vc
+                continue
+            share_a = wa + (wb if vb == va else 0.0) + (wc if vc == va else 0.0)
+            share_b = wb + (wa if vb == va else 0.0) + (wc if vc == vb else 0.0)
+            share_c = wc + (wa if vc == va else 0.0) + (wb if vc == vb else 0.0)
+            scalar[i] = va if share_a >= share_b and share_a >= share_c else vb if share_b >= share_c else vc
+
+
+@compiled
+def nearest_balls(
+    screen: FloatArray,
+    depth_mm: FloatArray,
+    radius: float,
+    radius_mm: float,
+    width: int,
+    height: int,
+    ball: npt.NDArray[np.int32],
+    nearest: FloatArray,
+) -> None:
+    """Fill in for each pixel, row by row, the ball whose surface is nearest at its centre (-1 for none), and its depth.
+
+    Args:
+        screen: (V, 2) pixels, y down; not-a-number drops a ball.
+        depth_mm: (V,) of the balls' centres.
+        radius: of the balls in pixels.
+        radius_mm: of the balls in mm.
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+        ball: (height * width,), written.
+        nearest: (height * width,), written.
+    """
+    ball[:] = -1
+    nearest[:] = np.inf
+    for k in range(len(screen)):
+        x, y = screen[k, 0], screen[k, 1]
+        if not math.isfinite(x + y + depth_mm[k]) or x + radius < 0 or y + radius < 0 or x - radius > width:
+            continue
+        top, bottom = max(int(y - radius), 0), min(int(min(y + radius, height)), height - 1)
+        left, right = max(int(x - radius), 0), min(int(min(x + radius, width)), width - 1)
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                off = (column + 0.5 - x) ** 2 + (row + 0.5 - y) ** 2
+                if off <= radius * radius:
+                    value = depth_mm[k] - math.sqrt(radius * radius - off) / radius * radius_mm
+                    pixel = row * width + column
+                    if value < nearest[pixel]:
+                        nearest[pixel] = value
+                        ball[pixel] = k
