@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import secrets
 import shutil
@@ -93,13 +92,17 @@ def make_app(
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
-        watching = asyncio.create_task(sessions.watch_over())
+        # The model is packed while the browser still opens.
+        working: list[asyncio.Task[Any]] = [
+            asyncio.create_task(sessions.watch_over()),
+            asyncio.create_task(viewer.packed_model()),
+        ]
         try:
             yield
         finally:
-            watching.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await watching
+            for task in working:
+                task.cancel()
+            await asyncio.gather(*working, return_exceptions=True)
             sessions.close()
 
     app = Starlette(
@@ -160,7 +163,7 @@ class _Viewer:
 
     async def about(self, request: Request) -> Response:
         model, limits = self._shown.model, self._sessions.limits
-        _, modes = await self._packed_model()
+        _, modes = await self.packed_model()
         return JSONResponse(
             {
                 "version": __version__,
@@ -177,6 +180,7 @@ class _Viewer:
                 "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
                 "sequential": colours.as_list(colours.SEQUENTIAL),
                 "diverging": colours.as_list(colours.DIVERGING),
+                "clay": colours.CLAY,
                 "scan_colour": colours.SCAN_COLOUR,
                 "model_colour": colours.MODEL_COLOUR,
                 "region_colours": dict(colours.REGION_COLOURS),
@@ -184,7 +188,7 @@ class _Viewer:
         )
 
     async def model(self, request: Request) -> Response:
-        packed, _ = await self._packed_model()
+        packed, _ = await self.packed_model()
         return Response(packed, media_type=_BINARY)
 
     async def fits(self, request: Request) -> Response:
@@ -335,7 +339,7 @@ class _Viewer:
             raise HTTPException(404, _NO_SCAN)
         return scan
 
-    async def _packed_model(self) -> tuple[bytes, int]:
+    async def packed_model(self) -> tuple[bytes, int]:
         async with self._packing:
             if self._packed is None:
                 self._packed = await asyncio.to_thread(self._shown.packed_model)

@@ -17,7 +17,7 @@ from shapespace.report.scene import pack_model
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
-MODEL_BYTES = 96 * 2**20
+MODEL_BYTES = 48 * 2**20
 """Modes beyond this size in the browser are left out, and the page says so."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6

@@ -25,10 +25,10 @@
     slider.style.setProperty("--to", share(Math.max(value, zero)));
   });
 
-  /** The next of 1, 2, 5, 10, 20, ... at or above a positive number. */
+  /** The next round number at or above a positive one. */
   Viewer.nice = function (value) {
     const power = 10 ** Math.floor(Math.log10(Math.max(value, 1e-3)));
-    return [1, 2, 5, 10].map((step) => step * power).find((step) => step >= value * 0.9999) || 10 * power;
+    return [1, 1.5, 2, 3, 4, 5, 6, 8, 10].map((step) => step * power).find((step) => step >= value * 0.9999) || 10 * power;
   };
 
   /** The q-quantile of the absolute finite values. */
@@ -88,12 +88,13 @@
       this.n = arrays.history_phase ? arrays.history_phase.length : 0;
       this.K = arrays.b.length;
       this.stddev = this.context.about.stddev;
-      const reach = Math.max(Viewer.quantile(arrays.model_to_scan_final, 0.95), 1);
-      this.limit = Viewer.nice(reach);
+      // A scale on which most of the surface can be told apart, however far hair or a collar lies.
+      const far = (q) => Viewer.quantile(arrays.model_to_scan_final, q);
+      this.limit = Viewer.nice(Math.max(1, Math.min(3 * far(0.5), far(0.95))));
       const keep = this.view || {};
       this.view = {
         stage: "final", moment: null, layout: keep.layout || "overlay", colour: keep.colour || "plain",
-        scanOpacity: 1, modelOpacity: 0.6, marked: false, threshold: Math.min(this.limit / 2, 2),
+        scanOpacity: 1, modelOpacity: 0.8, marked: false, threshold: Math.min(this.limit / 2, 2),
       };
       this._build();
       this._fill();
@@ -139,7 +140,7 @@
       this.modelSlider = slider("model-opacity", "Model", 0, 1, 0.01, 1, (v) => { this.view.modelOpacity = v; this.draw(); });
       this.mark = h("input", { type: "checkbox", id: id("mark"), "data-testid": id("mark") });
       this.mark.addEventListener("change", () => { this.view.marked = this.mark.checked; this.draw(); });
-      this.threshold = slider("threshold", "Threshold", 0, 2 * this.limit, this.limit / 100, view.threshold, (v) => {
+      this.threshold = slider("threshold", "Threshold", 0, 2 * this.limit, this.limit > 5 ? 0.1 : 0.05, view.threshold, (v) => {
         Object.assign(this.view, { threshold: v, marked: true });
         this.draw();
       });
@@ -160,8 +161,7 @@
         h("button", { type: "button", "data-testid": id("use"), onclick: () => this.context.apply(this._z(), facts.label || facts.name) }, "Use in Model"));
       this.element.replaceChildren(
         ...[h("h2", {}, "Stage"), this.stageButtons, h("h2", {}, "Show"), this.layoutButtons, this.colourButtons,
-          this.scanSlider.row, this.modelSlider.row, this.mapControls, this.steps, h("h2", {}, "Coefficients"), this.bars,
-          h("h2", {}, "Export"), exports].filter(Boolean));
+          this.scanSlider.row, this.modelSlider.row, this.mapControls, this.steps, this.bars, h("h2", {}, "Export"), exports].filter(Boolean));
       if (this.steps) Viewer.rmsChart(this.rms, Array.from(arrays.history_rms_mm), Array.from(arrays.history_phase), null);
       const error = Array.from(arrays.b_stddev, (sd, k) => sd / (k < this.stddev.length ? this.stddev[k] : NaN));
       Viewer.coefficientChart(this.bars, [{ z: this._z(), error }], this.K);
@@ -191,7 +191,7 @@
       const overlay = view.layout === "overlay";
       const only = { plain: null, model: "model", regions: "model", scan: "scan" }[view.colour];
       view.scanOpacity = overlay && only === "model" ? 0 : 1;
-      view.modelOpacity = !overlay ? 1 : only === "scan" ? 0 : only === "model" ? 1 : 0.6;
+      view.modelOpacity = !overlay ? 1 : only === "scan" ? 0 : only === "model" ? 1 : 0.8;
     }
 
     /** Go to a saved iteration. */

@@ -109,6 +109,7 @@
     }
 
     clear() {
+      $("empty").hidden = true;
       for (const view of [this.a, this.b]) {
         if (view) for (const id of ["model", "scan", "landmarks", "placed"]) view.remove(id);
       }
@@ -119,6 +120,14 @@
     }
   }
 
+  /** Show no surface, and say why. */
+  function nothing(text) {
+    stage.clear();
+    stage.split(false);
+    $("empty").textContent = text;
+    $("empty").hidden = false;
+  }
+
   // Model -----------------------------------------------------------------------------------------------------------
 
   const rows = [];
@@ -126,7 +135,7 @@
 
   function makeSliders() {
     const list = $("sliders");
-    list.append(h("div", { class: "mode modes-head", "aria-hidden": "true" }, h("span"), h("span", {}, "variance"), h("span"), h("span"), h("span")));
+    list.append(h("div", { class: "mode modes-head", "aria-hidden": "true" }, h("span"), h("span", {}, "Mode and its share of the variance"), h("span"), h("span"), h("span")));
     for (let k = 0; k < model.K; k++) {
       const name = `Mode ${k + 1}`;
       const tick = h("input", { type: "checkbox", "aria-label": `Animate mode ${k + 1}`, title: `Animate mode ${k + 1}`, "data-testid": `animate-${k + 1}` });
@@ -189,7 +198,7 @@
       stage.clear();
       stage.split(false);
       stage.holds = "model";
-      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.model_colour });
+      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.clay });
     } else {
       stage.a.move("model", positions);
     }
@@ -321,7 +330,7 @@
       stage.clear();
       stage.split(false);
       stage.holds = "compare";
-      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.model_colour });
+      stage.a.setSurface("model", { positions, faces: model.faces, colour: about.clay });
     } else {
       stage.a.move("model", positions);
     }
@@ -440,10 +449,16 @@
   let fitView, scanView;
   let selected = -1;
 
-  function verdictCard(facts) {
+  function verdictCard(facts, where) {
     const notes = facts.notes && facts.notes.length ? h("ul", {}, ...facts.notes.map((note) => h("li", {}, note))) : null;
-    return h("div", { class: `status ${facts.status}`, "data-testid": "status", "data-status": facts.status },
-      h("strong", {}, STATUS[facts.status] || facts.status), h("span", {}, facts.reason || ""), notes);
+    return h("div", { class: `status ${facts.status}`, "data-testid": `${where}-status`, "data-status": facts.status },
+      h("strong", {}, STATUS[facts.status] || facts.status), h("span", {}, plainReason(facts.reason || "")), notes);
+  }
+
+  /** A reason without what the heading says already. */
+  function plainReason(reason) {
+    const rest = reason.replace(/^Do not trust this fit: /, "");
+    return rest.charAt(0).toUpperCase() + rest.slice(1);
   }
 
   function distanceFacts(distances) {
@@ -495,12 +510,13 @@
     $("fit-list").setAttribute("aria-activedescendant", `fit-${index}`);
     $(`fit-${index}`).scrollIntoView({ block: "nearest" });
     const detail = h("div");
-    $("fit-detail").replaceChildren(verdictCard({ ...row, reason: row.reason }), detail);
+    fitView.clear();
+    fitView.element = detail;
+    $("fit-detail").replaceChildren(verdictCard(row, "fit"), detail);
     if (!row.pictured) {
       if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
       if (row.z) $("fit-detail").append(h("button", { type: "button", onclick: () => apply(row.z) }, "Use in Model"));
-      fitView.clear();
-      if (shown === "fits") { stage.clear(); stage.split(false); stage.captions(`${row.label}: no picture`); }
+      if (shown === "fits") nothing(`There is no picture of ${row.label}`);
       return;
     }
     $("loading").textContent = "Loading the fit";
@@ -508,7 +524,6 @@
     try {
       const payload = await binary(`/api/fits/${encodeURIComponent(row.name)}`);
       if (selected !== index) return;
-      fitView.element = detail;
       fitView.show(payload, { fit: row.name });
     } finally {
       $("loading").hidden = true;
@@ -631,6 +646,9 @@
     const last = own.states[own.states.length - 1];
     const what = last.phase === 1 ? "Finding the pose" : "Fitting pose and shape";
     progress(`${what}: iteration ${last.iteration}, RMS ${last.rms_mm.toFixed(2)} mm`, null);
+    clearTimeout(own.quiet);
+    const mine = own;
+    own.quiet = setTimeout(() => { if (own === mine && !mine.verdict) progress("Checking whether the fit can be trusted", null); }, 700);
     Viewer.rmsChart($("progress-chart"), own.states.map((s) => s.rms_mm), own.states.map((s) => s.phase), null);
     drawScanStates();
   }
@@ -671,7 +689,7 @@
       const there = new Float32Array(positions.length);
       mapping(first, true)(mapping(last, false)(positions, there), there);
       if (stage.a.has("model")) stage.a.move("model", there);
-      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour, opacity: 0.75 });
+      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour, opacity: 0.8 });
       stage.captions(`${own.name}: the model moves onto the scan`);
       stage.legend([["scan", about.scan_colour], ["model", about.model_colour]]);
     } else {
@@ -682,14 +700,18 @@
 
   async function showVerdict(mine) {
     const told = mine.verdict;
-    const card = verdictCard(told);
+    const card = verdictCard(told, "scan");
     $("verdict").replaceChildren(...[card, distanceFacts(told.distances_mm), told.why_not ? h("p", {}, told.why_not) : null].filter(Boolean));
     $("verdict").hidden = false;
     $("progress").hidden = true;
-    if (!told.b) { drawScanStates(); return; }
+    if (!told.b) {
+      if (mine.preview) drawScanStates();
+      else if (shown === "scan") nothing(`There is no picture of ${mine.name}`);
+      return;
+    }
     const start = { landmarks: "landmarks", upright: "the scan as it stands", rotations: "a search over rotations", given: "a given pose" }[told.start];
     const seconds = Object.values(told.seconds || {}).reduce((sum, value) => sum + value, 0);
-    $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)} s.`));
+    $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)}\u00a0s.`));
     shapes.set(`scan ${mine.id}`, { name: mine.name, z: told.z });
     fillChoices();
     if (!told.pictured) return;
@@ -751,6 +773,7 @@
     stage.holds = null;
     own.frame = null;
     drawPlacing(true);
+    $("placing").scrollIntoView({ block: "nearest" });
   }
 
   function drawPlacing(first) {
@@ -825,6 +848,7 @@
     }
     await ask(`/api/scans/${mine.id}/landmarks`, post({ landmarks }));
     $("scan-detail").hidden = false;
+    scanView.active = shown === "scan";
     beginScan({ id: mine.id, name: mine.name });
     progress("Starting from your landmarks", null);
     follow();
@@ -884,20 +908,21 @@
       stage.clear();
       stage.split(false);
       if (name === "fits") {
-        if (selected < 0 && listed.length) selectFit(0);
+        if (listed.length && !fitView.payload) selectFit(selected >= 0 ? selected : Math.max(0, listed.findIndex((row) => row.pictured)));
         else if (fitView.payload) fitView.draw(true);
-        else if (selected < 0) drawEmpty();
+        else drawEmpty();
       } else if (own && own.placing) drawPlacing(true);
       else if (scanView.payload) scanView.draw(true);
       else if (own && own.preview) drawScanStates();
-      else drawEmpty();
+      else if (own && own.verdict) nothing(`There is no picture of ${own.name}`);
+      else if (!own) drawEmpty();
     }
     if (name === "model" || name === "compare") stage.a.frame(["model"]);
   }
 
   /** Nothing to show yet: the mean, faint. */
   function drawEmpty() {
-    stage.a.setSurface("model", { positions: model.mean, faces: model.faces, colour: about.model_colour, opacity: 0.35 });
+    stage.a.setSurface("model", { positions: model.mean, faces: model.faces, colour: about.clay, opacity: 0.35 });
     stage.holds = "empty";
     stage.a.frame(["model"]);
   }

@@ -1,0 +1,139 @@
+"""How long the viewer takes from moving a slider to the picture, with WebGL by the processor.
+
+    python benchmarks/redraw.py             12,731 vertices, 50 modes
+    python benchmarks/redraw.py --repeat 30
+
+Needs Chromium and the extras `view` and `test`. The server only sends the model, once; each move of a slider is worked
+out in the browser, so the part of the server in a redraw is what it is asked for meanwhile, which is nothing.
+Target: a redraw in under 50 ms on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+from accuracy import machine_facts
+
+from shapespace.datasets.faces import load_faces
+from shapespace.model.shape_model import ShapeModel
+
+MODES = 50
+TARGET_MS = 50.0
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
+
+# Whole: from the event to pixels that can be read back. Drag: one event a frame, as a mouse gives them.
+SCRIPT = """async ([repeat, map]) => {
+  const box = document.getElementById("map");
+  if (box.checked !== map) box.click();
+  const view = window.shapespaceStage.a;
+  const move = (k, value) => {
+    const slider = document.getElementById(`mode-${k + 1}`);
+    slider.value = value;
+    slider.dispatchEvent(new Event("input", { bubbles: true }));
+  };
+  const frame = () => new Promise(requestAnimationFrame);
+  for (let i = 0; i < 5; i++) { move(0, i / 5); view.redraw(); await frame(); }
+  const whole = [], script = [];
+  for (let i = 0; i < repeat; i++) {
+    const start = performance.now();
+    move(i % 10, 3 * Math.sin(i));
+    script.push(performance.now() - start);
+    view.redraw();
+    whole.push(performance.now() - start);
+    await frame();
+  }
+  await new Promise((done) => setTimeout(done, 500));
+  window.shapespaceTimes.length = 0;
+  const began = performance.now(), before = view.frames;
+  for (let i = 0; i < repeat; i++) { move(1, 3 * Math.sin(i / 8)); await frame(); }
+  const drawn = view.frames - before, seconds = (performance.now() - began) / 1000;
+  return { whole, script, drag: window.shapespaceTimes.slice(), rate: drawn / seconds };
+}"""
+
+
+def model_file(folder: Path) -> Path:
+    """Write the model that is drawn, and return its file."""
+    faces = load_faces()
+    meshes = [faces.face(faces.draw_person(np.random.default_rng(k))) for k in range(MODES + 10)]
+    path = folder / "model.h5"
+    ShapeModel.fit(meshes, modes=MODES).save(path)
+    return path
+
+
+def measure(repeat: int) -> dict[str, object]:
+    """Open the viewer in Chromium, move sliders, and return milliseconds by what was measured."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        sys.exit("There is no Chromium here; install it and run again.")
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "shapespace", "view", str(model_file(Path(folder))), "--no-open"]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            assert server.stdout is not None
+            address = server.stdout.readline().split()[-1]
+            sent = []
+            for _ in range(5):
+                start = time.perf_counter()
+                size = len(urllib.request.urlopen(address + "api/model").read())
+                sent.append(1000 * (time.perf_counter() - start))
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+                page = browser.new_page(viewport={"width": 1280, "height": 800})
+                start = time.perf_counter()
+                page.goto(address)
+                page.wait_for_selector("body[data-ready]")
+                opened = time.perf_counter() - start
+                page.wait_for_timeout(1500)
+                asked: list[str] = []
+                page.on("request", lambda request: asked.append(request.url))
+                plain = page.evaluate(SCRIPT, [repeat, False])
+                painted = page.evaluate(SCRIPT, [repeat, True])
+                facts = page.evaluate("document.getElementById('about').textContent")
+                browser.close()
+        finally:
+            server.terminate()
+            server.wait()
+    return {
+        "model": facts,
+        "server: requests while sliders move": len(asked),
+        "server: model sent, MB": size / 2**20,
+        "server: model sent, ms (first)": sent[0],
+        "server: model sent, ms (again)": float(np.median(sent[1:])),
+        "page opened and drawn, s": opened,
+        **{f"plain: {key}": value for key, value in plain.items()},
+        **{f"with map: {key}": value for key, value in painted.items()},
+    }
+
+
+def main() -> None:
+    """Print the figures, and fail where the target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeat", type=int, default=60, metavar="N", help="moves of a slider")
+    found = measure(parser.parse_args().repeat)
+    print(json.dumps(machine_facts()))
+    met = True
+    for name, value in found.items():
+        if isinstance(value, list):
+            median, high = np.percentile(value, [50, 95])
+            print(f"{name}: median {median:.1f} ms, 95 % {high:.1f} ms")
+            met &= bool(median < TARGET_MS) or "whole" not in name
+        else:
+            print(f"{name}: {value:.2f}" if isinstance(value, float) else f"{name}: {value}")
+    print(f"target, a whole redraw in under {TARGET_MS:.0f} ms: {'met' if met else 'not met'}")
+    sys.exit(0 if met else 1)
+
+
+if __name__ == "__main__":
+    main()
