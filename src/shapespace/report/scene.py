@@ -32,49 +32,57 @@ SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
 _UNKNOWN = -32768
-_STEPS = 32767
+_MOST_STEPS = 32767
+_MOST_COLLAPSED = 150_000
+# What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
+_PLACE_STEP_MM = 0.04
+_DISTANCE_STEP_MM = 0.05
+_MODE_STEP_MM = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Quantised:
-    """An array as int16 times a scale, for `pack`.
+class Steps:
+    """An array of 16-bit integers, perhaps times a scale, for `pack`.
 
     Args:
-        steps: int16, any shape; -32768 stands for NaN.
-        scale: one positive number, or one for each leading row.
+        values: int16 or uint16, any shape; -32768 stands for NaN where there is a scale.
+        scale: one positive number, one for each leading row, or None for integers that are what they are.
+        coded: store differences from row to row, byte by byte, which deflate makes small where neighbours are alike.
+        follows: name of an array packed before, of the same shape and scale; differences from it are coded.
     """
 
-    steps: npt.NDArray[np.int16]
-    scale: float | list[float]
+    values: npt.NDArray[np.int16] | npt.NDArray[np.uint16]
+    scale: float | list[float] | None = None
+    coded: bool = False
+    follows: str | None = None
 
 
-def quantised(values: npt.ArrayLike, *, by_row: bool = False) -> Quantised:
-    """Return `values` as int16 steps; the error is at most half a step, which is max|values| / 65534.
+def quantised(values: npt.ArrayLike, *, step: float = 0.0, by_row: bool = False, coded: bool = False) -> Steps:
+    """Return `values` as int16 steps; the error is at most half a step.
 
     Args:
         values: float, any shape; NaN and infinities become NaN.
-        by_row: one scale for each leading row instead of one for all.
+        step: the least step; 0 takes the finest, max|values| / 32767.
+        by_row: one step for each leading row instead of one for all.
+        coded: see `Steps`.
     """
     array = np.asarray(values, dtype=np.float64)
     known = np.isfinite(array)
     size = np.where(known, np.abs(array), 0.0)
-    if by_row:
-        scales = size.reshape(len(array), -1).max(axis=1, initial=0.0) / _STEPS
-        scales = np.where(scales > 0, scales, 1.0)
-        step = scales.reshape(-1, *[1] * (array.ndim - 1))
-        scale: float | list[float] = [float(value) for value in scales]
-    else:
-        step = scale = float(size.max(initial=0.0)) / _STEPS or 1.0
-    steps = np.where(known, np.rint(np.where(known, array, 0.0) / step), _UNKNOWN)
-    return Quantised(steps.astype(np.int16), scale)
+    largest = size.reshape(len(array), -1).max(axis=1, initial=0.0) if by_row else size.max(initial=0.0)
+    scale = np.maximum(np.asarray(largest) / _MOST_STEPS, step)
+    scale = np.where(scale > 0, scale, 1.0)
+    steps = np.rint(np.where(known, array, 0.0) / (scale.reshape(-1, *[1] * (array.ndim - 1)) if by_row else scale))
+    whole = np.where(known, steps, _UNKNOWN).astype(np.int16)
+    return Steps(whole, [float(value) for value in scale] if by_row else float(scale), coded)
 
 
-def pack(arrays: Mapping[str, npt.NDArray[Any] | Quantised], facts: Mapping[str, Any]) -> bytes:
+def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any]) -> bytes:
     """Return `arrays` and `facts` as bytes that `Shapespace.unpack` reads in the browser.
 
     Args:
         arrays: name -> array; float64 becomes float32, int64 int32 and bool uint8, other types must be float32, int32,
-            uint32, uint16, int16 or uint8, or `Quantised`.
+            uint32, uint16, int16 or uint8, or `Steps`.
         facts: anything JSON can hold; numbers that are not finite become null.
 
     Raises:
@@ -84,12 +92,17 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Quantised], facts: Mapping[str,
     buffers: list[bytes] = []
     offset = 0
     for name, given in arrays.items():
-        array = given.steps if isinstance(given, Quantised) else _portable(name, np.asarray(given))
+        array = given.values if isinstance(given, Steps) else _portable(name, np.asarray(given))
         spec: dict[str, Any] = {"dtype": array.dtype.name, "shape": list(array.shape), "offset": offset}
-        if isinstance(given, Quantised):
-            spec["scale"] = given.scale
-        specs[name] = spec
         data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        if isinstance(given, Steps):
+            if given.scale is not None:
+                spec["scale"] = given.scale
+            if given.coded:
+                before = arrays[given.follows] if given.follows is not None else None
+                spec["coded"] = given.follows or True
+                data = _coded(array, before.values if isinstance(before, Steps) else None)
+        specs[name] = spec
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
     try:
@@ -99,15 +112,27 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Quantised], facts: Mapping[str,
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
 
-def pack_model(model: ShapeModel, modes: int | None = None) -> bytes:
+def _coded(array: npt.NDArray[Any], before: npt.NDArray[Any] | None) -> bytes:
+    """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
+    columns = array.shape[-1] if array.ndim > 1 else 1
+    values = array.reshape(-1, columns).view(np.uint16)
+    if before is not None:
+        values = values - before.reshape(-1, columns).view(np.uint16)
+    steps = np.diff(values, axis=0, prepend=np.zeros((1, columns), np.uint16)).view(np.int16).astype(np.int32)
+    zigzag = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u2")
+    return np.ascontiguousarray(zigzag.T).view(np.uint8).reshape(columns, -1, 2).transpose(0, 2, 1).tobytes()
+
+
+def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = False) -> bytes:
     """Return what `Shapespace.Model` and the widget of modes need.
 
-    Arrays: `mean` (V, 3) float32 mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the
-    displacement of one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
+    Arrays: `mean` (V, 3) mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the displacement of
+    one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
 
     Args:
         model: any model.
         modes: how many of its modes; None takes all, and a number above them is cut to them.
+        small: for a report: rounded to 0.02 mm, and vertices and triangles in another order, which deflates well.
 
     Raises:
         InputError: fewer than one mode.
@@ -115,27 +140,33 @@ def pack_model(model: ShapeModel, modes: int | None = None) -> bytes:
     if modes is not None and modes < 1:
         raise InputError(f"At least one mode must be packed, not {modes}.")
     K = model.n_modes if modes is None else min(modes, model.n_modes)
+    order, faces = np.arange(model.n_vertices), model.faces
+    if small and faces is not None:
+        order, faces = _neighbours_together(faces, model.n_vertices)
     one = np.zeros(K)
     moved = np.empty((K, model.n_vertices, 3))
     for k in range(K):
         one[k] = model.stddev[k]
         moved[k] = model.reconstruct(one) - model.mean_vertices
         one[k] = 0.0
-    arrays: dict[str, npt.NDArray[Any] | Quantised] = {
-        "mean": model.mean_vertices,
-        "modes": quantised(moved, by_row=True),
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {
+        "mean": quantised(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True)
+        if small
+        else model.mean_vertices,
+        "modes": quantised(moved[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
-    if model.faces is not None:
-        arrays["faces"] = _indices(model.faces, model.n_vertices)
+    if faces is not None:
+        arrays["faces"] = _indices(faces, model.n_vertices, coded=small)
+    place = np.argsort(order)
     facts = {
         "kind": "model",
         "names": [f"mode {k + 1}" for k in range(K)],
         "n_modes": model.n_modes,
         "n_training": model.n_training,
         "gauge": model.gauge,
-        "landmarks": dict(model.landmarks),
+        "landmarks": {name: int(place[vertex]) for name, vertex in model.landmarks.items()},
         "provenance": model.provenance,
         "licence": model.licence,
     }
@@ -151,8 +182,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
 
     Args:
         staged: a fit with its stages.
-        largest_scan: for a report: the scan is thinned to at most this many triangles (or points), positions are
-            quantised and the iterations left out. None packs everything as it is.
+        largest_scan: for a report: scan and model are thinned to at most this many triangles (or points) each, rounded
+            to 0.02 mm, their vertices put in another order, and the iterations left out. None packs all as it is.
 
     Raises:
         InputError: `largest_scan` below 1.
@@ -160,21 +191,26 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
     if largest_scan is not None and largest_scan < 1:
         raise InputError(f"A scan must keep at least one triangle, not {largest_scan}.")
     small = largest_scan is not None
-    scan, kept = staged.scan, np.arange(len(staged.scan.vertices))
+    last = list(staged.surfaces.values())[-1]
+    scan, model = staged.scan, last
+    of_scan, of_model = np.arange(len(scan.vertices)), np.arange(len(model.vertices))
     if largest_scan is not None:
-        scan, kept = thinned(scan, largest_scan)
-    place = quantised if small else _as_given
-    arrays: dict[str, npt.NDArray[Any] | Quantised] = {"scan": place(scan.vertices)}
+        scan, of_scan = _small(scan, largest_scan)
+        model, of_model = _small(last, largest_scan)
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
     if scan.faces is not None:
-        arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices))
-    for stage, surface in staged.surfaces.items():
-        if surface.faces is not None:
-            arrays.setdefault("faces", _indices(surface.faces, len(surface.vertices)))
-        arrays[f"surface_{stage}"] = place(surface.vertices)
-        arrays[f"model_to_scan_{stage}"] = quantised(staged.model_to_scan_mm[stage])
-        arrays[f"scan_to_model_{stage}"] = quantised(staged.scan_to_model_mm[stage][kept])
+        arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
+    if model.faces is not None:
+        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
+    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
+    step = _DISTANCE_STEP_MM if small else 0.0
+    for stage in staged.surfaces:
+        forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
+        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
+        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
     arrays |= {
-        "regions": staged.regions.astype(np.uint8),
+        "regions": staged.regions[of_model].astype(np.uint8),
         "b": staged.b,
         "z": staged.z,
         "b_stddev": staged.b_stddev,
@@ -198,7 +234,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
         "stages": list(staged.surfaces),
         "scan_vertices": len(staged.scan.vertices),
         "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
-        "thinned": len(scan.vertices) < len(staged.scan.vertices),
+        "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
 
@@ -240,8 +276,9 @@ def pack_scatter(
 def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
 
-    Vertices of one cell of a cubic grid become the one that is nearest to their mean, and triangles that fold up are
-    dropped (Rossignac and Borrel 1993). No new point is made, so what was measured at a vertex stays true of it.
+    No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
+    collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
+    instead (Rossignac and Borrel 1993): of each cell the vertex nearest to the mean stays.
 
     Args:
         scan: any surface or points.
@@ -250,10 +287,12 @@ def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     Returns:
         The mesh, and (S',) indices into the vertices of `scan`.
     """
-
-    everything = np.arange(len(scan.vertices))
     if _count(scan) <= largest:
-        return scan, everything
+        return scan, np.arange(len(scan.vertices))
+    if scan.faces is not None and len(scan.faces) <= _MOST_COLLAPSED:
+        collapsed = _collapsed(scan, scan.faces, largest)
+        if collapsed is not None:
+            return collapsed
     cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
     best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
     # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
@@ -270,6 +309,20 @@ def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
         trial = _clustered(scan, cell)
         best = trial if _count(trial[0]) <= largest else None
     return best
+
+
+def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
+    """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
+    import igl as untyped  # pyright: ignore[reportMissingTypeStubs]
+
+    igl = cast(Any, untyped)
+    if not igl.is_edge_manifold(faces.astype(np.int64)):
+        return None
+    _, triangles, _, kept = igl.decimate(scan.vertices, faces.astype(np.int64), largest)
+    if not 0 < len(triangles) <= largest:
+        return None
+    kept = np.asarray(kept, dtype=np.intp)
+    return Mesh(scan.vertices[kept], np.asarray(triangles), name=scan.name), kept
 
 
 def _count(mesh: Mesh) -> int:
@@ -357,12 +410,51 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _indices(faces: IntArray, vertices: int) -> npt.NDArray[Any]:
-    return faces.astype(np.uint16 if vertices <= 1 << 16 else np.uint32)
+def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any] | Steps:
+    if vertices > 1 << 16:
+        return faces.astype(np.uint32)
+    return Steps(faces.astype(np.uint16), coded=coded)
 
 
-def _as_given(values: npt.ArrayLike) -> npt.NDArray[Any]:
-    return np.asarray(values, dtype=np.float32)
+def _places(points: FloatArray, small: bool) -> npt.NDArray[Any] | Steps:
+    return quantised(points, step=_PLACE_STEP_MM, coded=True) if small else points.astype(np.float32)
+
+
+def _alike(surfaces: Mapping[str, FloatArray]) -> dict[str, Steps]:
+    """Return surfaces of the same vertices in one step, each but the first as what differs from the one before."""
+    largest = max(float(np.abs(points).max(initial=0.0)) for points in surfaces.values())
+    step = max(largest / _MOST_STEPS, _PLACE_STEP_MM)
+    out: dict[str, Steps] = {}
+    before: str | None = None
+    for name, points in surfaces.items():
+        out[name] = Steps(np.rint(points / step).astype(np.int16), step, True, before)
+        before = name
+    return out
+
+
+def _small(mesh: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `mesh` thinned, with neighbours near each other in the order, and the indices of its vertices."""
+    few, kept = thinned(mesh, largest)
+    if few.faces is None:
+        return few, kept
+    order, faces = _neighbours_together(few.faces, len(few.vertices))
+    return Mesh(few.vertices[order], faces, name=mesh.name), kept[order]
+
+
+def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.intp], IntArray]:
+    """Return an order of the vertices, (V,), in which neighbours are near, and the sorted triangles in that order."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    rows, columns = faces[:, [0, 1, 2, 1, 2, 0]].ravel(), faces[:, [1, 2, 0, 0, 1, 2]].ravel()
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(vertices, vertices)).tocsr()
+    order = np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.intp)
+    place = np.empty(vertices, dtype=np.int32)
+    place[order] = np.arange(vertices, dtype=np.int32)
+    moved = place[faces]
+    first = moved.argmin(axis=1)[:, None]
+    moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
+    return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
 
 
 def _matrix(T: Similarity) -> FloatArray:

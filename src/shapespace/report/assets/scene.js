@@ -24,20 +24,42 @@
     } catch (error) {
       throw damaged;
     }
-    const arrays = {};
+    const arrays = {}, integers = {};
     const start = 8 * Math.ceil((4 + length) / 8);
     for (const name of Object.keys(header.arrays)) {
       const spec = header.arrays[name];
       const count = spec.shape.reduce((product, n) => product * n, 1);
       const Type = TYPES[spec.dtype];
       if (!Type || start + spec.offset + count * Type.BYTES_PER_ELEMENT > buffer.byteLength) throw damaged;
-      let values = new Type(buffer, start + spec.offset, count);
+      let values;
+      if (spec.coded) {
+        const columns = spec.shape.length > 1 ? spec.shape[spec.shape.length - 1] : 1;
+        values = decoded(new Uint8Array(buffer, start + spec.offset, 2 * count), new Type(count), columns, integers[spec.coded]);
+      } else {
+        values = new Type(buffer, start + spec.offset, count);
+      }
+      integers[name] = values;
       if (spec.scale !== undefined) values = dequantised(values, spec.scale);
       values.shape = spec.shape;
       arrays[name] = values;
     }
     return { facts: header.facts, arrays };
   };
+
+  /** 16-bit integers from the byte planes of their differences from row to row, or from an array of before. */
+  function decoded(bytes, out, columns, before) {
+    const rows = columns ? out.length / columns : 0;
+    for (let c = 0; c < columns; c++) {
+      const low = 2 * c * rows, high = low + rows;
+      let value = 0;
+      for (let r = 0, i = c; r < rows; r++, i += columns) {
+        const zigzag = bytes[low + r] | (bytes[high + r] << 8);
+        value += (zigzag >>> 1) ^ -(zigzag & 1);
+        out[i] = before ? value + before[i] : value; // the array takes it modulo 2^16
+      }
+    }
+    return out;
+  }
 
   function dequantised(steps, scale) {
     const out = new Float32Array(steps.length);

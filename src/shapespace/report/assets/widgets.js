@@ -286,7 +286,7 @@
       view.frame(["model"], 1.12);
 
       const last = arrays[`model_to_scan_${state.stage}`];
-      const top = niceCeiling(Math.max(quantile(arrays.model_to_scan_final || last, 0.9) || 0, 0.5));
+      const top = niceCeiling(Math.min(Math.max(quantile(arrays.model_to_scan_final || last, 0.9) || 0, 1), 5));
       const bar = make("div", { class: "ss-bar" }), legend = make("div", { class: "ss-bar" });
       Shapespace.colourBar(bar, {
         map: colours().diverging, range: [-top, top], unit: "mm", title: "The scan lies behind the model (\u2212) or in front (+)", open: true,
