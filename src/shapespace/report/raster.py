@@ -161,7 +161,7 @@ def nearest_balls(
     screen: FloatArray,
     depth_mm: FloatArray,
     radius: float,
-    radius_mm: float,
+    rise_mm: float,
     width: int,
     height: int,
     ball: npt.NDArray[np.int32],
@@ -173,7 +173,7 @@ def nearest_balls(
         screen: (V, 2) pixels, y down; not-a-number drops a ball.
         depth_mm: (V,) of the balls' centres.
         radius: of the balls in pixels.
-        radius_mm: of the balls in mm.
+        rise_mm: how far a ball stands out before its centre, mm.
         width: of the picture in pixels.
         height: of the picture in pixels.
         ball: (height * width,), written.
@@ -191,8 +191,64 @@ def nearest_balls(
             for column in range(left, right + 1):
                 off = (column + 0.5 - x) ** 2 + (row + 0.5 - y) ** 2
                 if off <= radius * radius:
-                    value = depth_mm[k] - math.sqrt(radius * radius - off) / radius * radius_mm
+                    value = depth_mm[k] - math.sqrt(radius * radius - off) / radius * rise_mm
                     pixel = row * width + column
                     if value < nearest[pixel]:
                         nearest[pixel] = value
                         ball[pixel] = k
+
+
+@compiled
+def lit(
+    normal: npt.NDArray[np.float32],
+    scalar: npt.NDArray[np.float32],
+    table: npt.NDArray[np.float32],
+    unknown: npt.NDArray[np.float32],
+    low: float,
+    high: float,
+    lights: npt.NDArray[np.float32],
+    occlusion: npt.NDArray[np.float32],
+    back: npt.NDArray[np.bool_],
+    out: npt.NDArray[np.float32],
+) -> None:
+    """Fill in linear colours: soft key, fill and rim light, a little gloss.
+
+    Args:
+        normal: (3, n) as seen from the eye.
+        scalar: (n,), or (0,) for a surface of one colour.
+        table: (N, 3) linear colours from `low` to `high`; the first is that of a surface of one colour.
+        unknown: (3,) linear colour where the scalar is not finite.
+        low: scalar of the first colour.
+        high: scalar of the last colour.
+        lights: (5, 3): directions of key, fill and gloss, colours of key and fill.
+        occlusion: (n,) in (0, 1].
+        back: (n,) whether a surface is seen from its inside.
+        out: (n, 3), written.
+    """
+    mapped = len(scalar) > 0
+    for i in range(normal.shape[1]):
+        x, y, z = normal[0, i], normal[1, i], normal[2, i]
+        # Wrapped diffuse light keeps the shadow side of a face readable.
+        key = min(max((lights[0, 0] * x + lights[0, 1] * y + lights[0, 2] * z + 0.18) / 1.18, 0.0), 1.0)
+        fill = min(max(lights[1, 0] * x + lights[1, 1] * y + lights[1, 2] * z, 0.0), 1.0)
+        gloss = min(max(lights[2, 0] * x + lights[2, 1] * y + lights[2, 2] * z, 0.0), 1.0)
+        gloss = gloss**32 * occlusion[i]
+        rim = min(max(1.0 - abs(z), 0.0), 1.0)
+        at, known = 0, True
+        if mapped:
+            known = math.isfinite(scalar[i])
+            if known:
+                share = min(max((scalar[i] - low) / (high - low), 0.0), 1.0)
+                at = min(int(share * len(table)), len(table) - 1)
+        # A map is read by its colours: less shading there, and none of it coloured, so that they stay the scale's.
+        plain = (0.50 + 0.48 * key + 0.08 * fill) * (1.0 - 0.45 * rim**4)
+        for k in range(3):
+            base = table[at, k] if known else unknown[k]
+            if mapped:
+                value = base * plain * occlusion[i] + 0.02 * gloss
+            else:
+                light = key * lights[3, k] + (0.15 * fill + 0.13 * (0.5 + 0.5 * y)) * lights[4, k] + 0.035
+                value = base * light * occlusion[i] + 0.07 * gloss + 0.035 * rim**3
+            if back[i]:
+                value = 0.4 * value + 0.02
+            out[i, k] = min(max(value, 0.0), 1.0)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.report.colours import CLAY, UNKNOWN_COLOUR, WHITE, Colour
-from shapespace.report.raster import interpolated, nearest_balls, nearest_triangles
+from shapespace.report.raster import interpolated, lit, nearest_balls, nearest_triangles
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
@@ -27,6 +27,8 @@ _Single: TypeAlias = npt.NDArray[np.float32]
 
 _LARGEST_SIDE = 8192
 _GAMMA = 2.2
+# Powers of every pixel would take as long as finding what it shows.
+_SRGB = np.round(255.0 * ((np.arange(65536) + 0.5) / 65536) ** (1 / _GAMMA)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +283,7 @@ def _composed(
         for column in range(supersample):
             mean += samples[:, row, :, column]
     mean /= supersample**2
-    return np.round(255.0 * np.clip(mean, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
+    return _SRGB[(65535 * np.clip(mean, 0, 1)).astype(np.uint16)]
 
 
 def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
@@ -381,7 +383,9 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     behind = _depth_mm(depth, camera)
     radius = max(radius_mm * height / camera.height_mm, 0.75)
     winner, nearest = np.empty(width * height, dtype=np.int32), np.empty(width * height)
-    nearest_balls(screen, behind, radius, radius_mm, width, height, winner, nearest)
+    # Those of a surface are flattened, so that their rounding does not stand out of it.
+    rise_mm = radius_mm if surface is None else 0.3 * radius_mm
+    nearest_balls(screen, behind, radius, rise_mm, width, height, winner, nearest)
     pixel = np.flatnonzero(winner >= 0)
     owner = winner[pixel]
     at = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
@@ -392,7 +396,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
         seen = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
         seen *= np.where(seen[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, by which a cloud is told from a closed surface.
-        normal = _unit((seen[owner].T + 0.35 * normal).astype(np.float32))
+        normal = np.ascontiguousarray(_unit((seen[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = None if layer.scalars is None else layer.scalars[owner].astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
     back = np.zeros(len(pixel), dtype=np.bool_)
@@ -435,36 +439,24 @@ _COOL = np.array([0.86, 0.95, 1.10], dtype=np.float32)
 _HALF = _direction(*(float(v) for v in _KEY + np.array([0, 0, 1])))
 
 
+_LIGHTS = np.stack([_KEY, _FILL, _HALF, _WARM, _COOL])
+
+
+def _linear(colours: npt.ArrayLike) -> _Single:
+    return (np.atleast_2d(np.asarray(colours, dtype=np.float64)) ** _GAMMA).astype(np.float32)
+
+
 def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
-    """Return linear colours (n, 3): soft key, fill and rim light, a little gloss."""
-    normal = surfels.normal
+    """Return linear colours (n, 3)."""
+    out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
     mapped = surfels.scalar is not None and layer.colormap is not None
-    base = (np.asarray(layer.colour) ** _GAMMA).astype(np.float32)[None]
-    if surfels.scalar is not None and layer.colormap is not None:
-        table = (np.asarray(layer.colormap) ** _GAMMA).astype(np.float32)
-        finite = np.isfinite(surfels.scalar)
-        share = (np.where(finite, surfels.scalar, 0) - layer.vmin) / (layer.vmax - layer.vmin)
-        base = table[np.clip(share * len(table), 0, len(table) - 1).astype(np.int64)]
-        base[~finite] = np.asarray(UNKNOWN_COLOUR, dtype=np.float32) ** _GAMMA
-    # Wrapped diffuse light keeps the shadow side of a face readable.
-    key = np.clip((_KEY @ normal + 0.18) / 1.18, 0, 1)
-    fill = np.clip(_FILL @ normal, 0, 1)
-    sky = 0.5 + 0.5 * normal[1]
-    rim = np.clip(1 - np.abs(normal[2]), 0, 1)
-    gloss = np.clip(_HALF @ normal, 0, 1)
-    for _ in range(5):
-        gloss *= gloss
-    if mapped:
-        # A map is read by its colours: less shading there, and none of it coloured, so that they stay the scale's.
-        light = (0.50 + 0.48 * key + 0.08 * fill) * surfels.occlusion * (1 - 0.45 * rim**4)
-        out = base * light[:, None] + (0.02 * gloss * surfels.occlusion)[:, None]
-    else:
-        light = key[:, None] * _WARM + (0.15 * fill + 0.13 * sky)[:, None] * _COOL + np.float32(0.035)
-        out = base * (light * surfels.occlusion[:, None])
-        out += (0.07 * gloss * surfels.occlusion + 0.035 * rim**3)[:, None]
-    if surfels.back.any():
-        out[surfels.back] = 0.4 * out[surfels.back] + 0.02
-    return np.clip(out, 0, 1).astype(np.float32)
+    table = _linear(layer.colormap if mapped and layer.colormap is not None else layer.colour)
+    scalar = surfels.scalar if mapped and surfels.scalar is not None else np.zeros(0, dtype=np.float32)
+    lit(
+        surfels.normal, scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax), _LIGHTS,
+        surfels.occlusion, surfels.back, out,
+    )  # fmt: skip
+    return out
 
 
 def _occlusion(
