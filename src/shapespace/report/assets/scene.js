@@ -276,6 +276,14 @@
     if (extension) extension.loseContext();
   }
 
+  /** Take the drawing context away for a moment, as a driver may do at any time; to try out what happens then. */
+  Shapespace.loseContext = function () {
+    const extension = gpu() && gpu().context.getExtension("WEBGL_lose_context");
+    if (!extension) return;
+    extension.loseContext();
+    setTimeout(() => extension.restoreContext(), 50);
+  };
+
   const waiting = new Set();
   let scheduled = 0;
   function flush() {
@@ -316,6 +324,7 @@
       this._camera = { yaw: 0, pitch: 0, roll: 0, zoom: 1, target: [0, 0, 0], extent: [100, 100, 100] };
       this._home = null;
       this._near = true;
+      this._size = [1, 1];
       this.works = gpu() !== null;
       this.canvas = document.createElement("canvas");
       this.canvas.className = "shapespace-canvas";
@@ -681,6 +690,7 @@
       const width = Math.round(this._frame.clientWidth * ratio), height = Math.round(this._frame.clientHeight * ratio);
       if (width < 1 || height < 1) return;
       const start = performance.now();
+      this._size = [width, height];
       if (page.canvas.width !== width || page.canvas.height !== height) page.renderer.setSize(width, height, false);
       this._aim(width, height);
       this._render(page.renderer, height, ratio);
@@ -842,12 +852,11 @@
       clearTimeout(this._later);
       this._present(2);
       const copyOf = document.createElement("canvas");
-      copyOf.width = Math.max(this.canvas.width, 1);
-      copyOf.height = Math.max(this.canvas.height, 1);
+      [copyOf.width, copyOf.height] = this._size;
       const context = copyOf.getContext("2d");
       context.fillStyle = this._background || behind(this.element);
       context.fillRect(0, 0, copyOf.width, copyOf.height);
-      context.drawImage(this.canvas, 0, 0);
+      context.drawImage(this.canvas, 0, 0, copyOf.width, copyOf.height);
       if (this._names.style.display === "block") context.drawImage(this._names, 0, 0, copyOf.width, copyOf.height);
       return new Promise((resolve, reject) =>
         copyOf.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The picture could not be made."))), "image/png")
