@@ -8,8 +8,8 @@ from pathlib import Path
 from PIL import Image
 
 from shapespace.io.files import write_bytes
-from shapespace.report.figures import STAGE_TITLES, StagedFit, encode_webp, portrait_figure
-from shapespace.report.saved import Folder, read_fit, surfaces_of
+from shapespace.report.figures import encode_webp, portrait_figure
+from shapespace.report.saved import Folder, read_fit, staged_fit
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "demo.png"
 MOST_ROWS = 2
@@ -17,10 +17,8 @@ MOST_ROWS = 2
 
 def main(folder: Path) -> None:
     cases = json.loads((folder / "demo.json").read_text(encoding="utf-8"))["experiment2"]["cases"][:MOST_ROWS]
-    home, fits = Folder(folder), []
-    for case in cases:
-        scan, surfaces, forward, backward = surfaces_of(home, read_fit(home, case["fit"]), list(STAGE_TITLES))
-        fits.append(StagedFit(case["fit"]["name"], scan, surfaces, forward, backward))
+    home = Folder(folder)
+    fits = [staged_fit(home, read_fit(home, case["fit"])) for case in cases]
     figure = portrait_figure(fits, [case["short"] for case in cases], title="A raw scan becomes a short vector")
     data, _ = encode_webp(figure, lossless=True)
     picture = Image.open(io.BytesIO(data)).convert("RGB")

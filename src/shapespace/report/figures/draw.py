@@ -155,7 +155,8 @@ def grid(
         return height_of(wrapped, size)
 
     y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
-    for row in rows:
+    for r, row in enumerate(rows):
+        y += 10 if r and any(row.captions) and not row.heading else 0
         panels = row.panels if any(row.frames) else without_empty_rows(row.panels)
         high, wide = panels[0].shape[:2]
         left = (total_w - len(row.panels) * wide - (len(row.panels) - 1) * _GAP) // 2 if len(rows) == 1 else 0

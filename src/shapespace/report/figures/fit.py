@@ -197,7 +197,7 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
     low, high = _decades(every)
     edges = np.geomspace(low, high, bins + 1)
     figure, plots = charts(
-        title or f"{short(fit.label)}: closest distances both ways shrink from stage to stage",
+        title or f"{short(fit.label)}: closest distances both ways, stage by stage",
         [1.45] * len(both),
     )
     heights = {stage: [100 * _histogram(values, edges) for values in pair] for stage, pair in both.items()}
@@ -232,7 +232,7 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
 
 def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """Draw the RMS distance by iteration and phase."""
-    figure, axes = chart(title or f"{short(fit.label)}: how the RMS distance falls while the fit runs", height=3.0)
+    figure, axes = chart(title or f"{short(fit.label)}: the RMS distance from iteration to iteration", height=3.0)
     rms = np.array([moment.rms_mm for moment in fit.history], dtype=np.float64)
     phase = np.array([moment.phase for moment in fit.history], dtype=np.int64)
     usable = np.isfinite(rms)
