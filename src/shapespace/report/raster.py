@@ -252,3 +252,43 @@ def lit(
             if back[i]:
                 value = 0.4 * value + 0.02
             out[i, k] = min(max(value, 0.0), 1.0)
+
+
+@compiled
+def put_nearer(
+    pixel: npt.NDArray[np.int64],
+    colours: npt.NDArray[np.float32],
+    depth: npt.NDArray[np.float32],
+    out: npt.NDArray[np.float32],
+    nearest: npt.NDArray[np.float32],
+) -> None:
+    """Put `colours` (n, 3) of covered pixels (n,) into `out` (m, 3) where their `depth` (n,) is below `nearest` (m,)."""
+    for i in range(len(pixel)):
+        at = pixel[i]
+        if depth[i] < nearest[at]:
+            nearest[at] = depth[i]
+            for k in range(3):
+                out[at, k] = colours[i, k]
+
+
+@compiled
+def averaged(
+    samples: npt.NDArray[np.float32], supersample: int, srgb: npt.NDArray[np.uint8], out: npt.NDArray[np.uint8]
+) -> None:
+    """Fill in the mean of the samples of each pixel, as sRGB.
+
+    Args:
+        samples: (height * supersample, width * supersample, 3) linear colours in [0, 1].
+        supersample: samples per pixel and axis.
+        srgb: (65536,) value in sRGB of 65535 times a linear colour.
+        out: (height, width, 3), written.
+    """
+    share = 65535.0 / (supersample * supersample)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            for k in range(3):
+                total = 0.0
+                for i in range(supersample):
+                    for j in range(supersample):
+                        total += samples[row * supersample + i, column * supersample + j, k]
+                out[row, column, k] = srgb[int(min(max(total * share, 0.0), 65535.0))]

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.report.colours import CLAY, UNKNOWN_COLOUR, WHITE, Colour
-from shapespace.report.raster import interpolated, lit, nearest_balls, nearest_triangles
+from shapespace.report.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
@@ -262,9 +262,7 @@ def _composed(
     if all(opacity == 1 for *_, opacity in pieces):
         nearest = np.full(count, np.inf, dtype=np.float32)
         for colours, surfels, _ in pieces:
-            won = slice(None) if len(pieces) == 1 else surfels.depth_mm < nearest[surfels.pixel]
-            out[surfels.pixel[won]] = colours[won]
-            nearest[surfels.pixel[won]] = surfels.depth_mm[won]
+            put_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
     else:
         depths = np.full((len(pieces), count), np.inf, dtype=np.float32)
         paint = np.zeros((len(pieces), count, 3), dtype=np.float32)
@@ -277,13 +275,9 @@ def _composed(
         for which in order:
             share = np.where(np.isfinite(depths[which, at]), alpha[which], 0)[:, None]
             out += share * (paint[which, at] - out)
-    samples = out.reshape(height, supersample, width, supersample, 3)
-    mean = np.zeros((height, width, 3), dtype=np.float32)
-    for row in range(supersample):
-        for column in range(supersample):
-            mean += samples[:, row, :, column]
-    mean /= supersample**2
-    return _SRGB[(65535 * np.clip(mean, 0, 1)).astype(np.uint16)]
+    image = np.empty((height, width, 3), dtype=np.uint8)
+    averaged(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
+    return image
 
 
 def covered(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> tuple[IntArray, FloatArray]:
