@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -201,6 +200,7 @@ def test_with_a_token_nothing_is_answered_without_it(start: Start) -> None:
     assert drop(stranger, b"x").status_code == 401
     invited = viewer.stranger()
     assert invited.get("/?token=a-secret").status_code == 200
+    assert "token" not in invited.get("/?token=wrong%0d%0aSet-Cookie:x=y").headers.get("set-cookie", "")
     assert invited.get("/api/about").status_code == 200 and drop(invited, b"").status_code == 201
 
 
@@ -217,6 +217,9 @@ def test_other_pages_can_change_and_load_nothing(start: Start) -> None:
         assert visitor.put("/api/scans?name=a.ply", content=b"x", headers={"origin": origin}).status_code == 403
         assert visitor.post("/api/export?format=ply", json={"z": []}, headers={"origin": origin}).status_code == 403
     assert visitor.get("/api/model", headers={"sec-fetch-site": "cross-site"}).status_code == 403
+    for kind, status in (("document", 200), ("iframe", 403)):
+        headers = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate", "sec-fetch-dest": kind}
+        assert viewer.stranger().get("/", headers=headers).status_code == status
     own = {"origin": viewer.address, "sec-fetch-site": "same-origin"}
     assert visitor.put("/api/scans?name=a.ply", content=b"x", headers=own).status_code == 201
 
@@ -320,5 +323,10 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         assert answer.status_code == 422 and sentence(answer)
     saved = visitor.post("/api/export?format=ply", json={"fit": "a"})
     assert saved.content == (fits / "a.fitted.ply").read_bytes()
-    shutil.copy(fits / "a.fit.json", fits / "e.fit.json")
-    assert len(visitor.get("/api/fits").json()) == 5
+    record = json.loads((fits / "a.fit.json").read_text())
+    record["distances_mm"]["final"]["model_to_scan"]["mean"] = "far"
+    (fits / "e.fit.json").write_text(json.dumps(record | {"status": "<script>"}))
+    assert [(row["name"], row["status"]) for row in visitor.get("/api/fits").json()][:2] == [
+        ("d", "unreadable"),
+        ("e", "unreadable"),
+    ]

@@ -36,7 +36,7 @@ _LOOK_EVERY_S = 0.05
 
 DIED = "The fit ended unexpectedly, most likely for lack of memory; thin the scan and try again."
 TOO_LONG = "The fit took longer than {:.0f} minutes and was stopped; thin or crop the scan and try again."
-STOPPED = "The fit was stopped; drop the scan again to start anew."
+STOPPED = "It was stopped before it came to an end; drop the scan again to start anew."
 NO_PROCESS = "The system does not let a process for the fit start; close other programs and try again."
 
 

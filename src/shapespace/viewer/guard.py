@@ -55,15 +55,15 @@ class Guard:
         request = Request(scope)
         given = request.query_params.get("token", "")
         refused = self._refusal(request, given)
-        set_cookie = refused is None and self._token is not None and bool(given)
+        set_cookie = self._token is not None and same(given, self._token)
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in SECURITY_HEADERS.items():
                     headers[name] = value
-                if set_cookie:
-                    headers.append("Set-Cookie", cookie(self._cookie, given))
+                if set_cookie and self._token is not None:
+                    headers.append("Set-Cookie", cookie(self._cookie, self._token))
             await send(message)
 
         answer: Callable[[Scope, Receive, Send], object] = refused or self._app
@@ -104,8 +104,8 @@ def _from_own_page(headers: Headers, method: str) -> bool:
     site = headers.get("sec-fetch-site")
     if method in _CHANGING:
         return site in (None, "same-origin")
-    # A link to the page may stand anywhere, but no other page may load parts of it.
-    return site in (None, "same-origin", "none") or headers.get("sec-fetch-mode") == "navigate"
+    # A link to the page may stand anywhere, but no other page may load parts of it or hold it in a frame.
+    return site in (None, "same-origin", "none") or headers.get("sec-fetch-dest") == "document"
 
 
 def _host_name(host: str) -> str:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Message, Upload, Worker, converse, fit_upload
+from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, Upload, Worker, converse, fit_upload
 
 _HELPED_BY_LANDMARKS = ("doubtful", "failed", "max_iterations")
 
@@ -284,7 +284,8 @@ class Sessions:
             shutil.rmtree(scan.folder, ignore_errors=True)
             return
         if sentence is not None:
-            scan.tell({"event": "verdict", "status": "failed", "reason": sentence, "pictured": False})
+            status = "stopped" if sentence == STOPPED else "failed"
+            scan.tell({"event": "verdict", "status": status, "reason": sentence, "pictured": False})
         shown = any(message["event"] == "scan" for message in scan.events)
         verdict: Mapping[str, Any] = scan.events[-1]
         helped = self._with_landmarks and shown and verdict["status"] in _HELPED_BY_LANDMARKS

@@ -63,8 +63,10 @@ class Shown:
         folder = Folder(path)
         fits = find_fits(folder)
         found = model_of(folder, fits, model)
-        named = [str(cast(Mapping[str, Any], fit.record["model"]).get("name")) for fit in fits if "model" in fit.record]
-        return Shown(found, model.name if model else named[0], path)
+        sources = [
+            cast(Mapping[str, Any], fit.record["model"]) for fit in fits if isinstance(fit.record.get("model"), dict)
+        ]
+        return Shown(found, model.name if model else str(sources[0].get("name")), path)
 
     def packed_model(self) -> tuple[bytes, int]:
         """Return the model for the page, and how many of its modes that holds."""
@@ -145,13 +147,15 @@ class Shown:
             "fitted": "fitted" in fit.entry and fit.status not in ("failed", "unreadable"),
             "z": None,
         }
-        for key, direction in (("model_to_scan_mm", "model_to_scan"), ("scan_to_model_mm", "scan_to_model")):
-            row[key] = _number(fit.summary_mm("final", direction, "mean"))
-        if self._ours(fit) and "z" in fit.record:
-            try:
+        directions = {"model_to_scan_mm": "model_to_scan", "scan_to_model_mm": "scan_to_model"}
+        row |= dict.fromkeys(directions)
+        try:
+            row |= {key: _number(fit.summary_mm("final", direction, "mean")) for key, direction in directions.items()}
+            if self._ours(fit) and "z" in fit.record:
                 row["z"] = _rounded(fit.numbers("z"))
-            except ShapespaceError as error:
-                row |= {"status": "unreadable", "reason": str(error), "pictured": False}
+        except (ShapespaceError, TypeError, ValueError):
+            reason = f"The record of {fit.name} is damaged; fit the scan again."
+            row |= {"status": "unreadable", "reason": reason, "pictured": False}
         return row
 
 

@@ -299,7 +299,7 @@
       const options = { map: about.diverging, range, threshold: view.marked ? view.threshold : null };
       if (onModel) model.paint("model", values, options);
       else stage.a.paint("scan", values, options);
-      stage.bar({ map: about.diverging, range, unit: "mm", title: "Scan inside (\u2212) or outside (+) of the model" });
+      stage.bar({ map: about.diverging, range, unit: "mm", title: "Scan inside (\u2212) or outside (+)" });
       this.shared = { values, onModel };
     }
 

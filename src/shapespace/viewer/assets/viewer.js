@@ -8,7 +8,7 @@
   const SHOWN_AT_FIRST = 12;
   const STATUS = {
     converged: "You can trust this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
-    failed: "The scan could not be fitted", unreadable: "This result cannot be read",
+    failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
   };
   const LEFT_RED = [0.83, 0.25, 0.15];
 
@@ -210,7 +210,7 @@
       if (most > mapRange || most < mapRange / 4) mapRange = nice(Math.max(most, 0.1));
       const range = [-mapRange, mapRange];
       stage.a.paint("model", values, { map: about.diverging, range, changed: true });
-      stage.bar({ map: about.diverging, range, unit: "mm", title: "Moved inwards (\u2212) or outwards (+)" });
+      stage.bar({ map: about.diverging, range, unit: "mm", title: "Moved in (\u2212) or out (+)" });
     } else {
       stage.a.paint("model", null);
       stage.bar(null);
@@ -466,7 +466,7 @@
     if (!final) return null;
     const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
     const told = [
-      ["Model to scan", `${mm(final.model_to_scan.mean)} mean, ${mm(final.model_to_scan.p95)} for 95 %`],
+      ["Model to scan", `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`],
       ["Scan to model", `${mm(final.scan_to_model.mean)} mean over ${Math.round(100 * final.scan_to_model.fraction)} % of the scan`],
     ];
     return h("dl", { class: "facts" }, ...told.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
@@ -635,10 +635,20 @@
       } else if (told.event === "removed") source.close();
     });
     source.onerror = () => {
-      if (source.readyState === EventSource.CLOSED && own === mine && !mine.verdict) {
-        $("progress").hidden = true;
-        alertUser(UNREACHABLE);
-      }
+      // The browser tries again by itself; what matters is whether there is still a server, and still this scan.
+      setTimeout(guarded(async () => {
+        if (own !== mine || mine.verdict) return;
+        let known = null;
+        try {
+          known = (await json("/api/scans")).some((scan) => scan.id === mine.id);
+        } finally {
+          if (!known) {
+            source.close();
+            $("progress").hidden = true;
+          }
+        }
+        if (!known) throw new Error("The visit has ended, and its scans were removed; reload the page.");
+      }), 1500);
     };
   }
 
@@ -871,8 +881,8 @@
       depth = 0;
       $("cover").hidden = true;
       const files = Array.from(event.dataTransfer.files);
-      if (files.length > 1) alertUser("One scan at a time can be dropped; the first one is taken.");
       if (files[0]) dropFile(files[0]);
+      if (files.length > 1) alertUser(`One scan at a time can be dropped; ${files[0].name} is taken.`);
     });
     const earlier = await json("/api/scans");
     for (const facts of earlier) scansHere.set(facts.id, facts.name);
