@@ -262,7 +262,7 @@ def put_nearer(
     out: npt.NDArray[np.float32],
     nearest: npt.NDArray[np.float32],
 ) -> None:
-    """Put `colours` (n, 3) of covered pixels (n,) into `out` (m, 3) where their `depth` (n,) is below `nearest` (m,)."""
+    """Put `colours` (n, 3) of covered pixels (n,) into `out` (m, 3) where `depth` (n,) is below `nearest` (m,)."""
     for i in range(len(pixel)):
         at = pixel[i]
         if depth[i] < nearest[at]:

@@ -329,7 +329,7 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> tuple[bytes, tuple
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(pixels)).save(
-        stream, format="WEBP", lossless=lossless, quality=20 if lossless else 84, method=1 if lossless else 2
+        stream, format="WEBP", lossless=lossless, quality=20 if lossless else 78, method=1 if lossless else 3
     )
     return stream.getvalue(), (pixels.shape[1], pixels.shape[0])
 
