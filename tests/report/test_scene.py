@@ -207,6 +207,21 @@ def test_a_small_fit_is_small_and_true_where_it_has_points(staged: StagedFit) ->
             assert np.array_equal(arrays["regions"], staged.regions[nearest])
 
 
+@pytest.mark.parametrize("largest", [None, 400])
+def test_the_numbers_of_a_fit_are_of_all_its_vertices(staged: StagedFit, largest: int | None) -> None:
+    facts, arrays = unpack(scene.pack_fit(staged, largest_scan=largest))
+    for stage in staged.surfaces:
+        for key, given in (("model", staged.model_to_scan_mm[stage]), ("scan", staged.scan_to_model_mm[stage])):
+            known = np.abs(given[np.isfinite(given)])
+            assert facts["mean_mm"][stage][key] == pytest.approx(known.mean())
+            for k in (0, 2, 20, 100):
+                assert arrays[f"beyond_{key}_{stage}"][k] == pytest.approx((known > k / 10).mean(), abs=1e-6)
+    assert facts["region_shares"] == pytest.approx([(staged.regions == k).mean() for k in range(4)])
+    nothing = {stage: np.full_like(values, np.nan) for stage, values in staged.scan_to_model_mm.items()}
+    facts, _ = unpack(scene.pack_fit(replace(staged, scan_to_model_mm=nothing)))
+    assert facts["mean_mm"]["final"]["scan"] is None
+
+
 def test_a_fit_of_points_is_packed_without_triangles(staged: StagedFit) -> None:
     cloud = replace(staged, scan=Mesh(staged.scan.vertices, None))
     for largest in (None, 100):

@@ -177,8 +177,10 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
     """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
 
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
-    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed; `regions` (V,) codes; `b`, `z`, `b_stddev`
-    (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration` and `history_rms_mm` (n,).
+    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed; `beyond_model_STAGE` and
+    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes;
+    `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
+    and `history_rms_mm` (n,).
 
     Args:
         staged: a fit with its stages.
@@ -209,6 +211,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
         forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
         arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
         arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
+        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
+        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
     arrays |= {
         "regions": staged.regions[of_model].astype(np.uint8),
         "b": staged.b,
@@ -232,6 +236,11 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
         "status": staged.status,
         "reason": staged.reason,
         "stages": list(staged.surfaces),
+        "mean_mm": {
+            stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
+            for stage in staged.surfaces
+        },
+        "region_shares": (np.bincount(staged.regions, minlength=4) / max(len(staged.regions), 1)).tolist(),
         "scan_vertices": len(staged.scan.vertices),
         "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
@@ -455,6 +464,17 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     first = moved.argmin(axis=1)[:, None]
     moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
     return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
+
+
+def _mean(signed_mm: FloatArray) -> float:
+    known = np.abs(signed_mm[np.isfinite(signed_mm)])
+    return float(known.mean()) if len(known) else math.nan
+
+
+def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
+    known = np.sort(np.abs(signed_mm[np.isfinite(signed_mm)]))
+    within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
+    return (1.0 - within / max(len(known), 1)).astype(np.float32)
 
 
 def _matrix(T: Similarity) -> FloatArray:

@@ -293,6 +293,12 @@
     now.forEach((view) => view._draw());
   }
 
+  // Another resolution of the screen, or another theme behind the names.
+  const redrawAll = () => views.forEach((view) => view.request());
+  window.addEventListener("resize", redrawAll);
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawAll);
+  new MutationObserver(redrawAll).observe(document.documentElement, { attributes: true });
+
   // A view ----------------------------------------------------------------------------------------------------------
 
   const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws
@@ -312,8 +318,9 @@
     constructor(element, options) {
       const { label = "3-D picture", background = null, embedded = true } = options || {};
       this.element = element;
-      this.frames = 0;
-      this.lastRedrawMs = NaN;
+      this.frames = 0; // drawn so far
+      this.lastRedrawMs = NaN; // how long the last one kept the page busy
+      this.works = gpu() !== null; // false where there is no WebGL; then all methods do nothing
       this._background = background;
       this._embedded = embedded;
       this._things = new Map();
@@ -325,7 +332,6 @@
       this._home = null;
       this._near = true;
       this._size = [1, 1];
-      this.works = gpu() !== null;
       this.canvas = document.createElement("canvas");
       this.canvas.className = "shapespace-canvas";
       Object.assign(this.canvas.style, {
@@ -679,14 +685,14 @@
       if (page.bySoftware) {
         // What moves is drawn coarser, and again at twice the resolution once it rests.
         ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / area), 0.5));
-        this._later = setTimeout(() => this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area))), RESTS_MS);
+        this._later = setTimeout(() => this._near && this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area))), RESTS_MS);
       }
       this._present(ratio, wait);
     }
 
     _present(ratio, wait) {
       const page = gpu();
-      if (page.lost || this._disposed) return;
+      if (!page || page.lost || this._disposed) return;
       const width = Math.round(this._frame.clientWidth * ratio), height = Math.round(this._frame.clientHeight * ratio);
       if (width < 1 || height < 1) return;
       const start = performance.now();
@@ -1014,7 +1020,7 @@
       high[i % 3] = Math.max(high[i % 3], p[i]);
     }
     const sides = low.map((value, axis) => high[axis] - value).sort((a, b) => b - a);
-    return p.length ? Math.max(1.1 * Math.sqrt((sides[0] * sides[1]) / (p.length / 3)), 1e-3) : 1;
+    return p.length ? Math.max(1.4 * Math.sqrt((sides[0] * sides[1]) / (p.length / 3)), 1e-3) : 1;
   }
 
   function texture(map) {

@@ -310,34 +310,27 @@
         bar.hidden = beyond.row.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence(values()) : state.map === "regions" ? regions() : "";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : "";
         said.hidden = !said.textContent;
       }
 
-      function sentence(d) {
-        let known = 0, sum = 0, far = 0;
-        const threshold = state.threshold === null ? Infinity : state.threshold;
-        for (let v = 0; v < d.length; v++) {
-          if (!Number.isFinite(d[v])) continue;
-          known += 1;
-          sum += Math.abs(d[v]);
-          if (Math.abs(d[v]) > threshold) far += 1;
-        }
-        if (!known) return "No distance is known here.";
-        const mean = `Mean distance ${(sum / known).toFixed(2)} mm.`;
-        return state.threshold === null ? mean
-          : `${mean} ${((100 * far) / known).toFixed(far / known < 0.0995 ? 1 : 0)} % lie beyond ${state.threshold.toFixed(1)} mm.`;
+      // Figures are of all vertices, also where fewer are drawn.
+      function sentence() {
+        const known = facts.mean_mm[state.stage][state.map];
+        if (known === null) return "No distance is known here.";
+        const mean = `Mean distance ${known.toFixed(2)} mm.`;
+        if (state.threshold === null) return mean;
+        const share = 100 * arrays[`beyond_${state.map}_${state.stage}`][Math.round(10 * state.threshold)];
+        return `${mean} ${share.toFixed(share < 9.95 ? 1 : 0)} % lie beyond ${state.threshold.toFixed(1)} mm.`;
       }
 
       function regions() {
-        const counts = [0, 0, 0, 0];
-        for (const code of arrays.regions) counts[code] += 1;
-        return REGIONS.map((name, k) => `${REGION_WORDS[name]}: ${Math.round((100 * counts[k]) / arrays.regions.length)} %`)
-          .join("; ") + ".";
+        const words = REGIONS.map((name, k) => `${REGION_WORDS[name]}: ${Math.round(100 * facts.region_shares[k])} %`);
+        return `${words.join("; ")}.`;
       }
 
       const beyond = slider({
-        label: "Threshold", min: 0.2, max: Math.max(10, top), step: 0.1, value: Math.min(2, top),
+        label: "Threshold", min: 0.2, max: 10, step: 0.1, value: Math.min(2, top),
         show: (value) => `${value.toFixed(1)} mm`,
         input: (value) => {
           state.threshold = value;
@@ -392,7 +385,7 @@
         bar, legend, limit, beyond.row, said
       );
       if (facts.thinned) {
-        controls.append(make("p", { class: "ss-hint", text: "The scan is drawn with fewer points than it has." }));
+        controls.append(make("p", { class: "ss-hint", text: "Drawn with fewer triangles than there are; the numbers are of all." }));
       }
       paint();
       return { view, state };
