@@ -1,17 +1,24 @@
-"""A small demo folder as the demo writes it, on round heads of a few hundred vertices."""
+"""Folders as `shapespace fit` and the demo write them, on blobs of a few hundred vertices; each is made once."""
 
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from report_page import edit
 
+from shapespace.batch.run import fit_files, make_jobs
+from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import write_mesh
-from shapespace.types import Mesh, Similarity
+from shapespace.io.tables import write_rows
+from shapespace.types import Mesh
+from synthetic_shapes import blob_model, raw_scan, training_meshes
 
-STAGES = ("before", "initial", "final")
+VERTICES, MODES = 300, 4
+EVIL = "</script><script>alert(1)</script>"
 
 
 def make_head(n: int = 14) -> Mesh:
@@ -22,86 +29,51 @@ def make_head(n: int = 14) -> Mesh:
     return Mesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), name="head")
 
 
-def summary(values: np.ndarray) -> dict[str, float]:
-    return {
-        "mean": float(values.mean()),
-        "median": float(np.median(values)),
-        "rms": float(np.sqrt((values**2).mean())),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(values.max()),
-        "count": len(values),
-        "fraction": 1.0,
-    }
-
-
-def write_fit(root: Path, part: str, name: str, expression: str, level: float, modes: int = 4) -> dict[str, Any]:
-    rng = np.random.default_rng(len(name) + round(100 * level))
-    mesh = make_head()
-    assert mesh.faces is not None
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    T_scan_model = Similarity(0.5, turn, np.array([300.0, -20.0, 5.0]))
-    for folder in ("scans", "fits"):
-        (root / part / folder).mkdir(parents=True, exist_ok=True)
-    scan = T_scan_model.apply(mesh.vertices + rng.normal(0, 0.3, mesh.vertices.shape))
-    write_mesh(root / part / "scans" / f"{name}.ply", Mesh(scan, mesh.faces))
-    arrays: dict[str, Any] = {"faces": mesh.faces}
-    distances: dict[str, Any] = {}
-    for stage, size in zip(STAGES, (20.0, 4.0, 1.0), strict=True):
-        arrays[stage] = (T_scan_model.apply(mesh.vertices + np.array([size, 0, 0]))).astype(np.float32)
-        forward, backward = (np.abs(rng.normal(0, size, count)) for count in (len(mesh.vertices), 150))
-        arrays[f"model_to_scan_{stage}"], arrays[f"scan_to_model_{stage}"] = forward, backward
-        distances[stage] = {"model_to_scan": summary(forward), "scan_to_model": summary(backward)}
-    np.savez_compressed(root / part / "fits" / f"{name}.stages.npz", **arrays)
-    z = rng.normal(0, 1, modes) * (level + 0.1)
-    record = {
-        "format": "shapespace fit",
-        "scan": {"name": f"{name}.ply", "hash": "ab" * 32},
-        "model": {"name": "model.h5", "hash": "cd" * 32},
-        "status": "converged",
-        "reason": "The RMS closest distance stood still at 1.00 mm.",
-        "config": {"method": "paper", "max_iterations": 500},
-        "T_scan_model": {"scale": 0.5, "rotation": turn.tolist(), "translation": [300.0, -20.0, 5.0]},
-        "mm_per_scan_unit": 1.0,
-        "b": (z * np.arange(40, 40 - 5 * modes, -5)).tolist(),
-        "z": z.tolist(),
-        "distances_mm": distances,
-        "history": [
-            {"phase": 1 + k // 5, "iteration": k % 5, "rms_mm": 20.0 / (k + 1), "motion_mm": None} for k in range(10)
-        ],
-        "iterations": {"phase_1": 5, "phase_2": 5},
-        "seconds": {"phase_1": 0.1},
-    }
-    (root / part / "fits" / f"{name}.fit.json").write_text(json.dumps(record))
-    return {
-        "name": name,
-        "expression": expression,
-        "intensity": level,
-        "scan": f"{part}/scans/{name}.ply",
-        "json": f"{part}/fits/{name}.fit.json",
-        "stages": f"{part}/fits/{name}.stages.npz",
-        "vertex_error_mm": {"mean": 0.51, "rms": 0.6, "max": 2.0},
-        "floor_mm": {"mean": 0.21, "rms": 0.3, "max": 1.0},
-    }
+def write_fits(home: Path, names: Sequence[str], *, stages: bool = True, sub: str = "fits", **settings: Any) -> None:
+    """Write a model, scans and their fits below `home`."""
+    model = blob_model(VERTICES, MODES)
+    (home / "scans").mkdir(parents=True, exist_ok=True)
+    if not (home / "model.h5").exists():
+        model.save(home / "model.h5")
+    for k, name in enumerate(names):
+        z = np.random.default_rng(k).normal(0, 0.6, MODES + 1)
+        write_mesh(home / "scans" / f"{name}.ply", raw_scan(z, seed=k, vertices=500).scan)
+    scans = [home / "scans" / f"{name}.ply" for name in names]
+    config = FitConfig(**{"method": "paper", "max_iterations": 4, **settings})
+    fit_files(make_jobs(scans), model, home / "model.h5", home / sub, config, stages=stages)
 
 
 def write_demo(root: Path) -> dict[str, Any]:
-    mesh, rng = make_head(), np.random.default_rng(0)
+    """Write a small demo folder; its fits are too short to converge, so their records are made to say so."""
+    expressions = [("neutral", 0.0), *((name, level) for name in ("anger", "smile") for level in (0.5, 1.0))]
+    first = ["neutral" if not level else f"{name}_{round(100 * level):03}" for name, level in expressions]
+    entries: dict[str, dict[str, Any]] = {}
+    for part, names, labels in (
+        ("experiment1", first, expressions),
+        ("experiment2", ["stranger"], [("neutral", 0.0)]),
+    ):
+        write_fits(root / part, names)
+        for name, (expression, level) in zip(names, labels, strict=True):
+            base = f"{part}/fits/{name}"
+            record = json.loads((root / f"{base}.fit.json").read_text())
+            record.update(status="converged", reason="The RMS closest distance stood still at 1.00 mm.")
+            (root / f"{base}.fit.json").write_text(json.dumps(record))
+            entries[name] = {
+                "name": name,
+                "expression": expression,
+                "intensity": level,
+                "scan": f"{part}/scans/{name}.ply",
+                "json": f"{base}.fit.json",
+                "stages": f"{base}.stages.npz",
+                "vertex_error_mm": {"mean": 0.51, "rms": 0.6, "max": 2.0},
+                "floor_mm": {"mean": 0.21, "rms": 0.3, "max": 1.0},
+            }
     training = root / "experiment1" / "training"
-    training.mkdir(parents=True)
-    (root / "experiment2").mkdir()
+    training.mkdir()
     examples = []
-    for k in range(4):
-        write_mesh(training / f"{k:03}.ply", mesh.with_vertices(mesh.vertices * (1 + 0.02 * k)))
+    for k, mesh in enumerate(training_meshes(vertices=VERTICES)[:4]):
+        write_mesh(training / f"{k:03}.ply", mesh)
         examples.append({"file": f"experiment1/training/{k:03}.ply", "label": f"training {k}"})
-    for part in ("experiment1", "experiment2"):
-        np.savez_compressed(
-            root / part / "modes.npz",
-            mean=mesh.vertices,
-            faces=mesh.faces,
-            stddev=np.array([40.0, 35.0, 30.0, 25.0]),
-            basis5=rng.normal(0, 0.5, (4, *mesh.vertices.shape)),
-        )
-    cumulative = [0.6, 0.85, 0.96, 0.986, 0.995, 1.0]
     demo: dict[str, Any] = {
         "version": "0.1.0",
         "quick": True,
@@ -116,20 +88,12 @@ def write_demo(root: Path) -> dict[str, Any]:
         ],
         "experiment1": {
             "title": "Expressions of one person",
+            "model": "experiment1/model.h5",
             "n_training": 100,
             "modes_for_98_5": 4,
-            "cumulative_variance": cumulative,
             "training_examples": examples,
-            "mode_shapes": "experiment1/modes.npz",
-            "population_z": rng.normal(0, 1, (20, 4)).tolist(),
-            "fits": [
-                write_fit(root, "experiment1", "neutral", "neutral", 0.0),
-                *(
-                    write_fit(root, "experiment1", f"{name}_{round(100 * level):03}", name, level)
-                    for name in ("anger", "smile")
-                    for level in (0.5, 1.0)
-                ),
-            ],
+            "population_z": np.random.default_rng(0).normal(0, 1, (20, MODES)).tolist(),
+            "fits": [entries[name] for name in first],
             "scores": {
                 "left_out": [],
                 "line_spearman": {"anger": 1.0, "smile": 0.8},
@@ -140,13 +104,13 @@ def write_demo(root: Path) -> dict[str, Any]:
             "cases": [
                 {
                     "title": "Simulated scan of a stranger",
+                    "short": "stranger",
                     "simulated": True,
                     "note": "It has hair.",
+                    "model": "experiment2/model.h5",
                     "n_training": 100,
                     "modes_for_98_5": 40,
-                    "cumulative_variance": cumulative,
-                    "mode_shapes": "experiment2/modes.npz",
-                    "fit": write_fit(root, "experiment2", "stranger", "neutral", 0.0),
+                    "fit": entries["stranger"],
                 }
             ]
         },
@@ -165,3 +129,43 @@ def demo_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("demo")
     write_demo(root)
     return root
+
+
+@pytest.fixture(scope="session")
+def fits_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scans with labels, one of them a script; six fits in out/: two converged, one doubtful, one failed."""
+    root = tmp_path_factory.mktemp("fits")
+    write_fits(root, ["able", "baker", "charlie", "dog", "easy"], sub="out")
+    (root / "scans" / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
+    fit_files(
+        make_jobs([root / "scans" / "broken.ply"]), blob_model(VERTICES, MODES), root / "model.h5", root / "out",
+        FitConfig(method="paper"), stages=True,
+    )  # fmt: skip
+    for name, status in (("able", "converged"), ("baker", "converged"), ("charlie", "doubtful")):
+        edit(root / "out", lambda record, status=status: record.update(status=status), f"{name}.fit.json")
+    rows = [("able.ply", "calm", "0.5"), ("baker.ply", EVIL, "1"), ("charlie.ply", "calm", "1"), ("dog.ply", EVIL, "")]
+    write_rows(root / "scans" / "labels.csv", ("file", "expression", "intensity"), rows)
+    return root
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the drawing out, for tests of what stands around the pictures."""
+    from matplotlib.figure import Figure
+
+    from shapespace.report import figures
+
+    for name in figures.__all__:
+        if name.endswith(("_figure", "_grid", "_maps", "_matrix", "_3d", "_curves", "_histograms")) or name in (
+            "b_plane",
+            "b_space",
+            "gallery",
+        ):
+            monkeypatch.setattr(figures, name, lambda *_, **__: Figure(figsize=(1, 1), dpi=20))
+
+
+@pytest.fixture
+def fits(fits_template: Path, tmp_path: Path) -> Path:
+    """A copy of the folder of fits that may be damaged."""
+    shutil.copytree(fits_template, tmp_path / "work")
+    return tmp_path / "work" / "out"

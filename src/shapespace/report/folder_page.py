@@ -42,10 +42,12 @@ if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
 
 MOST_CARDS = 24
+MOST_EMPTY_CARDS = 6
 MOST_DETAILS = 3
 MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
+_WITHOUT_RESULT = ("failed", "unreadable")
 _FEWEST_POINTS = 20
 _ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
@@ -114,8 +116,7 @@ class FolderPage:
         """Return the page."""
         count = len(self.fits)
         name = self.folder.root.resolve().name
-        carded = self.fits[:MOST_CARDS]
-        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in carded}
+        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in self.carded()}
         self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main_fits()}
         parts = [
             Section("Summary", "Summary", self.summary),
@@ -147,6 +148,15 @@ class FolderPage:
             chosen += [others[k] for k in sorted({0, len(others) // 2})]
         return chosen
 
+    def carded(self) -> list[SavedFit]:
+        """Return the fits of the gallery; where not all have room, those without a result leave some to the others."""
+        if len(self.fits) <= MOST_CARDS:
+            return self.fits
+        empty = [fit for fit in self.fits if fit.status in _WITHOUT_RESULT]
+        rest = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT]
+        first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
+        return [*first, *rest[: MOST_CARDS - len(first)]]
+
     def summary(self) -> str:
         """Return what was fitted and how much of it is to be trusted."""
         counts = Counter(fit.status for fit in self.fits)
@@ -157,7 +167,8 @@ class FolderPage:
         methods = sorted({str(fit.record["method"]) for fit in self.fits if fit.record.get("method")})
         told = f"{counted(total, 'scan was', 'scans were')} fitted with {listed(models)}"
         told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
-        told += f"{counted(len(trusted), 'fit')} can be trusted as far as the fit itself can tell"
+        told += counted(len(trusted), "fit") if trusted else "None"
+        told += " can be trusted as far as the fit itself can tell"
         rest = [
             f"{counts[key]} {word}"
             for key, word in (
@@ -247,7 +258,7 @@ class FolderPage:
 
     def without_stages(self, problems: Sequence[str]) -> str:
         """Return why there are no pictures of the fit itself, what adds them, and stills of what there is."""
-        fitted = [fit for fit in self.fits if fit.status not in ("failed", "unreadable")]
+        fitted = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT]
         if not fitted:
             return paragraph("There is no fit to show.", "broken")
         model = _source(fitted[0], "model", "path") or "MODEL.h5"
@@ -273,7 +284,7 @@ class FolderPage:
             ),
             page.guarded("Every fit in numbers", self.numbers),
         ]
-        if sum(fit.status not in ("failed", "unreadable") for fit in self.fits) > 1:
+        if sum(fit.status not in _WITHOUT_RESULT for fit in self.fits) > 1:
             parts.append(page.guarded("The fits together", self.together))
         for fit in self.main_fits():
             parts.append(
@@ -285,7 +296,7 @@ class FolderPage:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
         from shapespace.report import stills
 
-        chosen = self.fits[:MOST_CARDS]
+        chosen = self.carded()
         sample, _ = sections.usable([fit for fit in chosen if fit.pictured], self.staged)
         good = [fit for fit in sample if fit.status == "converged"]
         limit = sections.common_limit_mm(good or sample)
@@ -296,7 +307,7 @@ class FolderPage:
                 if fit.pictured:
                     staged = self.staged(fit)
                     still, alt = stills.fit_strip(staged, limit), sections.strip_alt(staged, limit)
-                elif fit.entry.get("fitted") and fit.status not in ("failed", "unreadable"):
+                elif fit.entry.get("fitted") and fit.status not in _WITHOUT_RESULT:
                     still, alt = stills.mesh_still(self.posed(fit)), f"The fitted surface of {fit.name}"
                 else:
                     still, alt = stills.mesh_still(self.raw_scan(fit)), f"The raw scan {fit.name}, as its axes stand"
@@ -358,7 +369,7 @@ class FolderPage:
 
     def coefficients(self) -> list[SavedFit]:
         """Return the fits whose coefficients are to be compared: not the failed ones."""
-        return [fit for fit in self.fits if fit.status not in ("failed", "unreadable") and fit.record.get("b")]
+        return [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT and fit.record.get("b")]
 
     def together(self) -> str:
         """Return the coefficients of all fits against each other."""
@@ -387,7 +398,8 @@ class FolderPage:
 
     def settings(self) -> str:
         """Return settings that the fits share, versions and hashes."""
-        configs = [as_mapping(fit.record.get("config")) for fit in self.fits if fit.record.get("config")]
+        known = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT] or self.fits
+        configs = [as_mapping(fit.record.get("config")) for fit in known if fit.record.get("config")]
         rows: list[tuple[str, str]] = [("Report", f"shapespace {__version__}")]
         versions = sorted({str(fit.record["version"]) for fit in self.fits if fit.record.get("version")})
         if versions:

@@ -101,7 +101,7 @@ def table(
     kinds = " ".join(word for word, wanted in (("sortable", sortable), ("stack", stack)) if wanted)
     return (
         f'<div class="table" role="region" aria-label="{esc(caption)}" tabindex="0">'
-        f"<table{f' class={chr(34)}{kinds}{chr(34)}' if kinds else ''}><caption>{esc(caption)}</caption>"
+        f"<table{f' class={chr(34)}{kinds}{chr(34)}' if kinds else ''}><caption><span>{esc(caption)}</span></caption>"
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n"
     )
 

@@ -132,7 +132,14 @@ class Page:
         )
 
     def turning(
-        self, widget: Literal["modes", "fit", "scatter"], payload: bytes, poster: str, caption: str, *, label: str
+        self,
+        widget: Literal["modes", "fit", "scatter"],
+        payload: bytes,
+        poster: str,
+        caption: str,
+        *,
+        label: str,
+        still: str,
     ) -> str:
         """Return something that turns where the browser can, and is a still on paper and without a script.
 
@@ -142,6 +149,7 @@ class Page:
             poster: HTML of the still, from `image`.
             caption: of both.
             label: what it is, for screen readers.
+            still: what the still shows, told with it alone.
         """
         from shapespace.report import scene
 
@@ -151,16 +159,17 @@ class Page:
         text = scene.payload_html(name, payload)
         self.step(caption)
         if len(text) > self.left - _RESERVE_BYTES:
+            why = f"It does not turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB."
+            said = esc(f"{caption} {still} {why}")
             return (
-                f'<figure class="plain"><div class="plate">{poster}</div>\n<figcaption>{esc(caption)} It does not '
-                f"turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB.</figcaption></figure>\n"
+                f'<figure class="plain"><div class="plate">{poster}</div>\n<figcaption>{said}</figcaption></figure>\n'
             )
         self._spent += len(text)
         self._payloads.append(text)
         return (
             f'<figure class="turning"><div class="widget" data-widget="{widget}" data-payload="{name}" role="group" '
             f'aria-label="{esc(label)}"></div>\n<div class="plate poster">{poster}</div>\n'
-            f"<figcaption>{esc(caption)}</figcaption></figure>\n"
+            f'<figcaption>{esc(caption)} <span class="still">{esc(still)}</span></figcaption></figure>\n'
         )
 
     def html(self, title: str, lead: str, made: str, sections: Sequence[Section]) -> str:

@@ -129,8 +129,9 @@ def modes_to_move(page: Page, model: ShapeModel) -> str:
         "modes",
         pack_model(model, count),
         page.image(still.data, still.size, alt="The mean shape"),
-        f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand; the still shows the mean.",
+        f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand.",
         label="Modes of the model, one slider each",
+        still="The still shows the mean.",
     )
 
 
@@ -147,9 +148,10 @@ def fit_to_turn(page: Page, fit: StagedFit, limit_mm: float) -> str:
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
         page.image(still.data, still.size, alt=strip_alt(fit, limit_mm)),
-        f"{fit.label}: scan, model{' and dense surface' if 'dense' in fit.surfaces else ''}. The still shows the scan, "
-        f"both over each other, and the signed distance to the scan, −{limit_mm:g} (blue) to +{limit_mm:g} mm (red).",
+        f"{fit.label}: the scan, and the model at each stage.",
         label=f"Scan and model of {fit.label}, to be turned",
+        still="The still shows the scan, both over each other, and the signed distance to the scan, "
+        f"−{limit_mm:g} (blue) to +{limit_mm:g} mm (red).",
     )
 
 
@@ -307,10 +309,11 @@ def scale_key(page: Page, limit_mm: float) -> str:
     from shapespace.report import stills
 
     bar = stills.colour_bar()
+    colours = page.image(bar.data, bar.size, alt="from blue over pale to red")
     return (
         '<div class="key"><p>Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the '
         "nearer one shown; the distance from the model to the scan, one scale for all:</p>"
-        f'<p class="bar"><span>−{limit_mm:g} mm, scan inside</span>{page.image(bar.data, bar.size, alt="")}'
+        f'<p class="bar"><span>−{limit_mm:g} mm, scan inside</span>{colours}'
         f"<span>+{limit_mm:g} mm, scan outside</span></p></div>\n"
     )
 
@@ -451,8 +454,9 @@ def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> str:
             axes=[f"b{k + 1}" for k in range(first.shape[1])],
         ),
         page.image(data, size, alt=f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
-        "The first three coefficients in space, in mm; the boxes choose others.",
-        label="Scatter of b1, b2 and b3, to be turned",
+        "Coefficients of all fits in space, in mm.",
+        label="Scatter of three coefficients, to be turned",
+        still="The still shows the first three from two sides.",
     )
 
 
