@@ -12,10 +12,12 @@ import pytest
 from viewer_world import Start, drop, model, scan_file, sentence, start, told
 
 from shapespace.batch.run import Job, fit_file
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import Upload
+from shapespace.viewer.serve import listen, page_address, serve
 from shapespace.viewer.shown import Shown
 
 __all__ = ["model", "scan_file", "start"]
@@ -330,3 +332,37 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("d", "unreadable"),
         ("e", "unreadable"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("fits", "such as .*deep/er"), ("none.h5", "no such file"), ("a.ply", "no model"), ("empty", "no fits")],
+)
+def test_what_cannot_be_shown_is_one_sentence(name: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "fits" / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "fits" / "deep" / "er" / "a.fit.json").write_text("{}")
+    (tmp_path / "a.ply").write_text("ply")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ShapespaceError, match=says):
+        Shown.open(tmp_path / name)
+
+
+def test_a_taken_port_is_one_sentence_and_without_a_wish_the_next_one_is_found() -> None:
+    with listen("127.0.0.1", None) as first, listen("127.0.0.1", None) as second:
+        taken = first.getsockname()[1]
+        assert second.getsockname()[1] > taken
+        with pytest.raises(InputError, match=f"Port {taken} is taken"):
+            listen("127.0.0.1", taken)
+    for host, port in (("192.0.2.1", None), ("no such host", None), ("127.0.0.1", 99999)):
+        with pytest.raises(InputError, match=r"listen|used"):
+            listen(host, port)
+    assert page_address("::1", 1, None) == "http://[::1]:1/"
+    assert page_address("0.0.0.0", 1, "t").endswith(":1/?token=t")
+
+
+def test_without_its_packages_the_viewer_says_how_to_install_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[view\]'"):
+        serve(tmp_path)

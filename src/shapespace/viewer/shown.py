@@ -60,6 +60,8 @@ class Shown:
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
                 )
             return Shown(ShapeModel.load(path), path.name)
+        if not any(path.glob("*.fit.json")) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
+            raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
         folder = Folder(path)
         fits = find_fits(folder)
         found = model_of(folder, fits, model)

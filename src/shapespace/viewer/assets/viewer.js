@@ -809,10 +809,10 @@
     const names = h("div", { class: "names", role: "group", "aria-label": "Which landmark" }, ...about.landmarks.map((name) => h("button", {
       type: "button", class: placed.has(name) ? "placed" : "", "aria-pressed": String(name === mine.placing.current), "data-testid": `landmark-${name}`,
       onclick: () => { mine.placing.current = name; drawPlacing(); },
-    }, name)));
+    }, name.replace(/_/g, " "))));
     const missing = 3 - placed.size;
     $("placing").replaceChildren(
-      h("p", { role: "status", "data-testid": "placing-text" }, `Click ${mine.placing.current} on the scan. ${missing > 0 ? `${missing} more ${missing === 1 ? "is" : "are"} needed.` : "More landmarks make the start safer."}`),
+      h("p", { role: "status", "data-testid": "placing-text" }, `Click ${mine.placing.current.replace(/_/g, " ")} on the scan. ${missing > 0 ? `${missing} more ${missing === 1 ? "is" : "are"} needed.` : "More landmarks make the start safer."}`),
       names,
       h("div", { class: "row" },
         h("button", { type: "button", "data-testid": "undo", onclick: () => undo(mine) , disabled: placed.size === 0 }, "Undo"),
