@@ -66,12 +66,13 @@ def main() -> None:
         (folder / "package.json").write_text('{"private": true, "type": "module"}', encoding="utf-8")
         subprocess.run([npm, "install", "--silent", f"three@{THREE}", f"esbuild@{ESBUILD}"], cwd=folder, check=True)
         entry = f"export {{ {', '.join(NAMES)} }} from 'three/src/Three.js';"
-        banner = f"/* three.js {THREE}, MIT, https://threejs.org; a part, see README.md beside this file */"
+        licence = (folder / "node_modules/three/LICENSE").read_text(encoding="utf-8")
+        # The licence must travel with every copy, and pages hold this file without its folder.
+        banner = f"/* A part of three.js {THREE}, https://threejs.org\n\n{licence.strip()}\n*/"
         values = {"kept": json.dumps(KEPT_SHADERS), "entry": json.dumps(entry), "banner": json.dumps(banner)}
         (folder / "build.js").write_text(BUILD % values, encoding="utf-8")
         subprocess.run([node, "build.js"], cwd=folder, check=True)
         script = (folder / "three.min.js").read_bytes()
-        licence = (folder / "node_modules/three/LICENSE").read_text(encoding="utf-8")
     TARGET.mkdir(parents=True, exist_ok=True)
     (TARGET / "three.min.js").write_bytes(script)
     (TARGET / "LICENSE").write_text(licence, encoding="utf-8")
