@@ -3,6 +3,8 @@
 import json
 import os
 import time
+from collections.abc import Iterator
+from http.client import HTTPConnection
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -128,8 +130,22 @@ def test_scans_that_are_too_large_or_of_another_kind_are_refused(start: Start) -
     assert drop(visitor, b"x" * 1000).status_code == 201
     announced = drop(visitor, b"x" * 1001)
     assert announced.status_code == 413 and "larger than" in sentence(announced)
-    grown = visitor.put("/api/scans?name=a.ply", content=iter([b"x" * 600, b"x" * 600]))
+
+    def slowly() -> Iterator[bytes]:
+        for _ in range(2):
+            yield b"x" * 600
+            time.sleep(0.2)
+
+    grown = visitor.put("/api/scans?name=a.ply", content=slowly())
     assert grown.status_code == 413 and "larger than" in sentence(grown)
+    # Refused by what it announces, before any of it has come.
+    connection = HTTPConnection(viewer.address.removeprefix("http://"), timeout=10)
+    connection.putrequest("PUT", "/api/scans?name=a.ply")
+    connection.putheader("Content-Length", "1001")
+    connection.putheader("Cookie", "; ".join(f"{key}={value}" for key, value in visitor.cookies.items()))
+    connection.endheaders()
+    assert connection.getresponse().status == 413
+    connection.close()
     for name in ("a.exe", "a", "", "a.ply.html"):
         other = drop(visitor, b"x", name)
         assert other.status_code == 415 and ".ply" in sentence(other)
