@@ -155,7 +155,7 @@ def test_damaged_stages_and_records_cost_only_themselves(fits: Path, sketched: N
 
 
 @pytest.mark.parametrize("key", ["scan", "model", "config", "z", "b", "iterations", "seconds", "reason", "version"])
-@pytest.mark.parametrize("value", [None, 3, "text", [], {}, [None]])
+@pytest.mark.parametrize("value", [None, "text", [None]])
 def test_a_record_with_a_part_of_another_kind_never_stops_the_report(
     fits: Path, sketched: None, key: str, value: object
 ) -> None:
