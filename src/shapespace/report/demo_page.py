@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _NEEDED_BYTES = 1_500_000
 _PICTURES = 30
+_MODES_OF_A_CASE = 4
 
 
 class DemoPage:
@@ -301,9 +302,9 @@ class DemoPage:
             alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
         )
 
-    def modes(self, owner: Mapping[str, Any], paper: str) -> str:
+    def modes(self, owner: Mapping[str, Any], paper: str, to_move: int = sections.MODES_IN_WIDGET) -> str:
         """Return what the model is and does."""
-        return sections.model_part(self.page, self.model(owner), figure_of=paper)
+        return sections.model_part(self.page, self.model(owner), figure_of=paper, to_move=to_move)
 
     def test_faces(self, fits: Sequence[SavedFit]) -> str:
         """Return the scans of the test faces."""
@@ -349,9 +350,8 @@ class DemoPage:
         out = ""
         if self.page.left > _NEEDED_BYTES:
             out = self.page.tried(lambda: sections.fit_to_turn(self.page, staged, sections.common_limit_mm([staged])))
-        return (
-            out
-            + self.page.figure(
+        return out + sections.in_columns(
+            self.page.figure(
                 figures.overlay_figure(staged),
                 f"{paper}Where scan and model alternate finely, they coincide. Seen in the final pose's frame.",
                 alt=f"Scan and model of {label} over each other, before and after each phase; largest distance "
@@ -404,19 +404,20 @@ class DemoPage:
             )
             if neutral is None:
                 about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
-            out += self.page.figure(
+            pictures = self.page.figure(
                 figures.b_plane(scans, title="Test expressions in the first two coefficients", **lines),
                 f"Paper, figure 9. {about}",
                 alt=f"Scatter plot of b1 and b2 for {len(scans)} faces: each expression runs along its own line",
                 chart=True,
             )
             if all(len(scan.b) >= 3 for scan in scans):
-                out += self.page.figure(
+                pictures += self.page.figure(
                     figures.b_space(scans, title="The first three coefficients, from two sides", **lines),
                     "Paper, figure 10. Grey lines drop to the floor of the box.",
                     alt=f"Two views of b1, b2 and b3 for {len(scans)} faces with a line for each expression",
                 )
-                out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
+                out = self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
+            out = sections.in_columns(pictures) + out
         return out + sections.score_tables(
             scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
@@ -429,7 +430,7 @@ class DemoPage:
         if not shown:
             return absent
         chosen = [staged for _, staged in _strongest(shown)]
-        out = self.page.figure(
+        pictures = self.page.figure(
             figures.threshold_figure(chosen),
             "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the model's "
             "vertices within the limit.",
@@ -437,12 +438,12 @@ class DemoPage:
             + ", ".join(staged.label for staged in chosen),
         )
         every = chosen if self.quick else [staged for _, staged in shown]
-        out += self.page.figure(
+        pictures += self.page.figure(
             figures.distance_maps(every, title="The same distances on a finer scale"),
             "Distance from each model vertex to the scan, all on one scale.",
             alt="Distance maps on one scale for " + ", ".join(staged.label for staged in every),
         )
-        return out + absent
+        return sections.in_columns(pictures) + absent
 
     def convergence(self, fits: Sequence[SavedFit], owner: Mapping[str, Any], label: str | None = None) -> str:
         """Return RMS by iteration, and the coefficients against the population."""
@@ -467,7 +468,7 @@ class DemoPage:
                 alt="Bar chart of z: " + ", ".join(f"{value:.1f}" for value in staged.z[:10]),
                 chart=True,
             )
-        return out
+        return sections.in_columns(out)
 
     # Experiment 2
 
@@ -512,7 +513,7 @@ class DemoPage:
             ("Convergence and coefficients", lambda: self.convergence([fit], case, label)),
         ]
         if with_model and not self.quick:
-            parts.append(("The model", lambda: self.modes(case, "")))
+            parts.append(("The model", lambda: self.modes(case, "", _MODES_OF_A_CASE)))
         return out + "\n".join(self.page.guarded(heading, make, 4) for heading, make in parts)
 
     def case_maps(self, fit: SavedFit, label: str) -> str:
@@ -522,14 +523,17 @@ class DemoPage:
         staged = self.staged(fit, label)
         distances = np.abs(staged.model_to_scan_mm["final"])
         shares = [f"{100 * float((distances <= limit).mean()):.0f} % within {limit:g} mm" for limit in (2, 4, 6, 8, 10)]
-        return self.page.figure(
-            figures.threshold_figure([staged]),
-            "Paper, figure 11. Above each panel: share of the model's vertices within the limit.",
-            alt="Maps of the face: " + ", ".join(shares),
-        ) + self.page.figure(
-            figures.signed_maps(staged),
-            "Signed distances both ways: positive where the scan lies outside of the model.",
-            alt=f"Signed distance maps of {label}, model to scan and scan to model",
+        return sections.in_columns(
+            self.page.figure(
+                figures.threshold_figure([staged]),
+                "Paper, figure 11. Above each panel: share of the model's vertices within the limit.",
+                alt="Maps of the face: " + ", ".join(shares),
+            )
+            + self.page.figure(
+                figures.signed_maps(staged),
+                "Signed distances both ways: positive where the scan lies outside of the model.",
+                alt=f"Signed distance maps of {label}, model to scan and scan to model",
+            )
         )
 
     # The rest

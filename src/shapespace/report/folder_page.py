@@ -116,8 +116,9 @@ class FolderPage:
         """Return the page."""
         count = len(self.fits)
         name = self.folder.root.resolve().name
-        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in self.carded()}
         self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main_fits()}
+        if count > 1 or not self._details:
+            self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in self.carded()}
         parts = [
             Section("Summary", "Summary", self.summary),
             Section("The model", "Model", lambda: sections.model_part(self.page, self.model())),
@@ -204,7 +205,7 @@ class FolderPage:
             return ""
         items = ""
         for fit in bad[:_MOST_NAMED]:
-            place = self._cards.get(fit.name)
+            place = self._cards.get(fit.name) or self._details.get(fit.name)
             name = f'<a href="#{esc(place)}">{esc(fit.name)}</a>' if place else esc(fit.name)
             items += f"<li>{name}: {esc(_words_of(fit))}. {esc(fit.reason)}</li>"
         more = len(bad) - _MOST_NAMED
@@ -278,12 +279,11 @@ class FolderPage:
     def fits_part(self) -> str:
         """Return the gallery, the table, the fits together, and the main ones in detail."""
         page = self.page
-        parts = [
-            page.guarded(
-                "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first", self.gallery
-            ),
-            page.guarded("Every fit in numbers", self.numbers),
-        ]
+        parts: list[str] = []
+        if self._cards:
+            heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
+            parts.append(page.guarded(heading, self.gallery))
+        parts.append(page.guarded("Every fit in numbers", self.numbers))
         if sum(fit.status not in _WITHOUT_RESULT for fit in self.fits) > 1:
             parts.append(page.guarded("The fits together", self.together))
         for fit in self.main_fits():

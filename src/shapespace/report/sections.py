@@ -76,8 +76,15 @@ def in_columns(pictures: str) -> str:
 # The model
 
 
-def model_part(page: Page, model: ShapeModel, *, figure_of: str = "") -> str:
-    """Return what the model is and does: facts, modes to move by hand, modes as stills, spectrum."""
+def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: int = MODES_IN_WIDGET) -> str:
+    """Return what the model is and does: facts, modes to move by hand, modes as stills, spectrum.
+
+    Args:
+        page: that it goes to.
+        model: the shape space.
+        figure_of: said before the caption of the modes.
+        to_move: how many modes can be moved by hand.
+    """
     from shapespace.report import figures
 
     needed = [
@@ -95,7 +102,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "") -> str:
         ("Licence", model.licence or "not stated"),
     ]
     shown = min(5, model.n_modes)
-    out = facts(rows, caption="The shape model") + modes_to_move(page, model)
+    out = facts(rows, caption="The shape model") + modes_to_move(page, model, to_move)
     pictures = page.figure(
         figures.modes_figure(model, modes=shown),
         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each point "
@@ -117,13 +124,13 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "") -> str:
     return out + in_columns(pictures + sides)
 
 
-def modes_to_move(page: Page, model: ShapeModel) -> str:
+def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
     """Return the model's modes with sliders, as stills of the mean where nothing turns."""
     from shapespace.report import stills
     from shapespace.report.scene import pack_model
     from shapespace.types import Mesh
 
-    count = min(MODES_IN_WIDGET, model.n_modes)
+    count = min(most, model.n_modes)
     still = stills.mesh_still(Mesh(model.mean_vertices, model.faces, name="mean"), (420, 420))
     return page.turning(
         "modes",
@@ -391,7 +398,7 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
         if any(cell.text if cell.value is None else math.isfinite(cell.value) for cell in made)
     ]
     rows = [[made[k] for _, made in kept] for k in range(len(fits))]
-    return table([column for column, _ in kept], rows, caption=caption, sortable=True)
+    return table([column for column, _ in kept], rows, caption=caption, sortable=len(fits) > 1)
 
 
 def usable(fits: Sequence[SavedFit], load: Callable[[SavedFit], StagedFit]) -> tuple[list[StagedFit], list[str]]:
