@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib.util
 import secrets
+import signal
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -64,28 +66,59 @@ def serve(
     from shapespace.viewer.sessions import Limits
     from shapespace.viewer.shown import Shown
 
-    shown = Shown.open(path, model)
-    listening = listen(host, port)
-    taken = int(listening.getsockname()[1])
-    token = None if host in _LOOPBACK else secrets.token_urlsafe(24)
-    limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
-    app, sessions = make_app(shown, limits=limits, token=token, cookie_name=f"shapespace_{taken}")
-    address = page_address(host, taken, token)
-    say(f"The viewer is at {address}")
-    if token is not None:
-        say("Whoever has this address can use it, and the connection is not encrypted. Ctrl-C ends the viewer.")
-    else:
-        say("Ctrl-C ends the viewer.")
-    if open_browser:
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-    run(app, sessions, listening)
+    with _ended_by_sigterm():
+        shown = Shown.open(path, model)
+        listening = listen(host, port)
+        taken = int(listening.getsockname()[1])
+        token = None if host in _LOOPBACK else secrets.token_urlsafe(24)
+        limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
+        app, sessions = make_app(shown, limits=limits, token=token, cookie_name=f"shapespace_{taken}")
+        address = page_address(host, taken, token)
+
+        def started() -> None:
+            say(f"The viewer is at {address}")
+            if token is not None:
+                say("Whoever has this address can use it, and the connection is not encrypted.")
+            say("Ctrl-C ends the viewer.")
+            if open_browser:
+                threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+
+        run(app, sessions, listening, started)
 
 
-def run(app: object, sessions: Sessions, listening: socket.socket) -> None:
-    """Serve `app` until a signal ends it; scans and processes of visitors are gone when it returns."""
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Generator[None]:
+    """Let SIGTERM end the block as an exception does, so that temporary folders go."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def run(app: object, sessions: Sessions, listening: socket.socket, started: Callable[[], None]) -> None:
+    """Serve `app` until a signal ends it; scans and processes of visitors are gone when it returns.
+
+    Args:
+        app: the application.
+        sessions: its sessions.
+        listening: where it is served.
+        started: called when it answers.
+    """
     import uvicorn
 
     class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            started()
+
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             # Pages that watch a fit would otherwise hold the server up.
             sessions.closing = True

@@ -79,7 +79,11 @@ def make_app(
     """
     root = Path(tempfile.mkdtemp(prefix="shapespace-view-"))
     model_file = root / "model.h5"
-    shown.model.save(model_file)
+    try:
+        shown.model.save(model_file)
+    except BaseException:
+        shutil.rmtree(root, ignore_errors=True)
+        raise
     sessions = Sessions(
         root,
         model_file,
