@@ -67,6 +67,11 @@
       if (K <= 12 || k % 5 === 4 || k === 0) svg.append(draw("text", { x: x(k), y: H - 5, "text-anchor": "middle" }, String(k + 1)));
     }
     series.forEach((one, s) => {
+      if (one.name) {
+        const key = draw("g", { class: s ? "b" : "a" });
+        key.append(draw("circle", { cx: W - 92 + 52 * s, cy: 7, r: 4, class: s ? "hollow" : "" }));
+        svg.append(key, draw("text", { x: W - 84 + 52 * s, y: 11 }, one.name));
+      }
       const shift = series.length > 1 ? (s - 0.5) * Math.min(7, (W / K) * 0.35) : 0;
       for (let k = 0; k < Math.min(K, one.z.length); k++) {
         const group = draw("g", { class: s ? "b" : "a" });

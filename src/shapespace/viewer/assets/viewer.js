@@ -82,6 +82,18 @@
       $("pane-b").hidden = !two;
     }
 
+    /** What is seen as PNG; two views stand side by side. */
+    async picture() {
+      const views = $("pane-b").hidden ? [this.a] : [this.a, this.b];
+      const blobs = await Promise.all(views.map((view) => view.png()));
+      if (blobs.length === 1) return blobs[0];
+      const images = await Promise.all(blobs.map((blob) => createImageBitmap(blob)));
+      const canvas = h("canvas", { width: images[0].width + images[1].width, height: Math.max(images[0].height, images[1].height) });
+      const context = canvas.getContext("2d");
+      images.forEach((image, k) => context.drawImage(image, k * images[0].width, 0));
+      return new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+    }
+
     captions(a, b) {
       $("caption-a").textContent = a || "";
       $("caption-b").textContent = b || "";
@@ -317,13 +329,20 @@
     drawCompare(true);
   }
 
-  function drawCompare(changed) {
-    if (shown !== "compare") return;
+  /** Where the walk is: both shapes, their coefficients, those in between, and how far along. */
+  function onTheWay() {
     const [a, b] = pair();
     const K = about.modes, t = Number($("walk").value);
-    const za = Float64Array.from({ length: K }, (_, k) => a.z[k] || 0);
-    const zb = Float64Array.from({ length: K }, (_, k) => b.z[k] || 0);
-    const now = za.map((value, k) => value + t * (zb[k] - value));
+    const [za, zb] = [a, b].map((one) => {
+      const given = one.z;
+      return Float64Array.from({ length: K }, (_, k) => given[k] || 0);
+    });
+    return { a, b, za, zb, t, K, now: za.map((value, k) => value + t * (zb[k] - value)) };
+  }
+
+  function drawCompare(changed) {
+    if (shown !== "compare") return;
+    const { a, b, za, zb, t, K, now } = onTheWay();
     const from = $("difference").checked ? model.vertices(za).slice() : null;
     positions = model.vertices(now, positions);
     if (stage.holds !== "compare") {
@@ -358,7 +377,7 @@
       ["Most in", steps[most] ? `mode ${most + 1}, ${sign(steps[most])} standard deviations` : "no mode; they are equal"],
     ];
     $("compare-facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
-    Viewer.coefficientChart($("compare-chart"), [{ z: Array.from(za), name: a.name }, { z: Array.from(zb), name: b.name }], K);
+    Viewer.coefficientChart($("compare-chart"), [{ z: Array.from(za), name: "from" }, { z: Array.from(zb), name: "to" }], K);
   }
 
   function differenceRange(za, zb) {
@@ -434,6 +453,7 @@
     for (const id of ["compare-a", "compare-b"]) $(id).addEventListener("change", choose);
     $("walk").addEventListener("input", () => { stopWalk(); drawCompare(false); });
     $("walk-play").addEventListener("click", () => (walking ? stopWalk() : startWalk()));
+    $("walk-use").addEventListener("click", () => apply(onTheWay().now));
     $("difference").addEventListener("change", () => drawCompare(false));
     $("swap").addEventListener("click", () => {
       const [a, b] = [$("compare-a").value, $("compare-b").value];
@@ -957,7 +977,7 @@
       for (const view of [stage.a, stage.b]) if (view) view.request();
     });
     $("view-home").addEventListener("click", () => stage.a.reset());
-    $("picture").addEventListener("click", guarded(async () => save(await stage.a.png(), "shapespace.png")));
+    $("picture").addEventListener("click", guarded(async () => save(await stage.picture(), "shapespace.png")));
   }
 
   function ready() {
