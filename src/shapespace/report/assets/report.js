@@ -80,8 +80,14 @@
 
   // What turns builds itself when it comes near the window; the still stays where that fails, and for paper.
   for (const widget of document.querySelectorAll(".widget")) {
-    Promise.resolve(window.Shapespace.widgets[widget.dataset.widget](widget, widget.dataset.payload)).then((made) => {
-      widget.parentElement.classList.add(made && made.view && !made.view.failed ? "running" : "refused");
+    const parent = widget.parentElement;
+    window.Shapespace.widgets[widget.dataset.widget](widget, widget.dataset.payload).then((made) => {
+      if (made && made.view.works) return parent.classList.add("running");
+      const note = document.createElement("p");
+      note.className = "soft";
+      note.textContent = "It does not turn in this browser, which has no WebGL; the still shows the same.";
+      if (made) widget.replaceChildren(note);
+      parent.classList.add("refused");
     });
   }
 })();
