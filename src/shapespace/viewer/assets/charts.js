@@ -57,7 +57,7 @@
     const svg = canvas(element, W, H, `Coefficients in standard deviations${names ? `, ${names}` : ""}`);
     const x = (k) => left + ((W - left - right) * (k + 0.5)) / K;
     const y = (v) => top + ((H - top - bottom) * (reach - Math.max(-reach, Math.min(reach, v)))) / (2 * reach);
-    svg.append(draw("text", { x: 0, y: 11, class: "title" }, `Coefficients (standard deviations)${modes > K ? `, first ${K}` : ""}`));
+    svg.append(draw("text", { x: 0, y: 11, class: "title" }, `Coefficients${names ? "" : " (standard deviations)"}${modes > K ? `, first ${K}` : ""}`));
     svg.append(draw("rect", { x: left, y: y(1), width: W - left - right, height: y(-1) - y(1), class: "band" }));
     for (const value of [-reach, 0, reach]) {
       svg.append(draw("line", { x1: left, x2: W - right, y1: y(value), y2: y(value), class: "grid" }));
