@@ -42,7 +42,7 @@ def scan_free(vertices: np.ndarray, model: ShapeModel) -> Mesh:
     return Mesh(vertices, model.faces)
 
 
-def main() -> None:
+def draw() -> Image.Image:
     bench = Bench("dev")
     rows = [
         panels(bench.model("aligned200"), bench.scan("james", 0).mesh),
@@ -50,11 +50,15 @@ def main() -> None:
     ]
     picture = np.concatenate([np.full((44, rows[0].shape[1], 3), 255, dtype=np.uint8), *rows])
     image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image)
+    pen = ImageDraw.Draw(image)
     font = ImageFont.load_default(size=24)
     for i, title in enumerate(TITLES):
-        draw.text((i * SIZE[0] + SIZE[0] // 2, 24), title, fill=(40, 40, 40), font=font, anchor="mm")
-    image.save(ROOT / "docs" / "images" / "methods.png", optimize=True)
+        pen.text((i * SIZE[0] + SIZE[0] // 2, 24), title, fill=(40, 40, 40), font=font, anchor="mm")
+    return image
+
+
+def main() -> None:
+    draw().save(ROOT / "docs" / "images" / "methods.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,19 @@
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
+from contextlib import chdir
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from shapespace.cli import main
+from shapespace.datasets.faces import load_faces
+from shapespace.datasets.simulated_scan import Hair, Hole, simulate_scan
+from shapespace.io.meshes import write_mesh
 
 FLAGS = [
     "--no-sandbox",
@@ -61,6 +70,13 @@ class Tab:
         if not request.url.startswith(("file:", "data:", "blob:", "http://127.0.0.1", "http://localhost")):
             self.asked.append(request.url)
 
+    def until(self, expression: str, seconds: float = 120.0) -> None:
+        """Wait until `expression` is true; the page's own policy forbids what wait_for_function does."""
+        ends = time.monotonic() + seconds
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < ends, f"not within {seconds:.0f} s: {expression}"
+            self.page.wait_for_timeout(50)
+
     def shot(self, what: str, **options) -> Path:
         """Keep a screenshot for whoever looks at the run; return its path."""
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
@@ -85,3 +101,57 @@ def open_tab(browser, request):
     yield open_
     for context in contexts:
         context.close()
+
+
+WICKED = "</script><script>window.wicked = true</script>"
+"""A label that stays text."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A model of faces and fits by it, made by the command line."""
+
+    home: Path
+
+    @property
+    def model(self) -> Path:
+        return self.home / "model.h5"
+
+    @property
+    def fits(self) -> Path:
+        return self.home / "fits"
+
+    @property
+    def scan(self) -> Path:
+        return self.home / "scans" / "plain.ply"
+
+    @property
+    def broken(self) -> Path:
+        return self.home / "scans" / "broken.ply"
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    home = tmp_path_factory.mktemp("faces")
+    faces, rng = load_faces(), np.random.default_rng(11)
+    assert main(["data", "faces", "-o", str(home / "people"), "--subjects", "30", "--quiet"]) == 0
+    assert main(["build", str(home / "people"), "-o", str(home / "model.h5"), "--quiet"]) == 0
+    scans = home / "scans"
+    scans.mkdir()
+    damage = {"plain": {}, "holes": {"holes": (Hole(9.0), Hole(6.0))}, "hair": {"hair": Hair()}, "half": {"keep": 0.5}}
+    rows = ["file,subject,expression"]
+    for name, options in damage.items():
+        truth = faces.face(faces.draw_person(rng), name=name)
+        keep = options.pop("keep", None)
+        scan = simulate_scan(truth, rng, triangles=12_000, noise_mm=0.2, **options).scan
+        if keep is not None and scan.faces is not None:
+            x = scan.vertices[scan.faces].mean(axis=1)[:, 0]
+            scan = type(scan)(scan.vertices, scan.faces[x < np.quantile(x, keep)], name=name)
+        write_mesh(scans / f"{name}.ply", scan)
+        rows.append(f"{name}.ply,{name},{WICKED if name == 'hair' else 'neutral'}")
+    (scans / "labels.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (scans / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 12\nproperty float x\n")
+    fit = ["fit", "model.h5", "scans", "-o", "fits", "--stages", "--dense", "--jobs", "1", "--quiet"]
+    with chdir(home):  # so that no sentence holds a path of this machine
+        assert main(fit) == 1  # the broken one failed, the others went on
+    return World(home)

@@ -1,0 +1,263 @@
+"""The viewer as a visitor meets it: sliders, a dropped scan, a verdict, files to take away."""
+
+import base64
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pictures import change, drawn_share, same_as_kept
+
+from conftest import DESKTOP, PHONE, World
+from shapespace.batch.results import read_record
+from shapespace.cli import main
+from shapespace.io.meshes import read_mesh
+
+pytestmark = pytest.mark.xdist_group("browser")
+VERDICT_MS = 120_000
+
+
+def serve(*arguments: str) -> tuple[subprocess.Popen, str]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "shapespace", "view", *arguments, "--no-open", "--quiet"],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "http://127.0.0.1" in line, line
+    return process, line[line.index("http") :].strip()
+
+
+def end(process: subprocess.Popen, how: signal.Signals) -> None:
+    process.send_signal(how)
+    process.communicate(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def address(world: World) -> Iterator[str]:
+    process, found = serve(str(world.fits))
+    yield found
+    end(process, signal.SIGINT)
+    assert process.returncode in (0, 130)
+
+
+def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    process, _ = serve(str(world.model))
+    assert list(tmp_path.glob("shapespace-view-*"))
+    end(process, signal.SIGTERM)
+    assert not list(tmp_path.glob("shapespace-view-*"))
+
+
+def ready(tab, part: str = "model"):
+    tab.until("window.shapespaceReady === true")
+    tab.page.get_by_test_id(f"tab-{part}").click()
+    return tab
+
+
+def view(tab) -> bytes:
+    tab.page.wait_for_timeout(500)  # what is drawn coarsely while it moves is drawn finely at rest
+    return tab.page.get_by_test_id("view").screenshot()
+
+
+def slide(tab, mode: int, value: float) -> None:
+    tab.page.get_by_test_id(f"mode-{mode}").evaluate(
+        "(e, v) => { e.value = v; e.dispatchEvent(new Event('input', {bubbles: true})); }", value
+    )
+
+
+def drop(tab, path: Path) -> None:
+    data = tab.page.evaluate_handle(
+        """([name, content]) => { const t = new DataTransfer();
+        t.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name)); return t; }""",
+        [path.name, base64.b64encode(path.read_bytes()).decode()],
+    )
+    for event in ("dragenter", "dragover", "drop"):
+        tab.page.dispatch_event("body", event, {"dataTransfer": data})
+
+
+def verdict(tab) -> str:
+    card = tab.page.get_by_test_id("scan-status")
+    card.wait_for(state="visible", timeout=VERDICT_MS)
+    return card.get_attribute("data-status")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_the_model_is_shown_and_a_slider_changes_it(open_tab, address: str, viewport: dict, scheme: str) -> None:
+    tab = ready(open_tab(address, viewport, scheme))
+    mean = view(tab)
+    assert drawn_share(mean) > 0.1
+    slide(tab, 1, 3.0)
+    moved = view(tab)
+    assert change(mean, moved) > 0.01
+    tab.shot(f"{viewport['width']}-{scheme}")
+    assert tab.page.get_by_test_id("value-1").inner_text().lstrip("+").startswith("3.0")
+    tab.page.get_by_test_id("reset-all").click()
+    assert change(mean, view(tab)) < 0.002
+    assert tab.complaints == []
+    assert tab.asked == []
+
+
+def test_a_slider_moves_by_the_keyboard(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    mean = view(tab)
+    tab.page.get_by_test_id("mode-2").focus()
+    for _ in range(20):
+        tab.page.keyboard.press("ArrowRight")
+    assert change(mean, view(tab)) > 0.002
+
+
+def test_the_map_of_displacement_is_painted(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    slide(tab, 1, 2.0)
+    plain = view(tab)
+    tab.page.get_by_test_id("map").check()
+    assert change(plain, view(tab)) > 0.05
+    assert "mm" in tab.page.get_by_test_id("colour-bar").inner_text()
+
+
+def test_random_shapes_differ_and_reset_comes_home(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    mean = view(tab)
+    tab.page.get_by_test_id("random").click()
+    first = view(tab)
+    tab.page.get_by_test_id("random").click()
+    assert change(first, view(tab)) > 0.01
+    tab.page.get_by_test_id("reset-all").click()
+    assert change(mean, view(tab)) < 0.002
+
+
+def test_exports_are_the_shape_that_is_shown(open_tab, address: str, world: World, tmp_path: Path) -> None:
+    tab = ready(open_tab(address))
+    slide(tab, 1, 2.0)
+    from shapespace.model.shape_model import ShapeModel
+
+    model = ShapeModel.load(world.model)
+    wanted = model.reconstruct(np.array([2.0 * model.stddev[0]]))
+    for kind in ("ply", "obj", "stl"):
+        with tab.page.expect_download() as waiting:
+            tab.page.get_by_test_id("panel-model").get_by_test_id(f"export-{kind}").click()
+        waiting.value.save_as(tmp_path / f"s.{kind}")
+        mesh = read_mesh(tmp_path / f"s.{kind}")
+        if kind != "stl":
+            assert np.allclose(mesh.vertices, wanted, atol=1e-3)
+        assert np.allclose(mesh.vertices.max(axis=0), wanted.max(axis=0), atol=1e-3)
+    with tab.page.expect_download() as waiting:
+        tab.page.get_by_test_id("panel-model").get_by_test_id("export-csv").click()
+    waiting.value.save_as(tmp_path / "s.csv")
+    rows = list(csv.reader(io.StringIO((tmp_path / "s.csv").read_text())))
+    assert any("2" in cell for row in rows for cell in row)
+    with tab.page.expect_download() as waiting:
+        tab.page.get_by_test_id("export-png").click()
+    waiting.value.save_as(tmp_path / "s.png")
+    assert drawn_share(tmp_path / "s.png") > 0.1
+
+
+def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    tab.page.get_by_test_id("tab-fits").click()
+    rows = tab.page.get_by_test_id("fit")
+    rows.first.wait_for()
+    assert rows.first.get_attribute("data-name") == "broken"
+    tab.page.get_by_test_id("next-doubtful").click()
+    assert "broken" in tab.page.get_by_test_id("fit-detail").inner_text()
+    tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
+    tab.page.wait_for_timeout(800)
+    shown = view(tab)
+    assert drawn_share(shown) > 0.1
+    tab.shot("holes")
+    tab.page.get_by_test_id("fit-moment").evaluate("e => { e.value = 0; e.dispatchEvent(new Event('input', {bubbles: true})); }")
+    assert change(shown, view(tab)) > 0.01
+    assert tab.complaints == []
+
+
+def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
+    open_tab, address: str, world: World, tmp_path: Path
+) -> None:
+    tab = ready(open_tab(address))
+    drop(tab, world.scan)
+    assert verdict(tab) == "converged"
+    tab.page.wait_for_timeout(800)
+    assert drawn_share(view(tab)) > 0.1
+    tab.shot("verdict")
+    with tab.page.expect_download() as waiting:
+        tab.page.get_by_test_id("scan-record").click()
+    waiting.value.save_as(tmp_path / "dropped.fit.json")
+    assert main(["fit", str(world.model), str(world.scan), "-o", str(tmp_path / "cli"), "--quiet"]) == 0
+    here, there = json.loads((tmp_path / "dropped.fit.json").read_text()), read_record(tmp_path / "cli/plain.fit.json")
+    assert here["b"] == there["b"]
+    assert here["status"] == there["status"]
+    assert tab.complaints == []
+
+
+def test_a_broken_file_gives_one_sentence_and_the_page_goes_on(open_tab, address: str, world: World) -> None:
+    tab = ready(open_tab(address))
+    drop(tab, world.broken)
+    assert verdict(tab) == "failed"
+    said = tab.page.get_by_test_id("scan-status").inner_text()
+    assert "broken.ply" in said
+    assert "Traceback" not in said
+    tab.shot("sentence")
+    drop(tab, world.scan)
+    tab.until("document.querySelector('[data-testid=scan-status]')?.dataset.status === 'converged'")
+
+
+def test_what_is_no_scan_is_refused_in_a_sentence(open_tab, address: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("not a scan")
+    tab = ready(open_tab(address))
+    drop(tab, tmp_path / "notes.txt")
+    message = tab.page.get_by_test_id("message")
+    message.wait_for(state="visible")
+    assert "notes.txt" in message.inner_text()
+
+
+def test_a_reload_keeps_ones_own_scans_and_nobody_elses(open_tab, address: str, world: World) -> None:
+    tab, other = ready(open_tab(address)), ready(open_tab(address))
+    drop(tab, world.scan)
+    assert verdict(tab) == "converged"
+    tab.page.reload()
+    ready(tab)
+    tab.page.get_by_test_id("tab-scan").click()
+    assert verdict(tab) == "converged"
+    other.page.get_by_test_id("tab-scan").click()
+    other.page.wait_for_timeout(500)
+    assert "plain.ply" not in other.page.locator("body").inner_text()
+
+
+@pytest.fixture(scope="module")
+def people(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A viewer of a model of 200 ICT people."""
+    from shapespace.datasets.ict import landmark_vertices, load_ict
+    from shapespace.model.shape_model import ShapeModel
+
+    ict = load_ict(shared_data / "ict-facekit")
+    meshes = [ict.mesh(c, name=f"{i}") for i, c in enumerate(ict.draw_people(200, seed=1))]
+    path = tmp_path_factory.mktemp("ict") / "people.h5"
+    ShapeModel.fit(meshes, modes=None, landmarks=landmark_vertices("face")).save(path)
+    process, found = serve(str(path))
+    yield found
+    end(process, signal.SIGINT)
+
+
+def test_james_is_dropped_and_judged(open_tab, people: str, shared_data: Path) -> None:
+    tab = ready(open_tab(people, {"width": 1200, "height": 720}))
+    drop(tab, shared_data / "james" / "james.obj")
+    assert verdict(tab) in ("converged", "doubtful")
+    tab.page.wait_for_timeout(1500)
+    assert drawn_share(view(tab)) > 0.1
+    tab.shot("overlaid")
+    panel = tab.page.get_by_test_id("scan-detail")
+    panel.locator("[data-value=side]").click()
+    panel.locator("[data-value=model]").click()
+    tab.page.get_by_test_id("panel-scan").evaluate("e => { e.scrollTop = 0; e.parentElement.scrollTop = 0; }")
+    tab.page.wait_for_timeout(1500)
+    same_as_kept("viewer.png", tab.shot("readme"))
+    assert tab.complaints == []
