@@ -18,7 +18,7 @@ from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
 MODEL_BYTES = 48 * 2**20
-"""Modes beyond this size in the browser are left out, and the page says so."""
+"""Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
 
