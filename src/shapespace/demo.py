@@ -39,7 +39,7 @@ from shapespace.datasets.simulated_scan import (
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.files import atomic_path, make_folder, write_text
+from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.line_structure import disjointness, line_scores
@@ -197,7 +197,6 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         "modes_for_98_5": n_modes,
         "cumulative_variance": everything.cumulative_variance[:20].tolist(),
         "training_examples": examples,
-        "mode_shapes": _write_modes(folder, "experiment1/modes.npz", model),
         "population_z": _population_z(model, training),
         "fits": fits,
         "scores": scores,
@@ -310,7 +309,6 @@ def _case(
         "n_modes": model.n_modes,
         "modes_for_98_5": model.modes_for_variance(_PAPER_VARIANCE),
         "cumulative_variance": model.cumulative_variance.tolist(),
-        "mode_shapes": _write_modes(folder, f"experiment2/{model_name}_modes.npz", model),
         "fit": fits[0],
     }
 
@@ -387,22 +385,6 @@ def _floor(model: ShapeModel, scan: SimulatedScan) -> dict[str, float]:
     best = model.reconstruct(model.project(scan.truth_vertices))
     T_scan_model = fit_similarity(best, scan.truth_vertices)
     return _vertex_error(T_scan_model.apply(best), scan)
-
-
-def _write_modes(folder: Path, name: str, model: ShapeModel) -> str:
-    """Write mean and first five modes for figures; return `name`."""
-    first = min(5, model.n_modes)
-    modes = (model.basis[:, :first] * model.stddev[:first]).T.reshape(first, -1, 3)
-    arrays: dict[str, Any] = {
-        "mean": model.mean_vertices.astype(np.float32),
-        "basis5": modes.astype(np.float32),
-        "stddev": model.stddev,
-    }
-    if model.faces is not None:
-        arrays["faces"] = model.faces
-    with atomic_path(folder / name) as temporary:
-        np.savez_compressed(temporary, **arrays)
-    return name
 
 
 def _population_z(model: ShapeModel, training: Sequence[Mesh]) -> list[list[float]]:

@@ -22,6 +22,7 @@ from shapespace.io.meshes import read_mesh
 
 pytestmark = pytest.mark.xdist_group("browser")
 VERDICT_MS = 120_000
+MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 
 
 def serve(*arguments: str) -> tuple[subprocess.Popen, str]:
@@ -68,9 +69,7 @@ def view(tab) -> bytes:
 
 
 def slide(tab, mode: int, value: float) -> None:
-    tab.page.get_by_test_id(f"mode-{mode}").evaluate(
-        "(e, v) => { e.value = v; e.dispatchEvent(new Event('input', {bubbles: true})); }", value
-    )
+    tab.page.get_by_test_id(f"mode-{mode}").evaluate(MOVE, value)
 
 
 def drop(tab, path: Path) -> None:
@@ -174,7 +173,9 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     shown = view(tab)
     assert drawn_share(shown) > 0.1
     tab.shot("holes")
-    tab.page.get_by_test_id("fit-moment").evaluate("e => { e.value = 0; e.dispatchEvent(new Event('input', {bubbles: true})); }")
+    tab.page.get_by_test_id("fit-moment").evaluate(
+        "e => { e.value = 0; e.dispatchEvent(new Event('input', {bubbles: true})); }"
+    )
     assert change(shown, view(tab)) > 0.01
     assert tab.complaints == []
 

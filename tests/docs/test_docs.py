@@ -9,6 +9,7 @@ import io
 import re
 import shlex
 import tomllib
+import webbrowser
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -28,8 +29,8 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NEEDS_DATA = "<!-- needs data -->"
-# The demo takes minutes and has tests of its own; here its arguments are parsed only.
-PARSED_ONLY = ("demo",)
+# The demo takes minutes and the viewer runs until it is stopped; both have tests of their own. Here they are parsed.
+PARSED_ONLY = ("demo", "view")
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ def run(document: Path, *, with_data: bool) -> int:
             argv = arguments(command)
             if argv[0] in PARSED_ONLY:
                 cli.parser().parse_args(argv)
+                count += 1
                 continue
             with contextlib.redirect_stdout(io.StringIO()):
                 assert cli.main(argv) == 0, f"{where}: {command}"
@@ -111,6 +113,7 @@ def run(document: Path, *, with_data: bool) -> int:
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty current folder, without open data unless a test names them."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(webbrowser, "open", lambda _: True)
     for name in ("SHAPESPACE_DATA", "SHAPESPACE_DATA_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "cache"))

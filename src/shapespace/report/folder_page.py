@@ -121,7 +121,7 @@ class FolderPage:
             self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in self.carded()}
         parts = [
             Section("Summary", "Summary", self.summary),
-            Section("The model", "Model", lambda: sections.model_part(self.page, self.model())),
+            Section("The model", "Model", self.model_part),
             Section("The fits", "Fits", self.fits_part),
         ]
         if (self.folder.root / "recognition.json").is_file():
@@ -136,6 +136,13 @@ class FolderPage:
             f"Made by shapespace {__version__} from the files in {name}.",
             parts,
         )
+
+    def model_part(self) -> str:
+        """Return the model, with what quality.json says of it where there is such a file."""
+        out = sections.model_part(self.page, self.model())
+        if (self.folder.root / "quality.json").is_file():
+            out += self.page.tried(lambda: sections.quality_part(self.page, self.folder.json("quality.json")))
+        return out
 
     def main_fits(self) -> list[SavedFit]:
         """Return the fits shown with every picture: the worst doubtful one, the worst and the median of the others."""

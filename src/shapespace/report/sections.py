@@ -124,6 +124,19 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
     return out + in_columns(pictures + sides)
 
 
+def quality_part(page: Page, quality: Mapping[str, Any]) -> str:
+    """Return how good the shape space is by its number of modes, from the measures of it that are there."""
+    from shapespace.report import figures
+
+    return page.figure(
+        figures.quality_figure(quality),
+        "Compactness: share of the variance. Generalisation: error on shapes left out. Specificity: distance of random "
+        "shapes from the nearest training shape.",
+        alt="Compactness, generalisation and specificity by the number of modes, those of them that were measured",
+        chart=True,
+    )
+
+
 def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
     """Return the model's modes with sliders, as stills of the mean where nothing turns."""
     from shapespace.report import stills
@@ -134,7 +147,7 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
     still = stills.mesh_still(Mesh(model.mean_vertices, model.faces, name="mean"), (420, 420))
     return page.turning(
         "modes",
-        pack_model(model, count),
+        pack_model(model, count, small=True),
         page.image(still.data, still.size, alt="The mean shape"),
         f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand.",
         label="Modes of the model, one slider each",

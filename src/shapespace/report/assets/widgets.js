@@ -277,9 +277,10 @@
       const { facts, arrays } = unpacked;
       const { view, controls } = stage(element, `Scan and fitted model of ${facts.label || facts.name}`);
       const stages = facts.stages;
-      const state = { stage: stages.includes("dense") ? "dense" : "final", map: "none", threshold: null };
+      // How far the fit lies from the scan is what one looks for first.
+      const state = { stage: "final", map: "model", threshold: null };
       const scanShown = { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan };
-      view.setSurface("scan", { ...scanShown, opacity: 0.5 });
+      view.setSurface("scan", { ...scanShown, opacity: 0.5, visible: false });
       view.setSurface("model", {
         positions: arrays[`surface_${state.stage}`], faces: arrays.faces || null, colour: colours().model,
       });
@@ -350,7 +351,7 @@
           },
         });
         const box = make("input", { type: "checkbox", "aria-label": `Show ${name.toLowerCase()}` });
-        box.checked = true;
+        box.checked = opacity > 0;
         box.addEventListener("change", () => {
           if (box.checked && row.get() === 0) row.put(100);
           view.set(id, { visible: box.checked, opacity: row.get() / 100 });
@@ -365,7 +366,7 @@
           view.set(id, { visible: percent > 0, opacity: percent / 100 });
         } };
       };
-      const scan = layer("scan", "Scan", 50), model = layer("model", "Model", 100);
+      const scan = layer("scan", "Scan", 0), model = layer("model", "Model", 100);
       controls.append(
         choice("Stage", stages.map((name) => [name, STAGES[name] || name]), state.stage, (name) => {
           state.stage = name;
@@ -375,7 +376,7 @@
         make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, scan.row, model.row),
         select("Colour", [
           ["none", "plain"], ["model", "distance, model to scan"], ["scan", "distance, scan to model"], ["regions", "what the fit used"],
-        ], "none", (key) => {
+        ], state.map, (key) => {
           state.map = key;
           // The coloured surface is seen alone; the sliders bring the other one back.
           scan.show(key === "scan" ? 100 : key === "none" ? 50 : 0);

@@ -448,6 +448,10 @@ def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
 
 
+_MEDIANS = 5.0
+"""Of the distances, at which a scale ends at the latest; beyond it lie gaps and what is no part of the object."""
+
+
 def nice_ceiling(value: float) -> float:
     """Return a round number at or a little above `value`, 1 where that is not positive."""
     if not (value > 0 and np.isfinite(value)):
@@ -455,6 +459,14 @@ def nice_ceiling(value: float) -> float:
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
     return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
+
+
+def scale_end(distances_mm: FloatArray) -> float:
+    """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
+    known = np.abs(distances_mm[np.isfinite(distances_mm)])
+    if not len(known):
+        return 1.0
+    return nice_ceiling(min(float(np.percentile(known, 97)), _MEDIANS * float(np.median(known))))
 
 
 def mm(value: float) -> str:

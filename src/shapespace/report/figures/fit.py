@@ -38,8 +38,8 @@ from shapespace.report.figures.draw import (
     grid,
     legend,
     mm,
-    nice_ceiling,
     percent,
+    scale_end,
     scan_over,
     short,
     surroundings,
@@ -119,7 +119,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
     surface = _surface(fit, stage)
     forward, backward = fit.model_to_scan_mm[stage], fit.scan_to_model_mm[stage]
     if limit_mm is None:
-        limit_mm = nice_ceiling(float(np.percentile(np.concatenate([absolute(forward), absolute(backward)]), 95)))
+        limit_mm = scale_end(np.concatenate([forward, backward]))
     if not limit_mm > 0:
         raise InputError(f"The limit of a scale must be positive, not {limit_mm!r} mm.")
     on_model, on_scan = (

@@ -31,6 +31,7 @@ from shapespace.report.figures.draw import (
     mm,
     nice_ceiling,
     plain,
+    scale_end,
     scan_over,
     short,
     surroundings,
@@ -467,7 +468,7 @@ def portrait_figure(
     """
     if not fits:
         raise InputError(f"{plain(title)}: there is no fit to draw.")
-    top = nice_ceiling(float(np.percentile(np.concatenate([absolute(f.model_to_scan_mm["final"]) for f in fits]), 97)))
+    top = scale_end(np.concatenate([f.model_to_scan_mm["final"] for f in fits]))
     rows: list[Row] = []
     for k, fit in enumerate(fits):
         seen = view(surroundings(fit), 4, yaw_deg=yaw_deg)
