@@ -65,7 +65,9 @@ def test_record_and_stages_hold_it(dense: Path) -> None:
     with np.load(dense / "raw_0.stages.npz") as arrays:
         assert arrays["dense"].shape == arrays["final"].shape
         assert arrays["seen_dense"].dtype == np.bool_ and arrays["seen_dense"].mean() > 0.9
-        assert np.allclose(arrays["dense"], read_mesh(dense / "raw_0.dense.ply").vertices, atol=1e-2)
+        T = record["T_scan_model"]
+        in_scan = T["scale"] * arrays["dense"] @ np.array(T["rotation"]).T + np.array(T["translation"])
+        assert np.allclose(in_scan, read_mesh(dense / "raw_0.dense.ply").vertices, atol=1e-2)
 
 
 def test_resume_knows_whether_it_was_asked_for(run: Run, world: World, tmp_path: Path) -> None:

@@ -181,6 +181,14 @@ def test_scores_of_recognition_are_shown_where_there_are_some(fits: Path, sketch
     assert "Recognition" in words and "0.875" in words and EVIL in words
 
 
+def test_the_quality_of_the_model_is_shown_where_it_was_measured(fits: Path, sketched: None) -> None:
+    assert "Generalisation" not in Page(report(fits)).words
+    (fits / "quality.json").write_text(json.dumps({"compactness": [0.5, 0.8], "generalisation": [2.0, 1.5]}))
+    assert "Generalisation" in Page(report(fits)).words
+    (fits / "quality.json").write_text('{"compactness": "much"}')
+    assert report(fits).count('class="broken"') == 1
+
+
 def test_many_fits_stay_below_the_limit_and_the_rest_is_told(fits: Path, sketched: None) -> None:
     for k in range(60):
         for ending in ("fit.json", "stages.npz"):
