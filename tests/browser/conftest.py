@@ -5,11 +5,11 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import chdir
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import DESKTOP, WICKED, World
 
 from shapespace.cli import main
 from shapespace.datasets.faces import load_faces
@@ -31,7 +31,6 @@ FLAGS = [
 ]
 """WebGL by the processor, and no talk with anybody's servers."""
 
-DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 375, "height": 740}
 SCREENSHOTS = Path(os.environ.get("SHAPESPACE_SCREENSHOTS", Path(__file__).resolve().parents[2] / "screenshots-out"))
 
 
@@ -101,33 +100,6 @@ def open_tab(browser, request):
     yield open_
     for context in contexts:
         context.close()
-
-
-WICKED = "</script><script>window.wicked = true</script>"
-"""A label that stays text."""
-
-
-@dataclass(frozen=True)
-class World:
-    """A model of faces and fits by it, made by the command line."""
-
-    home: Path
-
-    @property
-    def model(self) -> Path:
-        return self.home / "model.h5"
-
-    @property
-    def fits(self) -> Path:
-        return self.home / "fits"
-
-    @property
-    def scan(self) -> Path:
-        return self.home / "scans" / "plain.ply"
-
-    @property
-    def broken(self) -> Path:
-        return self.home / "scans" / "broken.ply"
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 
 import pytest
+from pages import DESKTOP, PHONE, WICKED, World
 from pictures import change, drawn_share, same_as_kept
 
-from conftest import DESKTOP, PHONE, WICKED, World
 from shapespace.cli import main
 
 pytestmark = pytest.mark.xdist_group("browser")

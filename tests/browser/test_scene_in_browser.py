@@ -313,6 +313,7 @@ def test_the_widgets_work_by_their_controls(page_of, staged: StagedFit) -> None:
 
     changes("f", lambda: page.get_by_label("Before").check(force=True))
     changes("f", lambda: page.get_by_label("Phase 2").check(force=True))
+    changes("f", lambda: page.get_by_label("Colour").last.select_option("none"))
     changes("f", lambda: page.get_by_label("Colour").last.select_option("model"))
     page.get_by_label("Mark what lies beyond a threshold").check()
     changes("f", lambda: page.get_by_label("Threshold", exact=True).fill("0.2"))

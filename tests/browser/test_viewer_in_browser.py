@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import DESKTOP, PHONE, World
 from pictures import change, drawn_share, same_as_kept
 
-from conftest import DESKTOP, PHONE, World
 from shapespace.batch.results import read_record
 from shapespace.cli import main
 from shapespace.io.meshes import read_mesh

@@ -185,7 +185,7 @@ def test_the_quality_of_the_model_is_shown_where_it_was_measured(fits: Path, ske
     assert "Generalisation" not in Page(report(fits)).words
     (fits / "quality.json").write_text(json.dumps({"compactness": [0.5, 0.8], "generalisation": [2.0, 1.5]}))
     assert "Generalisation" in Page(report(fits)).words
-    (fits / "quality.json").write_text('{"compactness": "much"}')
+    (fits / "quality.json").write_text('{"compactness": [0.5,')
     assert report(fits).count('class="broken"') == 1
 
 
