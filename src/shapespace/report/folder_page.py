@@ -259,7 +259,8 @@ class FolderPage:
         some = f" The first {MOST_CURVES} fits of the table." if len(pictured) > MOST_CURVES else ""
         return self.page.figure(
             figures.error_curves(shown),
-            f"Share of the model's surface that lies within each distance of the scan, one curve a fit.{some}",
+            "Share of the model's vertices that lie within each distance of the scan, one curve a fit. Vertices at "
+            f"which the scan shows nothing are not counted.{some}",
             alt=f"Cumulative distances of {counted(len(shown), 'fit')}",
             chart=True,
         )

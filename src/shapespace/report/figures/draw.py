@@ -23,6 +23,7 @@ from matplotlib.font_manager import FontProperties
 from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
+from shapespace.fit.regions import UNSEEN
 from shapespace.report.colours import SCAN_COLOUR, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
 from shapespace.types import FloatArray, Mesh
@@ -446,6 +447,13 @@ def short(text: str, most: int = 28) -> str:
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
     """Cut `items` into rows of at most `columns`."""
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
+
+
+def distances_seen(fit: StagedFit, stage: str = "final") -> FloatArray:
+    """Return the distances, mm, of the vertices at which the scan shows something; of all where it shows nothing."""
+    far = absolute(fit.model_to_scan_mm[stage])
+    seen = fit.regions != UNSEEN
+    return far[seen] if seen.any() else far
 
 
 _MEDIANS = 5.0

@@ -23,6 +23,7 @@ from shapespace.report.figures.draw import (
     chart,
     charts,
     counted,
+    distances_seen,
     escaped,
     finish,
     grid,
@@ -194,8 +195,8 @@ def error_curves(
     """Draw cumulative curves: which share of the points lies within each distance.
 
     Args:
-        fits: fits, for a thin curve each and a thick one of all their vertices; or errors (n,) by name, for one named
-            curve each.
+        fits: fits, for a thin curve each and a thick one of all together, over the vertices that their scans show; or
+            errors (n,) by name, for one named curve each.
         stage: of the fits.
         title: above the figure.
         unit: of errors given by name.
@@ -209,7 +210,7 @@ def error_curves(
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(absolute(fit.model_to_scan_mm[stage])) for fit in fits]
+    far = [np.sort(distances_seen(fit, stage)) for fit in fits]
     pooled = np.sort(np.concatenate(far))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
@@ -231,7 +232,7 @@ def error_curves(
             f"{100 * share:.0f} % within {mm(at)}", (at, 100 * share), xytext=(10, -5), textcoords="offset points",
             fontsize=SMALL, color=INK, va="top",
         )  # fmt: skip
-    axes.set(xlabel="distance from the model to the scan (mm)", ylabel="share of the model's vertices (%)")
+    axes.set(xlabel="distance from the model to the scan (mm)", ylabel="share of the vertices seen (%)")
     axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))
     legend(axes, loc="lower right")
     return finish(figure)
@@ -478,7 +479,7 @@ def portrait_figure(
         panels = render_series([[scan], [model], [over, model], [mapped]], camera=seen.camera, size=seen.size)
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
-        rows.append(Row(panels, captions, f"{name}: mean distance {mm(float(absolute(far).mean()))}"))
+        rows.append(Row(panels, captions, f"{name}: {mm(float(distances_seen(fit).mean()))} on average where seen"))
     return grid(
         rows,
         title=title,

@@ -7,7 +7,7 @@
   const $ = (id) => document.getElementById(id);
   const SHOWN_AT_FIRST = 12;
   const STATUS = {
-    converged: "You can trust this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
+    converged: "Nothing speaks against this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
     failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
   };
   const LEFT_RED = [0.83, 0.25, 0.15];
