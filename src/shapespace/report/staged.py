@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.fit.regions import REGIONS
+from shapespace.fit.regions import REGIONS, UNSEEN
 from shapespace.fit.result import STAGES, FitResult
 from shapespace.fit.stages import STAGES_VERSION, stage_arrays
 from shapespace.model.shape_model import ShapeModel
@@ -51,7 +52,8 @@ class StagedFit:
         reason: one sentence on why.
         scan: the raw surface or points, as repaired.
         surfaces: the model at each stage: `before`, `initial`, `final`, and `dense` where there was one.
-        model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model.
+        model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model;
+            not-a-number at vertices where the scan shows nothing, of which the nearest point says nothing.
         scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
         regions: (V,) codes of `fit.regions.REGIONS`.
         b: (K,) mm.
@@ -75,6 +77,11 @@ class StagedFit:
     b_stddev: FloatArray
     shrinkage: FloatArray
     history: tuple[Moment, ...]
+
+    @cached_property
+    def scale_mm(self) -> float:
+        """Where the colour scale of the signed distances ends, in every picture of this fit."""
+        return scale_end(np.concatenate([self.model_to_scan_mm["final"], self.scan_to_model_mm["final"]]))
 
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
@@ -140,9 +147,32 @@ class StagedFit:
         whole &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
         if not whole:
             raise FileFormatError(f"{name}: its saved stages do not fit together; {again}.")
+        unseen = regions == UNSEEN
+        shown = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
         return StagedFit(
-            name, label, status, reason, scan, surfaces, forward, backward, regions, b, z, b_stddev, shrinkage, history
+            name, label, status, reason, scan, surfaces, shown, backward, regions, b, z, b_stddev, shrinkage, history
         )
+
+
+_MEDIANS = 5.0
+"""Of the distances, at which a scale ends at the latest; beyond it lies what is no part of the object."""
+
+
+def scale_end(distances_mm: FloatArray) -> float:
+    """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
+    known = np.abs(distances_mm[np.isfinite(distances_mm)])
+    if not len(known):
+        return 1.0
+    return nice_ceiling(min(float(np.percentile(known, 97)), _MEDIANS * float(np.median(known))))
+
+
+def nice_ceiling(value: float) -> float:
+    """Return a round number at or a little above `value`, 1 where that is not positive."""
+    if not (value > 0 and np.isfinite(value)):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
 
 
 def _similarity(T: npt.NDArray[Any]) -> Similarity:

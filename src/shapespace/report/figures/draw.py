@@ -23,7 +23,6 @@ from matplotlib.font_manager import FontProperties
 from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
-from shapespace.fit.regions import UNSEEN
 from shapespace.report.colours import SCAN_COLOUR, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
 from shapespace.types import FloatArray, Mesh
@@ -447,34 +446,6 @@ def short(text: str, most: int = 28) -> str:
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
     """Cut `items` into rows of at most `columns`."""
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
-
-
-def distances_seen(fit: StagedFit, stage: str = "final") -> FloatArray:
-    """Return the distances, mm, of the vertices at which the scan shows something; of all where it shows nothing."""
-    far = absolute(fit.model_to_scan_mm[stage])
-    seen = fit.regions != UNSEEN
-    return far[seen] if seen.any() else far
-
-
-_MEDIANS = 5.0
-"""Of the distances, at which a scale ends at the latest; beyond it lie gaps and what is no part of the object."""
-
-
-def nice_ceiling(value: float) -> float:
-    """Return a round number at or a little above `value`, 1 where that is not positive."""
-    if not (value > 0 and np.isfinite(value)):
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
-    return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
-
-
-def scale_end(distances_mm: FloatArray) -> float:
-    """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
-    known = np.abs(distances_mm[np.isfinite(distances_mm)])
-    if not len(known):
-        return 1.0
-    return nice_ceiling(min(float(np.percentile(known, 97)), _MEDIANS * float(np.median(known))))
 
 
 def mm(value: float) -> str:

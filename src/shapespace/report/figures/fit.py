@@ -39,14 +39,13 @@ from shapespace.report.figures.draw import (
     legend,
     mm,
     percent,
-    scale_end,
     scan_over,
     short,
     surroundings,
     view,
 )
 from shapespace.report.render import Image, Layer, render_maps, render_series
-from shapespace.report.staged import StagedFit
+from shapespace.report.staged import StagedFit, scale_end
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -119,7 +118,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
     surface = _surface(fit, stage)
     forward, backward = fit.model_to_scan_mm[stage], fit.scan_to_model_mm[stage]
     if limit_mm is None:
-        limit_mm = scale_end(np.concatenate([forward, backward]))
+        limit_mm = fit.scale_mm if stage == "final" else scale_end(np.concatenate([forward, backward]))
     if not limit_mm > 0:
         raise InputError(f"The limit of a scale must be positive, not {limit_mm!r} mm.")
     on_model, on_scan = (

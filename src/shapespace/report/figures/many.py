@@ -23,23 +23,20 @@ from shapespace.report.figures.draw import (
     chart,
     charts,
     counted,
-    distances_seen,
     escaped,
     finish,
     grid,
     in_rows,
     legend,
     mm,
-    nice_ceiling,
     plain,
-    scale_end,
     scan_over,
     short,
     surroundings,
     view,
 )
 from shapespace.report.render import Camera, Image, Layer, render, render_series
-from shapespace.report.staged import StagedFit
+from shapespace.report.staged import StagedFit, nice_ceiling, scale_end
 from shapespace.types import FloatArray, Mesh
 
 if TYPE_CHECKING:
@@ -210,7 +207,7 @@ def error_curves(
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(distances_seen(fit, stage)) for fit in fits]
+    far = [np.sort(absolute(fit.model_to_scan_mm[stage])) for fit in fits]
     pooled = np.sort(np.concatenate(far))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
@@ -479,7 +476,7 @@ def portrait_figure(
         panels = render_series([[scan], [model], [over, model], [mapped]], camera=seen.camera, size=seen.size)
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
-        rows.append(Row(panels, captions, f"{name}: {mm(float(distances_seen(fit).mean()))} on average where seen"))
+        rows.append(Row(panels, captions, f"{name}: {mm(float(absolute(far).mean()))} on average where seen"))
     return grid(
         rows,
         title=title,

@@ -30,11 +30,11 @@ from shapespace.report.figures.draw import (
     grid,
     legend,
     mm,
-    nice_ceiling,
     percent,
     view,
 )
 from shapespace.report.render import Camera, Image, Layer, render, render_layers
+from shapespace.report.staged import nice_ceiling
 from shapespace.types import FloatArray, Mesh
 
 SHARES = (0.90, 0.95, 0.98, 0.99)
