@@ -8,11 +8,13 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from report_page import Page, edit
 
 from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.tables import write_rows
 from shapespace.report import folder_page, scene
 from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
 
@@ -110,8 +112,35 @@ def test_failed_and_doubtful_fits_come_first_with_their_reason(page: str) -> Non
     words = Page(page).words
     cards = re.findall(r'<li class="card" id="([^"]+)"', page)
     assert cards[:2] == ["fit-broken", "fit-charlie"]
-    assert "2 fits can be trusted as far as the fit itself can tell" in words and "1 could not be fitted" in words
+    assert "2 fits converged with nothing found against them" in words and "1 could not be fitted" in words
     assert "broken.ply" in words and "No picture: the scan cannot be read." in words
+
+
+def test_coefficients_by_different_models_are_never_compared(fits: Path, sketched: None) -> None:
+    def other(record: dict[str, Any]) -> None:
+        record["model"]["hash"] = "0" * 64
+
+    assert "cannot be compared" not in Page(report(fits)).words
+    edit(fits, other, "able.fit.json")
+    words = Page(report(fits)).words
+    assert "The fits are by 2 different models, so their coefficients cannot be compared" in words
+    words = Page(report(fits, model=fits.parent / "model.h5")).words
+    assert "Fitted with another model than model.h5" in words and "cannot be compared" not in words
+
+
+@pytest.mark.parametrize(("subject", "drawn"), [("s1", True), ("", False)])
+def test_lines_through_neutral_need_one_known_subject(fits: Path, sketched: None, subject: str, drawn: bool) -> None:
+    rows = [("able", "calm", "0.5"), ("baker", "calm", "1"), ("charlie", "neutral", "0"), ("dog", "wild", "1")]
+    write_rows(fits / "labels.csv", ("file", "expression", "intensity", "subject"), [(*row, subject) for row in rows])
+    assert ("Larger marks are stronger expressions" in Page(report(fits)).words) == drawn
+
+
+def test_messages_about_result_files_name_no_folder_of_the_machine(fits: Path, sketched: None) -> None:
+    (fits / "able.fit.json").write_text("{")
+    (fits / "baker.stages.npz").write_bytes(b"no")
+    words = Page(report(fits)).words
+    assert "able.fit.json is not JSON" in words and "baker.stages.npz is not an .npz file" in words
+    assert str(fits.parent.parent) not in words
 
 
 def test_labels_are_found_beside_the_scans_and_can_be_given(fits: Path, sketched: None) -> None:

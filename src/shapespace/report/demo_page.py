@@ -33,7 +33,6 @@ from shapespace.report.markup import (
 )
 from shapespace.report.page import Page, Section, Step
 from shapespace.report.saved import Folder, SavedFit, read_fit, staged_fit
-from shapespace.types import FloatArray
 
 if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
@@ -349,7 +348,7 @@ class DemoPage:
         both = [f"{mm(fit.summary_mm(stage, 'model_to_scan', 'max'))} {said}" for stage, said in _STAGES.items()]
         out = ""
         if self.page.left > _NEEDED_BYTES:
-            out = self.page.tried(lambda: sections.fit_to_turn(self.page, staged, sections.common_limit_mm([staged])))
+            out = self.page.tried(lambda: sections.fit_to_turn(self.page, staged))
         return out + sections.in_columns(
             self.page.figure(
                 figures.overlay_figure(staged),
@@ -385,39 +384,18 @@ class DemoPage:
 
     def b_plots(self, experiment: Mapping[str, Any], fits: Sequence[SavedFit]) -> str:
         """Return the coefficients of the test faces, and the scores of recognition."""
-        from shapespace.report import figures
-
         scores = as_mapping(experiment.get("scores"))
         left_out = {str(name) for name in as_list(scores.get("left_out"))}
         kept = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
         scans = [sections.coefficients_of(fit) for fit in _tests(kept)]
-        neutral = next((fit for fit in kept if not fit.entry.get("intensity")), None)
-        lines: dict[str, FloatArray | None] = {
-            "neutral_b": None if neutral is None else neutral.numbers("b"),
-            "neutral_z": None if neutral is None else neutral.numbers("z"),
-        }
+        neutral = next((sections.coefficients_of(fit) for fit in kept if not fit.entry.get("intensity")), None)
         out = ""
         if scans and all(len(scan.b) >= 2 for scan in scans):
-            about = (
-                "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
-                "coefficients, each in its standard deviations."
-            )
-            if neutral is None:
-                about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
-            pictures = self.page.figure(
-                figures.b_plane(scans, title="Test expressions in the first two coefficients", **lines),
-                f"Paper, figure 9. {about}",
-                alt=f"Scatter plot of b1 and b2 for {len(scans)} faces: each expression runs along its own line",
-                chart=True,
+            out = sections.lines_through_neutral(
+                self.page, scans, neutral, figures_of=("Paper, figure 9. ", "Paper, figure 10. ")
             )
             if all(len(scan.b) >= 3 for scan in scans):
-                pictures += self.page.figure(
-                    figures.b_space(scans, title="The first three coefficients, from two sides", **lines),
-                    "Paper, figure 10. Grey lines drop to the floor of the box.",
-                    alt=f"Two views of b1, b2 and b3 for {len(scans)} faces with a line for each expression",
-                )
-                out = self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
-            out = sections.in_columns(pictures) + out
+                out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
         return out + sections.score_tables(
             scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
@@ -432,8 +410,8 @@ class DemoPage:
         chosen = [staged for _, staged in _strongest(shown)]
         pictures = self.page.figure(
             figures.threshold_figure(chosen),
-            "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the model's "
-            "vertices within the limit.",
+            "Paper, figure 11, for the strongest level of each expression. Above each panel: share of the vertices "
+            "within the limit.",
             alt="Maps of the face with the part within 2, 4, 6, 8 and 10 mm of the scan for "
             + ", ".join(staged.label for staged in chosen),
         )

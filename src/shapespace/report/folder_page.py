@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from shapespace import __version__
-from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.report import sections
@@ -49,6 +49,7 @@ MOST_CURVES = 100
 _MOST_NAMED = 12
 _WITHOUT_RESULT = ("failed", "unreadable")
 _FEWEST_POINTS = 20
+_FEWEST_LEVELS = 2
 _ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
 _DETAIL_BYTES = 1_300_000
@@ -176,7 +177,9 @@ class FolderPage:
         told = f"{counted(total, 'scan was', 'scans were')} fitted with {listed(models)}"
         told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
         told += counted(len(trusted), "fit") if trusted else "None"
-        told += " can be trusted as far as the fit itself can tell"
+        told += (
+            " converged with nothing found against them" if len(trusted) != 1 else " converged with nothing against it"
+        )
         rest = [
             f"{counts[key]} {word}"
             for key, word in (
@@ -192,18 +195,36 @@ class FolderPage:
         to_model = _median([fit.summary_mm("final", "scan_to_model", "mean") for fit in trusted])
         to_scan = _median([fit.summary_mm("final", "model_to_scan", "mean") for fit in trusted])
         rows = [
-            (str(len(trusted)), f"of {total}", "to be trusted"),
+            (str(len(trusted)), f"of {total}", "with nothing found against them"),
             (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
             (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
         ]
         for value, what in (
-            (expected, "vertex error that a trusted fit expects of itself, median"),
-            (to_model, "mean distance from scan to model, median of the trusted"),
-            (to_scan, "mean distance from model to scan, median of the trusted"),
+            (expected, "vertex error that such a fit expects of itself, median"),
+            (to_model, "mean distance from scan to model, median of those"),
+            (to_scan, "mean distance from model to scan, median of those"),
         ):
             if np.isfinite(value):
                 rows.append((mm(value).removesuffix(" mm"), "mm", what))
-        return paragraph(told) + tiles(rows) + self.doubts() + self.page.guarded("Main figures", self.main_figures)
+        return (
+            paragraph(told)
+            + tiles(rows)
+            + self.other_models()
+            + self.doubts()
+            + self.page.guarded("Main figures", self.main_figures)
+        )
+
+    def other_models(self) -> str:
+        """Return which fits are by another model than the one shown, where one was given."""
+        if self.model_path is None:
+            return ""
+        shown = self.model_hash()
+        others = [
+            fit.name
+            for fit in self.fits
+            if fit.status not in _WITHOUT_RESULT and _source(fit, "model", "hash") != shown
+        ]
+        return notice(f"Fitted with another model than {self.model_path.name}", others)
 
     def doubts(self) -> str:
         """Return the fits that need a look, by name and reason."""
@@ -375,13 +396,51 @@ class FolderPage:
             out += paragraph(self.label_note, "soft")
         return out
 
-    def coefficients(self) -> list[SavedFit]:
-        """Return the fits whose coefficients are to be compared: not the failed ones."""
-        return [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT and fit.record.get("b")]
+    def of_one_model(self, model_hash: str) -> list[SavedFit]:
+        """Return the fits by one model that have coefficients: only these can be compared."""
+        return [
+            fit
+            for fit in self.fits
+            if fit.status not in _WITHOUT_RESULT and fit.record.get("b") and _source(fit, "model", "hash") == model_hash
+        ]
+
+    def model_hash(self) -> str:
+        """Return the content hash of the model whose fits are compared.
+
+        Raises:
+            InputError: there are several, and none was given.
+        """
+        if self.model_path is not None:
+            return self.model().content_hash
+        hashes = {str(_source(fit, "model", "hash")) for fit in self.fits if fit.status not in _WITHOUT_RESULT}
+        if len(hashes) > 1:
+            raise InputError(
+                f"The fits are by {len(hashes)} different models, so their coefficients cannot be compared; "
+                "give one of the models with --model."
+            )
+        return hashes.pop() if hashes else ""
 
     def together(self) -> str:
-        """Return the coefficients of all fits against each other."""
-        return sections.scatter(self.page, [sections.coefficients_of(fit) for fit in self.coefficients()])
+        """Return the coefficients of all fits by one model against each other, and the lines of one subject's."""
+        compared = self.of_one_model(self.model_hash())
+        out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
+        expressive = [fit for fit in compared if fit.entry.get("intensity")]
+        subjects = {str(fit.entry.get("subject") or "") for fit in expressive}
+        levels = Counter(str(fit.entry.get("expression")) for fit in expressive)
+        if len(subjects) != 1 or "" in subjects or max(levels.values(), default=0) < _FEWEST_LEVELS:
+            return out
+        points = [sections.coefficients_of(fit) for fit in expressive]
+        if any(len(point.b) < 2 for point in points):
+            return out
+        neutral = next(
+            (
+                sections.coefficients_of(fit)
+                for fit in compared
+                if fit.entry.get("intensity") == 0 and str(fit.entry.get("subject") or "") in subjects
+            ),
+            None,
+        )
+        return out + self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))
 
     def detail(self, fit: SavedFit) -> str:
         """Return one fit with every picture, as far as the file's size allows."""
@@ -389,14 +448,12 @@ class FolderPage:
         out = sections.fit_facts(fit)
         if self.page.left < _DETAIL_BYTES + _RESERVE_BYTES:
             return out + paragraph("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")
-        limit = sections.common_limit_mm([staged])
-        others = [other.numbers("z") for other in self.coefficients() if other.name != fit.name]
+        same = self.of_one_model(str(_source(fit, "model", "hash")))
+        others = [other.numbers("z") for other in same if other.name != fit.name]
         population: FloatArray | None = None
         if len(others) > 2 and len({len(z) for z in others}) == 1:
             population = np.stack(others)
-        return (
-            out + sections.fit_to_turn(self.page, staged, limit) + sections.fit_pictures(self.page, staged, population)
-        )
+        return out + sections.fit_to_turn(self.page, staged) + sections.fit_pictures(self.page, staged, population)
 
     # The rest
 
@@ -412,7 +469,8 @@ class FolderPage:
         versions = sorted({str(fit.record["version"]) for fit in self.fits if fit.record.get("version")})
         if versions:
             rows.append(("Fits", f"shapespace {listed(versions)}"))
-        keys = dict.fromkeys(key for config in configs for key in config)
+        dense = any(config.get("dense") for config in configs)
+        keys = dict.fromkeys(key for config in configs for key in config if dense or key != "dense_settings")
         for key in keys:
             values = list(dict.fromkeys(sections.setting(config.get(key)) for config in configs))
             rows.append((words(key), values[0] if len(values) == 1 else f"differs: {'; '.join(values[:4])}"))

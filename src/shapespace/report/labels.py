@@ -28,17 +28,19 @@ class Label:
     Args:
         text: its class, such as an expression.
         intensity: from 0 to 1, or None where the table does not say.
+        subject: whom it shows, or empty.
     """
 
     text: str
     intensity: float | None = None
+    subject: str = ""
 
 
 def read_labels(path: Path) -> dict[str, Label]:
     """Return the labels in a CSV table by the name of the scan, without folder and ending.
 
     The scan stands in the column `file`, `scan` or `name`; its class in `label`, `expression`, `class`, `group` or
-    `subject`, the first that is there; `intensity` may stand beside it.
+    `subject`, the first that is there; `intensity` and `subject` may stand beside it.
 
     Raises:
         FileError: it cannot be read.
@@ -63,7 +65,9 @@ def read_labels(path: Path) -> dict[str, Label]:
     for row in rows:
         text = _printable(row[label] or "")
         if row[name] and text:
-            found[PurePath(row[name]).stem] = Label(text, _intensity(row.get("intensity")))
+            found[PurePath(row[name]).stem] = Label(
+                text, _intensity(row.get("intensity")), _printable(row.get("subject") or "")
+            )
     return found
 
 
@@ -101,7 +105,7 @@ def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
     label = labels.get(PurePath(scan).stem if isinstance(scan, str) else fit.name) or labels.get(fit.name)
     if label is None:
         return fit
-    more: dict[str, Any] = {"expression": label.text}
+    more: dict[str, Any] = {"expression": label.text, "subject": label.subject}
     if label.intensity is not None:
         more["intensity"] = label.intensity
     return replace(fit, entry={**fit.entry, **more})

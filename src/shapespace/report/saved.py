@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -22,7 +24,7 @@ from shapespace.types import FloatArray, Mesh
 
 _LARGEST_JSON = 64 * 2**20
 _LARGEST_ARRAY = 2**30
-_AGAIN = "make it again"
+_AGAIN = "make it again with shapespace fit --stages"
 _RECORD = ".fit.json"
 
 
@@ -33,7 +35,7 @@ class Folder:
     root: Path
 
     def path(self, name: object) -> Path:
-        """Return the file called `name`.
+        """Return the file called `name`, as the folder was named by the user.
 
         Raises:
             FileFormatError: it is no name, or it leads out of the folder.
@@ -41,10 +43,11 @@ class Folder:
         if not isinstance(name, str) or not name:
             raise FileFormatError(f"{self.root}: a result file has no name where one is needed; {_AGAIN}.")
         try:
-            path = (self.root / name).resolve()
-        except (OSError, ValueError) as error:
+            path = self.root / name
+            inside = path.resolve().is_relative_to(self.root.resolve())
+        except (OSError, ValueError, RuntimeError) as error:
             raise FileFormatError(f"{self.root}: {name[:80]!r} is not a file name; {_AGAIN}.") from error
-        if not path.is_relative_to(self.root.resolve()):
+        if not inside:
             raise FileFormatError(f"{self.root}: {name[:80]!r} leads out of the folder of the results; {_AGAIN}.")
         return path
 
@@ -56,13 +59,14 @@ class Folder:
             FileFormatError: it is not a JSON object, or too large to be one of ours.
         """
         path = self.path(name)
-        _bounded(path, _LARGEST_JSON)
-        try:
-            content: object = json.loads(read_bytes(path))
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(f"{path} is not JSON, or it is cut short; {_AGAIN}.") from error
-        if not isinstance(content, dict):
-            raise FileFormatError(f"{path} does not hold a JSON object; {_AGAIN}.")
+        with self._named_shortly():
+            _bounded(path, _LARGEST_JSON)
+            try:
+                content: object = json.loads(read_bytes(path))
+            except (ValueError, RecursionError) as error:
+                raise FileFormatError(f"{path} is not JSON, or it is cut short; {_AGAIN}.") from error
+            if not isinstance(content, dict):
+                raise FileFormatError(f"{path} does not hold a JSON object; {_AGAIN}.")
         return cast(dict[str, Any], _printable(cast(object, content)))
 
     def arrays(self, name: object) -> dict[str, npt.NDArray[Any]]:
@@ -73,19 +77,20 @@ class Folder:
             FileFormatError: it is damaged, or declares arrays that it does not hold.
         """
         path = self.path(name)
-        _bounded(path, _LARGEST_ARRAY)
-        try:
-            with zipfile.ZipFile(path) as archive:
-                for member in archive.infolist():
-                    _check_member(path, archive, member)
-            with np.load(path, allow_pickle=False) as loaded:
-                return {key: np.asarray(loaded[key]) for key in loaded.files}
-        except OSError as error:
-            raise read_error(path, error) from error
-        except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError) as error:
-            if isinstance(error, FileFormatError):
-                raise
-            raise FileFormatError(f"{path} is not an .npz file of arrays, or it is cut short; {_AGAIN}.") from error
+        with self._named_shortly():
+            _bounded(path, _LARGEST_ARRAY)
+            try:
+                with zipfile.ZipFile(path) as archive:
+                    for member in archive.infolist():
+                        _check_member(path, archive, member)
+                with np.load(path, allow_pickle=False) as loaded:
+                    return {key: np.asarray(loaded[key]) for key in loaded.files}
+            except OSError as error:
+                raise read_error(path, error) from error
+            except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError) as error:
+                if isinstance(error, FileFormatError):
+                    raise
+                raise FileFormatError(f"{path} is not an .npz file of arrays, or it is cut short; {_AGAIN}.") from error
 
     def mesh(self, name: object) -> Mesh:
         """Return the mesh in a file.
@@ -94,7 +99,19 @@ class Folder:
             FileError: it cannot be read.
             FileFormatError: it is damaged.
         """
-        return read_mesh(self.path(name))
+        with self._named_shortly():
+            return read_mesh(self.path(name))
+
+    @contextmanager
+    def _named_shortly(self) -> Iterator[None]:
+        # A report is mailed and a viewer has visitors: neither is to tell where the folder lies on this machine.
+        try:
+            yield
+        except ShapespaceError as error:
+            told = str(error)
+            for root in dict.fromkeys((str(self.root.resolve()), str(self.root))):
+                told = told.replace(f"{root}{os.sep}", "")
+            raise type(error)(told) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +223,7 @@ def _found(folder: Folder, file: str) -> SavedFit:
     try:
         record = folder.json(file)
         if record.get("format") != "shapespace fit":
-            raise FileFormatError(f"{folder.root / file} is not the record of a fit; {_AGAIN}.")
+            raise FileFormatError(f"{file} is not the record of a fit; {_AGAIN}.")
     except ShapespaceError as error:
         record = {"status": "unreadable", "reason": str(error)}
     return SavedFit(entry, record)
@@ -232,20 +249,6 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
         z=fit.numbers("z"),
         b_stddev=fit.numbers("b_stddev"),
         shrinkage=fit.numbers("shrinkage"),
-    )
-
-
-def surfaces_of(
-    folder: Folder, fit: SavedFit, stages: Sequence[str]
-) -> tuple[Mesh, dict[str, Mesh], dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return scan, surfaces and unsigned distances of `staged_fit` at `stages`; raises as it does."""
-    staged = staged_fit(folder, fit)
-    backward = {stage: staged.scan_to_model_mm[stage] for stage in stages}
-    return (
-        staged.scan,
-        {stage: staged.surfaces[stage] for stage in stages},
-        {stage: np.abs(staged.model_to_scan_mm[stage]) for stage in stages},
-        {stage: np.abs(signed[np.isfinite(signed)]) for stage, signed in backward.items()},
     )
 
 

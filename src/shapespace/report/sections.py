@@ -158,11 +158,12 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
 # One fit
 
 
-def fit_to_turn(page: Page, fit: StagedFit, limit_mm: float) -> str:
+def fit_to_turn(page: Page, fit: StagedFit) -> str:
     """Return scan and model of one fit, as a strip of stills where nothing turns."""
     from shapespace.report import stills
     from shapespace.report.scene import pack_fit
 
+    limit_mm = fit.scale_mm
     still = stills.fit_strip(fit, limit_mm, (300, 372))
     return page.turning(
         "fit",
@@ -177,11 +178,21 @@ def fit_to_turn(page: Page, fit: StagedFit, limit_mm: float) -> str:
 
 def strip_alt(fit: StagedFit, limit_mm: float) -> str:
     """Return what is seen in `stills.fit_strip`, in words."""
-    distances = np.abs(fit.model_to_scan_mm["final"])
     return (
         f"{fit.label}: the scan, scan and model over each other, and a map of the distances; "
-        f"{percent(float((distances <= limit_mm).mean()))} of the model lies within {limit_mm:g} mm of the scan"
+        f"{share_within(fit, limit_mm)} of what the scan shows lies within {limit_mm:g} mm"
     )
+
+
+def share_within(fit: StagedFit, limit_mm: float) -> str:
+    """Return the share of the vertices that the scan shows which lie within `limit_mm` of it."""
+    known = _known(fit, "final")
+    return percent(float((known <= limit_mm).mean())) if len(known) else "none"
+
+
+def _known(fit: StagedFit, stage: str) -> FloatArray:
+    distances = np.abs(fit.model_to_scan_mm[stage])
+    return distances[np.isfinite(distances)]
 
 
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = None) -> str:
@@ -194,11 +205,10 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = Non
     """
     from shapespace.report import figures
 
-    final = fit.model_to_scan_mm["final"]
-    shares = [f"{percent(float((np.abs(final) <= limit).mean()))} within {limit} mm" for limit in (2, 4, 6, 8, 10)]
+    shares = [f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)]
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
     largest = [
-        f"{mm(float(np.abs(fit.model_to_scan_mm[stage]).max()))} {said}"
+        f"{mm(float(_known(fit, stage).max(initial=0.0)))} {said}"
         for stage, said in stages.items()
         if stage in fit.surfaces
     ]
@@ -228,7 +238,8 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = Non
         ),
         lambda: page.figure(
             figures.threshold_figure([fit]),
-            "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the model's vertices.",
+            "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the vertices that the scan "
+            "shows.",
             alt=f"Maps of {fit.label}: {listed(shares)}",
         ),
         lambda: page.figure(
@@ -339,11 +350,10 @@ def scale_key(page: Page, limit_mm: float) -> str:
 
 
 def common_limit_mm(fits: Sequence[StagedFit]) -> float:
-    """Return the end of the scale that strips of these fits share: 98 % of the usual fit lies within it."""
-    tops = [float(np.percentile(np.abs(fit.model_to_scan_mm["final"]), 98)) for fit in fits]
-    top = float(np.median(tops)) if tops else 1.0
-    steps = (0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 15, 20)
-    return float(next((step for step in steps if step >= top), 20))
+    """Return the end of the scale that strips of these fits share: that of the usual fit."""
+    from shapespace.report.staged import nice_ceiling
+
+    return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
 
 
 def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: str) -> str:
@@ -456,6 +466,44 @@ def scatter(page: Page, points: Sequence[Coefficients]) -> str:
     if all(len(point.b) >= 3 for point in points):
         out += page.tried(lambda: scatter_to_turn(page, points))
     return out
+
+
+def lines_through_neutral(
+    page: Page, points: Sequence[Coefficients], neutral: Coefficients | None, *, figures_of: Sequence[str] = ("", "")
+) -> str:
+    """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
+
+    Args:
+        page: that it goes to.
+        points: the expressive fits, with at least two coefficients.
+        neutral: the fit of the neutral face, through which the lines pass; None draws none.
+        figures_of: said before the two captions.
+    """
+    from shapespace.report import figures
+
+    about = (
+        "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
+        "coefficients, each in its standard deviations."
+    )
+    if neutral is None:
+        about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
+    lines: dict[str, FloatArray | None] = {
+        "neutral_b": None if neutral is None else neutral.b,
+        "neutral_z": None if neutral is None else neutral.z,
+    }
+    pictures = page.figure(
+        figures.b_plane(points, title="Expressions in the first two coefficients", **lines),
+        f"{figures_of[0]}{about}",
+        alt=f"Scatter plot of b1 and b2 for {counted(len(points), 'face')}: each expression runs along its own line",
+        chart=True,
+    )
+    if all(len(point.b) >= 3 for point in points):
+        pictures += page.figure(
+            figures.b_space(points, title="The first three coefficients, from two sides", **lines),
+            f"{figures_of[1]}Grey lines drop to the floor of the box.",
+            alt=f"Two views of b1, b2 and b3 for {counted(len(points), 'face')} with a line for each expression",
+        )
+    return in_columns(pictures)
 
 
 def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> str:

@@ -70,6 +70,47 @@
     });
   }
 
+  // Pictures: on a narrow page their words get too small to read, so they open at full size and scroll.
+  const wide = 1.25;
+  function offer(figure) {
+    const plate = figure.querySelector(".plate");
+    const image = plate && plate.querySelector("img");
+    const narrow = image && image.clientWidth > 0 && Number(image.getAttribute("width")) > wide * image.clientWidth;
+    let opener = figure.querySelector("button.full");
+    if (plate && plate.classList.contains("full")) return;
+    if (opener) opener.hidden = !narrow;
+    if (opener || !narrow) return;
+    opener = document.createElement("button");
+    opener.type = "button";
+    opener.className = "full";
+    opener.setAttribute("aria-pressed", "false");
+    opener.textContent = "Full size";
+    opener.addEventListener("click", () => {
+      const full = plate.classList.toggle("full");
+      opener.setAttribute("aria-pressed", String(full));
+      opener.textContent = full ? "Fit to the page" : "Full size";
+      if (full) plate.tabIndex = 0;
+      else plate.removeAttribute("tabindex");
+    });
+    figure.insertBefore(opener, plate.nextSibling);
+  }
+  const narrowPage = window.matchMedia("(max-width: 640px)");
+  function offerAll() {
+    if (narrowPage.matches) document.querySelectorAll("figure.drawing, figure.plain, figure.chart").forEach(offer);
+  }
+  window.addEventListener("load", offerAll);
+  narrowPage.addEventListener("change", offerAll);
+
+  // Tables wider than the page say so.
+  function tellWide() {
+    for (const holder of document.querySelectorAll(".table")) {
+      holder.classList.toggle("wide", holder.scrollWidth > holder.clientWidth + 4);
+    }
+  }
+  window.addEventListener("load", tellWide);
+  window.addEventListener("resize", tellWide);
+  document.addEventListener("toggle", tellWide, true);
+
   // Paper has no folds.
   let folded = [];
   window.addEventListener("beforeprint", () => {
