@@ -6,7 +6,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +103,7 @@ class Folder:
             return read_mesh(self.path(name))
 
     @contextmanager
-    def _named_shortly(self) -> Iterator[None]:
+    def _named_shortly(self) -> Generator[None]:
         # A report is mailed and a viewer has visitors: neither is to tell where the folder lies on this machine.
         try:
             yield
