@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
+_EVERY_MODEL = ("mean", "basis", "stddev", "faces")
+"""What is not of one representation."""
 
 
 def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
@@ -25,6 +27,7 @@ def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, 
     arrays: dict[str, npt.NDArray[Any]] = {"mean": model.mean, "basis": model.basis, "stddev": model.stddev}
     if model.faces is not None:
         arrays["faces"] = model.faces
+    arrays.update(model.coding)
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
         "format_version": FORMAT_VERSION,
@@ -44,7 +47,12 @@ def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, 
 def save(model: ShapeModel, path: Path) -> None:
     """Write `model` to `path`, whole or not at all."""
     arrays, attributes = contents(model)
-    write_hdf5(path, arrays, {**attributes, "model_hash": model.content_hash, "software_version": __version__})
+    write_hdf5(path, arrays, {**attributes, **made_by(model)})
+
+
+def made_by(model: ShapeModel) -> dict[str, Attribute]:
+    """Return what a file says beside the contents of `model`."""
+    return {"model_hash": model.content_hash, "software_version": __version__}
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -77,6 +85,7 @@ def load(path: Path) -> dict[str, Any]:
             "gauge": str(attributes["gauge"]),
             "landmarks": {str(name): int(vertex) for name, vertex in stored.items()},
             "representation": str(attributes["representation"]),
+            "coding": {name: array for name, array in arrays.items() if name not in _EVERY_MODEL},
             "provenance": str(attributes["provenance"]),
             "licence": str(attributes["licence"]),
         }

@@ -1,0 +1,317 @@
+"""Identity and expression apart: x = mean + A a + B e, as a rotation of the coefficients of an ordinary shape model.
+
+A holds the modes of neutral shapes, B those of expression minus the same person's neutral. With a and e normal and
+independent, x has the covariance A La A^T + B Le B^T, whose eigenvectors are a shape model like any other: fitting that
+model is fitting a and e jointly, and [a; e] in standard deviations is its z, rotated. Source: method.md 8; Amberg,
+Knothe and Vetter, FG 2008, for the additive model of expressions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import eigh
+
+from shapespace.errors import InputError, ModelFileError
+from shapespace.geometry.procrustes import Gauge, align_in_place
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.hdf5 import read_hdf5, write_hdf5
+from shapespace.model import model_file
+from shapespace.model.pca import principal_components
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
+
+_STILL_ROUNDS = 4
+_NO_VARIANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class AdditiveModel:
+    """A shape model whose whitened coefficients split into identity a and expression e: [a; e] = rotation @ z.
+
+    Args:
+        shape: the model that fits: its covariance is that of identity plus that of expression.
+        rotation: (K, K) orthogonal; its first `n_identity` rows give a, the others e, in standard deviations.
+        n_identity: number of identity coefficients.
+
+    Raises:
+        InputError: parts that do not belong together.
+    """
+
+    shape: ShapeModel
+    rotation: FloatArray
+    n_identity: int
+
+    def __post_init__(self) -> None:
+        rotation, k = read_only(self.rotation), self.shape.n_modes
+        if rotation.shape != (k, k) or not 1 <= self.n_identity < k:
+            raise InputError(
+                f"An additive model of {k} modes needs a ({k}, {k}) rotation and 1 to {k - 1} identity modes, not "
+                f"{rotation.shape} and {self.n_identity}."
+            )
+        if not np.allclose(rotation @ rotation.T, np.eye(k), atol=1e-6):
+            raise InputError("The rotation of an additive model must be orthogonal.")
+        object.__setattr__(self, "rotation", rotation)
+
+    @classmethod
+    def fit(
+        cls,
+        meshes: Sequence[Mesh],
+        subjects: Sequence[str],
+        neutral: Sequence[bool],
+        *,
+        identity_modes: int | float | None = None,
+        expression_modes: int | float | None = 0.99,
+        gauge: Gauge = "shape",
+        alignment_vertices: IntArray | None = None,
+        still_share: float = 0.3,
+        landmarks: Mapping[str, int] | None = None,
+        provenance: str = "",
+        licence: str = "",
+    ) -> AdditiveModel:
+        """Build the model of corresponding `meshes`, in mm.
+
+        Args:
+            meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
+            subjects: (N,) whom each shows.
+            neutral: (N,) whether it is the neutral face; a person's neutrals are averaged.
+            identity_modes: a number; a float below 1 for a share of the variance; None for all.
+            expression_modes: the same for expressions.
+            gauge: `shape` divides size out, `form` keeps it.
+            alignment_vertices: that carry the alignment, such as forehead and nose; None takes those that expressions
+                move least.
+            still_share: how many those are, as a share of all.
+            landmarks: name -> vertex, kept in the model.
+            provenance: what the meshes are, in words.
+            licence: of the meshes.
+
+        Raises:
+            CorrespondenceError: the meshes differ in vertices or triangles.
+            InputError: too few of them, or an expression without its person's neutral.
+        """
+        faces = common_faces(meshes)
+        if not len(meshes) == len(subjects) == len(neutral):
+            raise InputError("Give one subject and one word on neutral for each mesh.")
+        people = list(dict.fromkeys(s for s, plain in zip(subjects, neutral, strict=True) if plain))
+        expressive = [i for i, plain in enumerate(neutral) if not plain]
+        if len(people) < 2 or not expressive:
+            raise InputError(
+                f"An additive model needs the neutral faces of at least two people and some expressions, not "
+                f"{len(people)} and {len(expressive)}."
+            )
+        missing = sorted({subjects[i] for i in expressive} - set(people))
+        if missing:
+            raise InputError(f"There is no neutral face of {', '.join(missing[:5])}; add it, or leave them out.")
+        own = {name: row for row, name in enumerate(people)}
+        own_neutrals = {
+            name: [m.vertices for m, who, plain in zip(meshes, subjects, neutral, strict=True) if plain and who == name]
+            for name in people
+        }
+        neutrals = np.stack([np.asarray(np.mean(own_neutrals[name], axis=0)) for name in people])
+        shapes = np.stack([meshes[i].vertices for i in expressive])
+        if not (np.isfinite(neutrals).all() and np.isfinite(shapes).all()):
+            raise InputError("The training meshes hold vertices that are not finite; repair them or leave them out.")
+        row = np.array([own[subjects[i]] for i in expressive])
+        still = still_vertices(neutrals[row], shapes, still_share) if alignment_vertices is None else alignment_vertices
+        align_in_place(neutrals, gauge, alignment_vertices=still)
+        for k, r in enumerate(row):
+            T = fit_similarity(shapes[k][still], neutrals[r][still], with_scale=gauge == "shape")
+            shapes[k] = T.apply(shapes[k]) - neutrals[r]
+        identity = principal_components(neutrals.reshape(len(neutrals), -1), identity_modes)
+        B, expression_variance, left = _modes_through_zero(shapes.reshape(len(shapes), -1), expression_modes)
+        A, identity_variance = identity.basis, identity.variance
+        shape, rotation = _as_shape_model(A * np.sqrt(identity_variance), B * np.sqrt(expression_variance))
+        basis, stddev = shape
+        model = ShapeModel(
+            mean=identity.mean,
+            basis=basis,
+            stddev=stddev,
+            total_variance=identity.total_variance + float(expression_variance.sum()) + left,
+            n_training=len(meshes),
+            faces=faces,
+            gauge=gauge,
+            landmarks=landmarks or {},
+            provenance=provenance,
+            licence=licence,
+        )
+        return cls(model, rotation, len(identity_variance))
+
+    @property
+    def n_expression(self) -> int:
+        """Number of expression coefficients."""
+        return self.shape.n_modes - self.n_identity
+
+    @cached_property
+    def _to_b(self) -> FloatArray:
+        """[a; e] to b, mm: (K, K)."""
+        return self.shape.stddev[:, None] * self.rotation.T
+
+    def split(self, z: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return identity a (..., Ka) and expression e (..., Ke), in standard deviations, of coefficients z (..., K).
+
+        Raises:
+            InputError: another number of coefficients than the model's, or some that are not finite.
+        """
+        t = self._checked(z) @ self.rotation.T
+        return t[..., : self.n_identity], t[..., self.n_identity :]
+
+    def join(self, a: npt.ArrayLike, e: npt.ArrayLike) -> FloatArray:
+        """Return b (K,), mm, of identity `a` and expression `e`; missing ones are zero: an e of () is the neutral face.
+
+        Raises:
+            InputError: more coefficients than the model has, or some that are not finite.
+        """
+        t = np.zeros(self.shape.n_modes)
+        for start, count, part, what in (
+            (0, self.n_identity, a, "identity"),
+            (self.n_identity, self.n_expression, e, "expression"),
+        ):
+            values = np.atleast_1d(np.asarray(part, dtype=np.float64))
+            if values.ndim != 1 or len(values) > count or not np.isfinite(values).all():
+                raise InputError(f"There are at most {count} finite coefficients of {what}, not {values.shape}.")
+            t[start : start + len(values)] = values
+        return self._to_b @ t
+
+    def mesh(self, a: npt.ArrayLike, e: npt.ArrayLike) -> Mesh:
+        """Return the surface of identity `a` with expression `e`, mm."""
+        return self.shape.mesh(self.join(a, e))
+
+    def transfer(self, z_of: npt.ArrayLike, z_expression: npt.ArrayLike) -> Mesh:
+        """Return the person of coefficients `z_of` (K,) with the expression of `z_expression` (K,), as a mesh in mm."""
+        return self.mesh(self.split(z_of)[0], self.split(z_expression)[1])
+
+    def tie(self, z: npt.ArrayLike, z_stddev: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return one identity and the expressions of several scans of one person, by all their fits together.
+
+        Each fit told z within z_stddev, of which its prior is taken out before all scans are put together under one
+        prior: the normal equations are block-arrow, so a is solved for first and each e after it.
+
+        Args:
+            z: (n, K) coefficients of fits, in standard deviations.
+            z_stddev: (n, K) their standard deviations after the fit, below 1 where the scan told something.
+
+        Returns:
+            a (Ka,) and e (n, Ke), in standard deviations.
+
+        Raises:
+            InputError: arrays of other shapes, or values that are not finite.
+        """
+        z, stddev = self._checked(z), np.asarray(z_stddev, dtype=np.float64)
+        if z.ndim != 2 or stddev.shape != z.shape or not (stddev > 0).all():
+            raise InputError(f"Give (n, {self.shape.n_modes}) coefficients and as many positive standard deviations.")
+        variance = np.minimum(stddev, 0.999) ** 2
+        told = 1.0 / variance - 1.0
+        pulled = z / variance
+        Ra, Re = self.rotation[: self.n_identity], self.rotation[self.n_identity :]
+        left: FloatArray = np.eye(self.n_identity)
+        right: FloatArray = np.zeros(self.n_identity)
+        solves: list[tuple[FloatArray, FloatArray]] = []
+        for h, p in zip(told, pulled, strict=True):
+            cross = (Ra * h) @ Re.T
+            own = (Re * h) @ Re.T + np.eye(self.n_expression)
+            solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, Re @ p])), dtype=np.float64)
+            left = left + (Ra * h) @ Ra.T - cross @ solved[:, :-1]
+            right = right + Ra @ p - cross @ solved[:, -1]
+            solves.append((solved[:, :-1], solved[:, -1]))
+        a: FloatArray = np.asarray(np.linalg.solve(left, right), dtype=np.float64)
+        return a, np.stack([own - with_a @ a for with_a, own in solves])
+
+    def save(self, path: Path | str) -> None:
+        """Write a model file that also reads as the plain shape model.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        arrays, attributes = model_file.contents(self.shape)
+        write_hdf5(
+            Path(path),
+            {**arrays, "split_rotation": self.rotation},
+            {**attributes, "split_identity": self.n_identity, **model_file.made_by(self.shape)},
+        )
+
+    @classmethod
+    def load(cls, path: Path | str) -> AdditiveModel:
+        """Read a model written by `save`.
+
+        Raises:
+            FileError: it cannot be read.
+            ModelFileError: it is damaged, of another version, or does not part identity and expression.
+        """
+        shape = ShapeModel.load(path)
+        arrays, attributes = read_hdf5(Path(path))
+        if "split_rotation" not in arrays or "split_identity" not in attributes:
+            raise ModelFileError(
+                f"{path} does not part identity and expression; build it with --additive and a table of labels."
+            )
+        try:
+            return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
+        except (InputError, ValueError, TypeError) as error:
+            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+
+    def _checked(self, z: npt.ArrayLike) -> FloatArray:
+        array = np.asarray(z, dtype=np.float64)
+        if array.ndim < 1 or array.shape[-1] != self.shape.n_modes or not np.isfinite(array).all():
+            raise InputError(f"Give {self.shape.n_modes} finite coefficients for each shape, not {array.shape}.")
+        return array
+
+
+def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3) -> IntArray:
+    """Return the vertices that move least from `neutrals` to `shapes`, both (N, V, 3): `share` of all.
+
+    They are found in turns with the alignment that they carry; on faces they end on forehead, nose and the outer rim.
+
+    Raises:
+        InputError: a share outside (0, 1], or one that leaves fewer than three vertices.
+    """
+    count = round(share * shapes.shape[1])
+    if not 0 < share <= 1 or count < 3:
+        raise InputError(f"The share of still vertices must leave at least three of them, not {share}.")
+    still: IntArray = np.arange(shapes.shape[1], dtype=np.int32)
+    for _ in range(_STILL_ROUNDS):
+        moved = np.zeros(shapes.shape[1])
+        for neutral, shape in zip(neutrals, shapes, strict=True):
+            T = fit_similarity(shape[still], neutral[still], with_scale=False)
+            moved += ((T.apply(shape) - neutral) ** 2).sum(axis=1)
+        still = np.sort(np.argpartition(moved, count - 1)[:count]).astype(np.int32)
+    return still
+
+
+def _modes_through_zero(data: FloatArray, wanted: int | float | None) -> tuple[FloatArray, FloatArray, float]:
+    """Return modes (D, K) and second moments (K,) about zero of `data` (N, D), and what they leave.
+
+    About zero and not the mean: neutral is zero, and an expression runs along a line through it.
+    """
+    gram = data @ data.T / len(data)
+    values, vectors = eigh(gram)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    total = float(values.sum())
+    if total <= 0:
+        raise InputError("No expression differs from its neutral face, so there is nothing to model.")
+    kept = int((values > _NO_VARIANCE * values[0]).sum())
+    if isinstance(wanted, float):
+        if not 0 < wanted <= 1:
+            raise InputError(f"A share of the variance lies between 0 and 1, not at {wanted}.")
+        kept = min(kept, int(np.searchsorted(np.cumsum(values) / total, wanted - 1e-12)) + 1)
+    elif wanted is not None:
+        if not 1 <= wanted <= kept:
+            raise InputError(f"These expressions give 1 to {kept} modes, so {wanted} cannot be had.")
+        kept = wanted
+    values, vectors = values[:kept], vectors[:, :kept]
+    modes = data.T @ (vectors / np.sqrt(values * len(data)))
+    modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(kept)])
+    return modes, values, total - float(values.sum())
+
+
+def _as_shape_model(A: FloatArray, B: FloatArray) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
+    """Return basis (D, K), stddev (K,) and rotation (K, K) with [A B] t = basis @ (stddev * z) and t = rotation @ z."""
+    W = np.concatenate([A, B], axis=1)
+    orthonormal, upper = np.linalg.qr(W)
+    left, stddev, right = np.linalg.svd(upper)
+    if stddev[-1] <= np.sqrt(_NO_VARIANCE) * stddev[0]:
+        raise InputError("Identity and expression share modes, so they cannot be told apart; ask for fewer modes.")
+    return (orthonormal @ left, stddev), right.T
