@@ -143,6 +143,10 @@ def _add_build(commands: Any) -> None:
                           help="a number; auto for cross-validation on held-out vertices (default); all")  # fmt: skip
     sub.add_argument("--gauge", choices=("form", "shape"), default="shape",
                      help="form: size lives in the modes; shape: size is divided out (default)")  # fmt: skip
+    sub.add_argument("--representation", choices=("vertices", "bspline", "bspline-detail"), default="vertices",
+                     help="what the modes move: vertices (default), or control points of a B-spline surface, without "
+                          "or with the detail of the mean that it cannot hold")  # fmt: skip
+    sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
     sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
     sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
@@ -337,6 +341,8 @@ def _build(arguments: argparse.Namespace) -> int:
         align=not arguments.no_align,
         unit=arguments.unit,
         landmarks=arguments.landmarks,
+        representation=arguments.representation,
+        control_points=arguments.control_points,
         provenance=arguments.provenance,
         licence=arguments.licence,
         seed=arguments.seed,
@@ -518,6 +524,13 @@ def _share(text: str) -> float:
     if not 0 < value <= 1:
         raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
     return value
+
+
+def _control_points(text: str) -> tuple[int, int]:
+    counts = text.lower().split("x")
+    if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
+        raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
+    return int(counts[0]), int(counts[1])
 
 
 def _modes(text: str) -> int | str:

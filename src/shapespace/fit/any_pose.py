@@ -136,7 +136,7 @@ class _ModelSide:
         tree, shapes = KdTree(points).arrays, dict[int, kernels.ShapePoints]()
         rows = (3 * chosen[:, None] + np.arange(3)).ravel()
         for modes in {min(step.modes, model.n_modes) for step in (GLANCE, FLIPS, MIDDLE, FINE, LONG)}:
-            basis = np.ascontiguousarray(model.basis[rows, :modes]).reshape(-1, 3, modes)
+            basis = np.ascontiguousarray(model.vertex_basis[rows, :modes]).reshape(-1, 3, modes)
             precision = 1.0 / model.stddev[:modes] ** 2
             shapes[modes] = kernels.ShapePoints(points, np.ascontiguousarray(normals), basis, precision, tree)
         centre = points.mean(axis=0)

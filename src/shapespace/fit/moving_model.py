@@ -98,9 +98,9 @@ def prepare(model: ShapeModel) -> PreparedModel:
             raise InputError(
                 "The robust method needs a model with triangles; this one has none, so use --method paper."
             )
-        modes = np.ascontiguousarray(model.basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
+        modes = np.ascontiguousarray(model.vertex_basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
         pose = small_poses(model.mean_vertices)
-        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.basis.T @ pose)
+        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.vertex_basis.T @ pose)
     return _PREPARED[model]
 
 

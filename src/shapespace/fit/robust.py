@@ -363,7 +363,7 @@ def in_span(
     # The modes are orthonormal, so they drop out of the normal equations and the pose is left.
     normal = pose.T @ pose - inside.T @ inside
     unit = 1.0 / np.linalg.norm(pose, axis=0)
-    pull = pose.T @ moved - inside.T @ (model.basis[:, :modes].T @ moved)
+    pull = pose.T @ moved - inside.T @ (model.vertex_basis[:, :modes].T @ moved)
     value, vector = np.linalg.eigh(normal * np.outer(unit, unit))
     kept = value > _IN_SPAN
     turn = unit * (vector[:, kept] @ ((vector[:, kept].T @ (unit * pull)) / value[kept]))

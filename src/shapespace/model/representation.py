@@ -2,26 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
 
-from shapespace.types import FloatArray
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.geometry.bspline import DEGREE, SplineSquare, check_counts
+from shapespace.geometry.flatten import disc_map
+from shapespace.types import BoolArray, FloatArray, Mesh, read_only
+
+CONTROL_POINTS = (24, 24)
+"""Along each side of the square, where nobody says how many."""
 
 
 class Representation(Protocol):
-    """Turns vertices into a vector and back; distances are always measured on decoded vertices."""
+    """Turns vertices into a vector and back; distances and inner products are always those of decoded vertices."""
+
+    takes_holes: ClassVar[bool]
+    """Whether `encode` takes vertices that are not-a-number."""
+
+    @classmethod
+    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Representation:
+        """Return the representation of surfaces that correspond to `template`, which is finite.
+
+        Args:
+            template: usually the mean of the training shapes.
+            control_points: along u and v; None for the usual number, or where there are none.
+
+        Raises:
+            InputError: this representation cannot be had of such surfaces.
+        """
+        ...
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Representation:
+        """Return the representation that `arrays` gave.
+
+        Raises:
+            InputError: they do not belong together.
+        """
+        ...
+
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return what a model file keeps of it, by the names of the datasets."""
+        ...
 
     def encode(self, vertices: FloatArray) -> FloatArray:
-        """Return (..., D) from vertices (..., V, 3)."""
+        """Return (..., D) from vertices (..., V, 3), mm."""
         ...
 
     def decode(self, vector: FloatArray) -> FloatArray:
-        """Return vertices (..., V, 3) from (..., D)."""
+        """Return vertices (..., V, 3) from (..., D), mm."""
+        ...
+
+    def directions(self, basis: FloatArray) -> FloatArray:
+        """Return (3V, K): how the vertices move along each column of `basis` (D, K)."""
         ...
 
 
 class Vertices:
     """The paper's representation (eq 1): all coordinates, one vertex after the other, D = 3V."""
+
+    takes_holes: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Vertices:
+        """Return it; `template` is not needed.
+
+        Raises:
+            InputError: `control_points` are given, which vertices do not have.
+        """
+        if control_points is not None:
+            raise InputError("Only B-spline surfaces have control points; choose the representation bspline for them.")
+        return cls()
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Vertices:
+        """Return it; there is nothing to be kept in a file."""
+        return cls()
+
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return nothing."""
+        return {}
 
     def encode(self, vertices: FloatArray) -> FloatArray:
         """Return (..., 3V) from vertices (..., V, 3)."""
@@ -31,6 +95,124 @@ class Vertices:
         """Return vertices (..., V, 3) from (..., 3V)."""
         return vector.reshape(*vector.shape[:-1], -1, 3)
 
+    def directions(self, basis: FloatArray) -> FloatArray:
+        """Return `basis` itself."""
+        return basis
 
-REPRESENTATIONS: Mapping[str, Callable[[], Representation]] = {"vertices": Vertices}
-"""Representations by the name that a model file carries; B-spline control points will join here."""
+
+class BSplineSurface:
+    """Control points of a tensor-product cubic B-spline surface over a one-to-one map of the template, D = 3mn.
+
+    Control points are those of regularised least squares, every vertex counting the same, so that |x| is the same
+    norm as that of `Vertices`. Vertices that are not-a-number have no weight: the thin-plate energy decides there.
+
+    Args:
+        uv: (V, 2) of each vertex on the unit square.
+        counts: m control points along u and n along v; the vector holds x, y, z of (0, 0), then of (0, 1), and so on.
+        detail: (V, 3) mm added to the spline's vertices, the same for every shape; None for nothing.
+
+    Raises:
+        InputError: places off the square, too few or too many control points.
+    """
+
+    takes_holes: ClassVar[bool] = True
+    _keeps_detail: ClassVar[bool] = False
+
+    def __init__(self, uv: FloatArray, counts: tuple[int, int], detail: FloatArray | None = None) -> None:
+        self.spline = SplineSquare(read_only(uv), counts)
+        self.detail = None if detail is None else read_only(detail)
+        if self.detail is not None and not (self.detail.shape == (len(uv), 3) and np.isfinite(self.detail).all()):
+            raise InputError("The detail of a B-spline surface must be one finite offset (3,) a vertex.")
+
+    @classmethod
+    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> BSplineSurface:
+        """Return the surfaces over `disc_map` of `template`.
+
+        Raises:
+            MeshError: the template cannot be spread out on a square.
+            InputError: too few or too many control points.
+        """
+        counts = control_points or CONTROL_POINTS
+        check_counts(counts)
+        if counts[0] * counts[1] > len(template.vertices):
+            raise InputError(
+                f"{counts[0]}x{counts[1]} control points are more than the {len(template.vertices)} vertices of the "
+                "meshes; ask for fewer."
+            )
+        surface = cls(disc_map(template), counts)
+        if not cls._keeps_detail:
+            return surface
+        return cls(surface.spline.uv, counts, template.vertices - surface.decode(surface.encode(template.vertices)))
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> BSplineSurface:
+        """Return the surfaces that `arrays` gave.
+
+        Raises:
+            InputError: one is missing, or they do not belong together.
+        """
+        missing = [name for name in ("uv", "control_counts", "degree") if name not in arrays]
+        if missing or (cls._keeps_detail and "detail" not in arrays):
+            raise InputError(f"A B-spline surface needs the array {(missing or ['detail'])[0]!r}.")
+        if arrays["control_counts"].shape != (2,) or arrays["degree"].shape != () or arrays["degree"] != DEGREE:
+            raise InputError("The B-spline surfaces of this version are cubic, with two numbers of control points.")
+        m, n = (int(count) for count in arrays["control_counts"])
+        detail = arrays["detail"].astype(np.float64) if cls._keeps_detail else None
+        return cls(arrays["uv"].astype(np.float64), (m, n), detail)
+
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return `uv` (V, 2), `control_counts` (2,) and `degree` (), and `detail` (V, 3) where it is kept."""
+        found: dict[str, npt.NDArray[Any]] = {
+            "uv": self.spline.uv,
+            "control_counts": np.array(self.spline.counts, dtype=np.int32),
+            "degree": np.array(DEGREE, dtype=np.int32),
+        }
+        return found if self.detail is None else {**found, "detail": self.detail}
+
+    def encode(self, vertices: FloatArray) -> FloatArray:
+        """Return (..., 3mn) from vertices (..., V, 3), of which some may be not-a-number."""
+        shapes = vertices.reshape(-1, *vertices.shape[-2:])
+        # One by one, so that a shape is coded to the last bit as it is among many.
+        out = np.stack([self._control_points(shape).ravel() for shape in shapes])
+        return out.reshape(*vertices.shape[:-2], -1)
+
+    def _control_points(self, shape: FloatArray) -> FloatArray:
+        plain = shape if self.detail is None else shape - self.detail
+        there: BoolArray = np.logical_and.reduce(np.isfinite(plain), axis=1)
+        if there.all():
+            return self.spline.fit(plain)
+        return self.spline.fit(np.where(there[:, None], plain, 0.0), np.asarray(there, dtype=np.float64))
+
+    def decode(self, vector: FloatArray) -> FloatArray:
+        """Return vertices (..., V, 3) from (..., 3mn).
+
+        Raises:
+            InputError: vectors of another length.
+        """
+        size = 3 * self.spline.counts[0] * self.spline.counts[1]
+        if vector.shape[-1] != size:
+            raise InputError(f"These B-spline surfaces have {size} numbers, not {vector.shape[-1]}.")
+        nets = vector.reshape(-1, size // 3, 3)
+        out = np.stack([self.spline.values(net) for net in nets])
+        if self.detail is not None:
+            out += self.detail
+        return out.reshape(*vector.shape[:-1], -1, 3)
+
+    def directions(self, basis: FloatArray) -> FloatArray:
+        """Return (3V, K) from `basis` (3mn, K)."""
+        D, K = basis.shape
+        return self.spline.values(basis.reshape(D // 3, 3 * K)).reshape(-1, K)
+
+
+class DetailedBSplineSurface(BSplineSurface):
+    """B-spline surfaces that carry what the spline cannot hold of the mean, the same for every shape."""
+
+    _keeps_detail: ClassVar[bool] = True
+
+
+REPRESENTATIONS: Mapping[str, type[Representation]] = {
+    "vertices": Vertices,
+    "bspline": BSplineSurface,
+    "bspline-detail": DetailedBSplineSurface,
+}
+"""Representations by the name that a model file carries."""

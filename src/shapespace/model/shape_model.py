@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,9 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import content_hash
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
-from shapespace.model.pca import principal_components
-from shapespace.model.representation import REPRESENTATIONS, Representation
+from shapespace.model.holes import fill_holes
+from shapespace.model.pca import PrincipalComponents, principal_components
+from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
@@ -35,8 +36,8 @@ class ShapeModel:
     Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b.
 
     Args:
-        mean: (D,) mm; D = 3V for vertices.
-        basis: (D, K) orthonormal columns.
+        mean: (D,) mm; D = 3V for vertices, 3mn for B-splines of m x n control points.
+        basis: (D, K) columns that move the vertices orthonormally; for vertices they are themselves orthonormal.
         stddev: (K,) of each coefficient, mm.
         total_variance: of all modes of the training set, kept or not, mm^2.
         n_training: number of training shapes.
@@ -44,6 +45,7 @@ class ShapeModel:
         gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).
         landmarks: name -> vertex index.
         representation: a name of `REPRESENTATIONS`.
+        coding: the arrays of that representation; none for vertices.
         provenance: what it was made from, in words.
         licence: licence of the training data.
 
@@ -60,6 +62,7 @@ class ShapeModel:
     gauge: Gauge = "shape"
     landmarks: Mapping[str, int] = field(default_factory=lambda: dict[str, int]())
     representation: str = "vertices"
+    coding: Mapping[str, npt.NDArray[Any]] = field(default_factory=lambda: dict[str, npt.NDArray[Any]]())
     provenance: str = ""
     licence: str = ""
 
@@ -87,6 +90,7 @@ class ShapeModel:
         object.__setattr__(self, "landmarks", MappingProxyType({str(k): int(v) for k, v in self.landmarks.items()}))
         object.__setattr__(self, "total_variance", float(self.total_variance))
         object.__setattr__(self, "n_training", int(self.n_training))
+        object.__setattr__(self, "coding", MappingProxyType(dict(self._coder.arrays())))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         object.__setattr__(self, "faces", checked.faces)
         for name, vertex in self.landmarks.items():
@@ -103,6 +107,8 @@ class ShapeModel:
         align: bool = True,
         alignment_vertices: IntArray | None = None,
         landmarks: Mapping[str, int] | None = None,
+        representation: str = "vertices",
+        control_points: tuple[int, int] | None = None,
         provenance: str = "",
         licence: str = "",
         seed: int = 0,
@@ -110,38 +116,52 @@ class ShapeModel:
         """Build the shape space of corresponding `meshes` (eqs 1-5), in mm.
 
         Args:
-            meshes: at least two, same vertices in the same order, same triangles.
+            meshes: at least two, same vertices in the same order, same triangles. For B-splines, vertices that are
+                not-a-number are missing, and filled.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
                 vertices; None for every mode that varies.
             gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
             align: False takes the meshes as they stand.
             alignment_vertices: indices that carry the alignment, such as forehead and nose when expressions vary.
             landmarks: name -> vertex index, kept in the model.
+            representation: `vertices`; `bspline`, control points of a smooth surface; `bspline-detail`, the same
+                with what the spline cannot hold of the mean added to every shape.
+            control_points: along u and v of a B-spline; None for 24 each.
             provenance: what the meshes are, in words.
             licence: of the meshes.
             seed: of the cross-validation.
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.
-            InputError: too few meshes, values that are not finite, no variation, too many modes asked for.
+            MeshError: for B-splines: the surface cannot be spread out on a square.
+            InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
+                representation, control points that cannot be.
         """
+        if representation not in REPRESENTATIONS:
+            raise InputError(
+                f"There is no representation {representation!r}; choose one of {', '.join(REPRESENTATIONS)}."
+            )
+        kind = REPRESENTATIONS[representation]
         faces = common_faces(meshes)
         if len(meshes) < 2:
             raise InputError(
                 f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
             )
         shapes = np.stack([mesh.vertices for mesh in meshes])
-        finite = np.isfinite(shapes).all(axis=(1, 2))
-        if not finite.all():
-            name = meshes[int(np.argmin(finite))].name
-            raise InputError(f"{name} holds vertices that are not finite; repair it or leave it out.")
+        names = [mesh.name for mesh in meshes]
+        if kind.takes_holes and np.isnan(shapes).any():
+            _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
+            fill_holes(shapes, faces, names)
+        _refuse_not_finite(shapes, names)
         _refuse_equal(shapes)
         if align:
-            _refuse_without_extent(meshes)
+            _refuse_without_extent(shapes, names)
             align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-        data = REPRESENTATIONS["vertices"]().encode(shapes)
-        wanted = choose_modes(data, seed=seed).modes if modes == "auto" else modes
-        pc = principal_components(data, wanted)
+        coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), control_points)
+        if isinstance(coder, Vertices):
+            pc = _components(coder.encode(shapes), modes, seed)
+        else:
+            pc = _components_of_codes(coder, shapes, modes, seed)
         return cls(
             mean=pc.mean,
             basis=pc.basis,
@@ -151,13 +171,15 @@ class ShapeModel:
             faces=faces,
             gauge=gauge,
             landmarks=landmarks or {},
+            representation=representation,
+            coding=coder.arrays(),
             provenance=provenance,
             licence=licence,
         )
 
     @cached_property
     def _coder(self) -> Representation:
-        return REPRESENTATIONS[self.representation]()
+        return REPRESENTATIONS[self.representation].from_arrays(self.coding)
 
     @property
     def n_modes(self) -> int:
@@ -175,15 +197,28 @@ class ShapeModel:
         return self._coder.decode(self.mean)
 
     @cached_property
+    def vertex_basis(self) -> FloatArray:
+        """How the vertices move along each mode, (3V, K), orthonormal columns; `basis` itself for vertices."""
+        return self._coder.directions(self.basis)
+
+    @cached_property
     def _modes(self) -> FloatArray:
         """The basis transposed, (K, D): with each mode in one piece both of its products run at memory speed."""
         return np.ascontiguousarray(self.basis.T)
 
+    @cached_property
+    def _vertex_modes(self) -> FloatArray:
+        """The vertex basis transposed, (K, 3V)."""
+        return self._modes if self.vertex_basis is self.basis else np.ascontiguousarray(self.vertex_basis.T)
+
     @property
     def noise_variance(self) -> float:
-        """Variance per coordinate that the kept modes leave over, mm^2 (Tipping and Bishop, JRSS B 61(3), 1999)."""
+        """Variance per coordinate of the vertices that the kept modes leave over, mm^2.
+
+        Tipping and Bishop, JRSS B 61(3), 1999. It counts what a representation cannot hold of how shapes vary.
+        """
         kept = float((self.stddev**2).sum())
-        return max(self.total_variance - kept, 0.0) / max(len(self.mean) - self.n_modes, 1)
+        return max(self.total_variance - kept, 0.0) / max(3 * self.n_vertices - self.n_modes, 1)
 
     @cached_property
     def cumulative_variance(self) -> FloatArray:
@@ -241,17 +276,21 @@ class ShapeModel:
             raise InputError("A shape to be projected must be finite.")
         b = np.zeros(self.n_modes)
         if not align:
-            return self._modes @ (self._coder.encode(vertices) - self.mean)
+            return self._nearest(vertices)
         Q = self.mean_vertices
         for _ in range(_PROJECTION_ITERATIONS):
             # Phase 2 with known matches: pose and coefficients in turn, since modes may hold a little pose.
             T_shape_model = fit_similarity(Q, vertices, with_scale=self.gauge == "shape")
             Q_matched = T_shape_model.inverse().apply(vertices)
-            before, b = b, self._modes @ (self._coder.encode(Q_matched) - self.mean)
+            before, b = b, self._nearest(Q_matched)
             if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
                 break
             Q = self.reconstruct(b)
         return b
+
+    def _nearest(self, vertices: FloatArray) -> FloatArray:
+        """Return the coefficients (K,) of the shape nearest to `vertices` (V, 3) in the model's frame."""
+        return self._vertex_modes @ (vertices - self.mean_vertices).reshape(-1)
 
     def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return coefficients (count, K), mm, drawn from the normal distribution of the model."""
@@ -298,6 +337,38 @@ class ShapeModel:
         return array
 
 
+def _components(data: FloatArray, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
+    return principal_components(data, choose_modes(data, seed=seed).modes if modes == "auto" else modes)
+
+
+def _components_of_codes(
+    coder: Representation, shapes: FloatArray, modes: int | float | Literal["auto"] | None, seed: int
+) -> PrincipalComponents:
+    """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
+
+    What coding loses counts as variance that the modes leave over.
+    """
+    centre = shapes.mean(axis=0)
+    total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)
+    codes = coder.encode(shapes)
+    for shape, code in zip(shapes, codes, strict=True):
+        shape[:] = coder.decode(code)
+    data = shapes.reshape(len(shapes), -1)
+    pc = _components(data, modes, seed)
+    # Modes are sums of the training shapes, and the same sums of their codes decode to them.
+    shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
+    mean = codes.mean(axis=0)
+    return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
+
+
+def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
+    finite = np.isfinite(values).all(axis=(1, 2))
+    if not finite.all():
+        raise InputError(
+            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; repair it or leave it out."
+        )
+
+
 def _refuse_equal(shapes: FloatArray) -> None:
     """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
     spread = float(np.ptp(shapes, axis=0).max())
@@ -305,11 +376,9 @@ def _refuse_equal(shapes: FloatArray) -> None:
         raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
 
 
-def _refuse_without_extent(meshes: Sequence[Mesh]) -> None:
-    for mesh in meshes:
-        centred = mesh.vertices - mesh.vertices.mean(axis=0)
+def _refuse_without_extent(shapes: FloatArray, names: Sequence[str]) -> None:
+    for shape, name in zip(shapes, names, strict=True):
+        centred = shape - shape.mean(axis=0)
         extent = np.linalg.eigvalsh(centred.T @ centred)
         if extent[1] <= 1e-9 * extent[2]:
-            raise InputError(
-                f"{mesh.name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out."
-            )
+            raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out.")

@@ -1,0 +1,119 @@
+"""Tensor-product cubic B-splines on the unit square, fitted to scattered values by regularised least squares.
+
+A function of (u, v) is sum_ij N_i(u) N_j(v) c_ij with m x n coefficients (control points where values are points) on
+uniform clamped knots (de Boor, A Practical Guide to Splines, 2001).
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csr_matrix, kron
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray
+
+DEGREE = 3
+FEWEST, MOST = 4, 64
+"""Control points along each side: a cubic needs four, and beyond 64 the normal equations outgrow memory."""
+_RIDGE = 1e-9
+"""Share of the thin-plate energy that decides what the data leave open."""
+
+
+def check_counts(counts: tuple[int, int]) -> None:
+    """Refuse numbers of control points that cannot be had.
+
+    Raises:
+        InputError: not two numbers, or outside `FEWEST` to `MOST`.
+    """
+    if len(counts) != 2 or not all(FEWEST <= count <= MOST for count in counts):
+        raise InputError(
+            f"A B-spline surface needs {FEWEST} to {MOST} control points along each of two sides, such as 24x24, not "
+            f"{'x'.join(str(count) for count in counts)}."
+        )
+
+
+class SplineSquare:
+    """Splines with fixed control points and fixed places of the data on the square.
+
+    Args:
+        uv: (V, 2) in [0, 1].
+        counts: control points along u and along v, `FEWEST` to `MOST`.
+
+    Raises:
+        InputError: places off the square, or counts that cannot be.
+    """
+
+    def __init__(self, uv: FloatArray, counts: tuple[int, int]) -> None:
+        if uv.ndim != 2 or uv.shape[1] != 2 or not len(uv) or not ((uv >= 0) & (uv <= 1)).all():
+            raise InputError("A B-spline surface needs the place (u, v) of each vertex on the unit square, (V, 2).")
+        check_counts(counts)
+        self.uv = uv
+        self.counts = counts
+        self.matrix: Any = _design_matrix(uv, counts)
+        self._penalty = _RIDGE * len(uv) * thin_plate_energy(counts)
+        self._factor = self._factored(None)
+
+    def values(self, control: FloatArray) -> FloatArray:
+        """Return the spline with coefficients `control` (mn, c) at the places, (V, c)."""
+        return np.asarray(self.matrix @ control)
+
+    def fit(self, values: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+        """Return the coefficients (mn, c) nearest to `values` (V, c), smooth where `weights` (V,) leaves them open.
+
+        Raises:
+            InputError: fewer than three values with weight, or all on a line.
+        """
+        if weights is None:
+            return np.asarray(cast(Any, cho_solve)(self._factor, self.matrix.T @ values))
+        return np.asarray(cast(Any, cho_solve)(self._factored(weights), self.matrix.T @ (weights[:, None] * values)))
+
+    def _factored(self, weights: FloatArray | None) -> Any:
+        B = self.matrix if weights is None else self.matrix.multiply(weights[:, None]).tocsr()
+        normal = np.asarray((B.T @ self.matrix).todense()) + self._penalty
+        try:
+            return cast(Any, cho_factor)(normal, lower=True)
+        except LinAlgError:
+            raise InputError("Too few vertices are there to fit a B-spline surface to them.") from None
+
+
+def _knots(count: int) -> FloatArray:
+    inner = np.linspace(0.0, 1.0, count - DEGREE + 1)
+    return np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+
+
+def _design_matrix(uv: FloatArray, counts: tuple[int, int]) -> Any:
+    """Return the sparse (V, mn) values of each control point's weight at each place; rows sum to one."""
+    along = [BSpline.design_matrix(uv[:, k], _knots(counts[k]), DEGREE).toarray() for k in range(2)]
+    first, second = ((side != 0).argmax(axis=1) for side in along)
+    # A place at a knot has one weight of zero: the window of four is moved inside the row.
+    width = np.arange(DEGREE + 1)
+    i = np.minimum(first, counts[0] - DEGREE - 1)[:, None] + width
+    j = np.minimum(second, counts[1] - DEGREE - 1)[:, None] + width
+    row = np.arange(len(uv))[:, None]
+    values = along[0][row, i][:, :, None] * along[1][row, j][:, None, :]
+    columns = i[:, :, None] * counts[1] + j[:, None, :]
+    pointers = np.arange(len(uv) + 1) * (DEGREE + 1) ** 2
+    return csr_matrix((values.ravel(), columns.ravel(), pointers), (len(uv), counts[0] * counts[1]))
+
+
+def thin_plate_energy(counts: tuple[int, int]) -> FloatArray:
+    """Return E (mn, mn) with c^T E c the integral of f_uu^2 + 2 f_uv^2 + f_vv^2 over the square, exact."""
+    gram = [[_gram(count, order) for order in range(3)] for count in counts]
+    u, v = gram
+    energy = kron(u[2], v[0]) + 2 * kron(u[1], v[1]) + kron(u[0], v[2])
+    return np.asarray(cast(Any, energy).todense())
+
+
+def _gram(count: int, order: int) -> FloatArray:
+    """Return (count, count) integrals of products of the derivatives of that order of the basis splines."""
+    knots = _knots(count)
+    nodes, weights = np.polynomial.legendre.leggauss(DEGREE + 1)
+    edges = np.unique(knots)
+    half = 0.5 * np.diff(edges)
+    x = (edges[:-1, None] + half[:, None] * (nodes + 1)).ravel()
+    values = np.asarray(cast(Any, BSpline(knots, np.eye(count), DEGREE))(x, order), dtype=np.float64)
+    return values.T @ ((half[:, None] * weights).ravel()[:, None] * values)

@@ -1,0 +1,235 @@
+"""A surface spread out on the unit square, so that functions on the square describe it.
+
+`disc_map` is one-to-one for every surface that is a disc but for holes (Tutte 1963; Floater, Math. Comp. 72, 2003):
+its rim lies on a convex curve, every other vertex is an average of its neighbours with positive weights, and each hole
+is closed by one vertex of its own. `cylinder_map` is the height field to compare with: it overlaps where a line from
+the axis meets the surface more than once.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from shapespace.errors import MeshError
+from shapespace.geometry.surface import faces_of
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+
+_ROUNDNESS = 4.0
+"""Exponent of the rim |x|^p + |y|^p = 1: strictly convex, and 93 % of the square (a circle has 79 %)."""
+_MOST_ROUNDS = 40
+_LEAST_GAIN = 2e-3
+_TINY = 1e-9
+
+
+def disc_map(mesh: Mesh) -> FloatArray:
+    """Return where each vertex lies on the unit square, (V, 2): one-to-one, and stretched little.
+
+    Weights are mean value coordinates (Floater, CAGD 20, 2003), which are positive on any triangles, divided round by
+    round by the stretch at the neighbour (Yoshizawa, Belyaev and Seidel, Shape Modeling International 2004). They
+    stay positive, so the map stays one-to-one, and pockets such as nostrils get room.
+
+    Args:
+        mesh: one piece with a rim and any number of holes, the longest border taken for the rim.
+
+    Raises:
+        MeshError: it is no such surface: no triangles, several pieces, closed, edges of three triangles, handles.
+    """
+    faces = faces_of(mesh)
+    vertices, filled, rim = _closed_up(mesh, faces)
+    pinned = _on_rim(vertices, faces, rim)
+    weights = _mean_value_weights(vertices, filled)
+    area = _doubled_areas(vertices, filled)
+    best: tuple[float, FloatArray | None] = (np.inf, None)
+    for _ in range(_MOST_ROUNDS):
+        uv = _averaged(weights, rim, pinned)
+        if (_turning(uv, filled) <= 0).any():
+            break  # so much stretch that rounding folds it
+        squared = _squared_stretch(vertices, uv, filled)
+        whole = float(np.sqrt((area * squared).sum() / area.sum()))
+        if whole > best[0] * (1 - _LEAST_GAIN):
+            if whole < best[0]:
+                best = (whole, uv)
+            break
+        best = (whole, uv)
+        share = np.repeat(area * squared, 3), np.repeat(area, 3)
+        flat = filled.ravel()
+        stretch = np.sqrt(
+            np.bincount(flat, share[0], len(vertices)) / np.maximum(np.bincount(flat, share[1], len(vertices)), _TINY)
+        )
+        weights = weights.multiply(1.0 / np.maximum(stretch, _TINY)[None, :]).tocsr()
+    if best[1] is None:
+        raise MeshError(
+            f"{mesh.name}: its surface cannot be spread out on a square, since triangles fold over; repair it, or use "
+            "the representation vertices."
+        )
+    return np.ascontiguousarray(best[1][: len(mesh.vertices)])
+
+
+def cylinder_map(mesh: Mesh, axis: int = 1) -> FloatArray:
+    """Return angle about an axis and height along it, (V, 2), each scaled to [0, 1]; nothing keeps it one-to-one.
+
+    Args:
+        mesh: with or without triangles.
+        axis: of the frame, 0 to 2; the cylinder's centre is that of the circle nearest to the vertices seen along it.
+    """
+    x = mesh.vertices[:, [(axis + 2) % 3, (axis + 1) % 3]] if axis == 1 else np.delete(mesh.vertices, axis, axis=1)
+    columns = np.column_stack([2 * x, np.ones(len(x))])
+    centre = np.asarray(np.linalg.lstsq(columns, (x**2).sum(axis=1), rcond=None)[0], dtype=np.float64)[:2]
+    around = x - centre
+    middle = around.mean(axis=0)
+    forward, side = around @ middle, around @ np.array([-middle[1], middle[0]])
+    uv = np.column_stack([np.arctan2(side, forward), mesh.vertices[:, axis]])
+    return (uv - uv.min(axis=0)) / np.ptp(uv, axis=0)
+
+
+def folded_triangles(uv: FloatArray, faces: IntArray) -> BoolArray:
+    """Return (F,) True for triangles that lie on the square the other way round than most, or without area.
+
+    Args:
+        uv: (V, 2) of the vertices.
+        faces: (F, 3).
+    """
+    turning = _turning(uv, faces)
+    return turning * np.sign(np.median(np.sign(turning))) <= 0
+
+
+def _turning(uv: FloatArray, faces: IntArray) -> FloatArray:
+    a, b, c = uv[faces[:, 0]], uv[faces[:, 1]], uv[faces[:, 2]]
+    p, q = b - a, c - a
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+
+def _doubled_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _squared_stretch(vertices: FloatArray, uv: FloatArray, faces: IntArray) -> FloatArray:
+    """Return (F,) mean squared length on the surface of a unit step on the square (Sander et al., SIGGRAPH 2001)."""
+    turning = _turning(uv, faces)[:, None]
+    x, s = vertices[faces], uv[faces]
+    along_u = sum(x[:, k] * (s[:, k - 2, 1] - s[:, k - 1, 1])[:, None] for k in range(3)) / turning
+    along_v = sum(x[:, k] * (s[:, k - 1, 0] - s[:, k - 2, 0])[:, None] for k in range(3)) / turning
+    return 0.5 * ((along_u**2).sum(axis=1) + (along_v**2).sum(axis=1))
+
+
+def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return vertices and triangles with every hole closed by a fan about a vertex of its own, and the rim (R,)."""
+    name, count = mesh.name, len(mesh.vertices)
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError(f"{name}: vertices that are not finite have no place on a square; fill or remove them.")
+    advice = "a B-spline surface needs one sheet with a rim; crop or repair it, or use the representation vertices."
+    if np.bincount(faces.ravel(), minlength=count).min() == 0:
+        raise MeshError(f"{name}: some vertices belong to no triangle, but {advice}")
+    start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
+    graph = coo_matrix((np.ones(len(start)), (start, end)), (count, count))
+    pieces = int(cast(Any, connected_components(graph, directed=False))[0])
+    if pieces > 1:
+        raise MeshError(f"{name}: its surface is in {pieces} pieces, but {advice}")
+    keys = start * count + end
+    if len(np.unique(keys)) < len(keys):
+        raise MeshError(
+            f"{name}: an edge has more than two triangles, or neighbours that face opposite ways, but {advice}"
+        )
+    open_side = np.logical_not(np.isin(end * count + start, keys))
+    if not open_side.any():
+        raise MeshError(f"{name}: its surface is closed, but {advice}")
+    loops = _loops(start[open_side], end[open_side])
+    if loops is None:
+        raise MeshError(f"{name}: parts of its border touch each other at a vertex, but {advice}")
+    edges = (len(keys) + int(open_side.sum())) // 2
+    if count - edges + len(faces) + len(loops) != 2:
+        raise MeshError(f"{name}: its surface has handles or is pinched, but {advice}")
+    length = [np.linalg.norm(np.diff(mesh.vertices[[*loop, loop[0]]], axis=0), axis=1).sum() for loop in loops]
+    rim = loops.pop(int(np.argmax(length)))
+    vertices, filled = [mesh.vertices], [faces]
+    for hole in loops:
+        centre = np.full(len(hole), count, dtype=np.int32)
+        filled.append(np.column_stack([np.roll(hole, -1), hole, centre]).astype(np.int32))
+        vertices.append(mesh.vertices[hole].mean(axis=0, keepdims=True))
+        count += 1
+    return np.concatenate(vertices), np.concatenate(filled), rim
+
+
+def _loops(start: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> list[IntArray] | None:
+    """Return the closed borders, each (n,) in the direction of its triangles; None if two meet at a vertex."""
+    following = dict(zip(start.tolist(), end.tolist(), strict=True))
+    if len(following) < len(start):
+        return None
+    loops: list[IntArray] = []
+    while following:
+        loop = [next(iter(following))]
+        while loop[-1] in following:
+            loop.append(following.pop(loop[-1]))
+        loops.append(np.array(loop[:-1], dtype=np.int32))
+    return loops
+
+
+def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
+    """Return (R, 2) where the rim's vertices lie: by length along it, turned as the surface lies in its main plane."""
+    points = vertices[rim]
+    steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    steps = np.maximum(steps, _TINY * steps.sum())
+    at = (np.cumsum(steps) - steps) / steps.sum()
+    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    centred = points - points.mean(axis=0)
+    if np.linalg.norm(normal) > 0:
+        normal = normal / np.linalg.norm(normal)
+        centred = centred - np.outer(centred @ normal, normal)
+    main = np.linalg.svd(centred, full_matrices=False)[2][0]
+    main = main * np.sign(main[np.argmax(np.abs(main))])
+    # The first harmonic of the rim tells at which angle it starts.
+    plane = centred @ np.cross(main, normal) + 1j * (centred @ main)
+    phase = np.angle((plane * np.exp(-2j * np.pi * at) * steps).sum()) / (2 * np.pi)
+    angle = np.linspace(0.0, 2 * np.pi, 4097)
+    curve = _rim_curve(angle)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    theta = np.asarray(cast(Any, np.interp)((at + phase) % 1.0, along / along[-1], angle), dtype=np.float64)
+    return 0.5 + 0.5 * _rim_curve(theta)
+
+
+def _rim_curve(angle: FloatArray) -> FloatArray:
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return around / (np.abs(around) ** _ROUNDNESS).sum(axis=1, keepdims=True) ** (1 / _ROUNDNESS)
+
+
+def _mean_value_weights(vertices: FloatArray, faces: IntArray) -> Any:
+    """Return the sparse (V, V) weights that each row's vertex gives its neighbours, positive everywhere."""
+    rows: list[IntArray] = []
+    columns: list[IntArray] = []
+    values: list[FloatArray] = []
+    for k in range(3):
+        i, j, h = faces[:, k], faces[:, k - 2], faces[:, k - 1]
+        p, q = vertices[j] - vertices[i], vertices[h] - vertices[i]
+        length = np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)
+        floor = _TINY * max(length[0].max(), length[1].max())
+        bottom = np.maximum(length[0] * length[1] + (p * q).sum(axis=1), floor**2)
+        half = np.clip(np.linalg.norm(np.cross(p, q), axis=1) / bottom, 1e-4, 1e4)
+        for other, far in ((j, length[0]), (h, length[1])):
+            rows.append(i)
+            columns.append(other)
+            values.append(half / np.maximum(far, floor))
+    every = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return coo_matrix(every, (len(vertices), len(vertices))).tocsr()
+
+
+def _averaged(weights: Any, rim: IntArray, pinned: FloatArray) -> FloatArray:
+    """Return (V, 2): the rim at `pinned`, every other vertex the weighted average of its neighbours."""
+    count = weights.shape[0]
+    free = np.ones(count, dtype=np.bool_)
+    free[rim] = False
+    uv = np.zeros((count, 2))
+    uv[rim] = pinned
+    if free.any():
+        inner = weights[free]
+        total = np.asarray(inner.sum(axis=1)).ravel()
+        system = (-inner[:, free]).tocsc()
+        system.setdiag(total)
+        uv[free] = cast(Any, splu(system)).solve(np.asarray(inner[:, ~free] @ uv[~free]))
+    return uv
