@@ -100,6 +100,8 @@ def build(
     licence: str,
     seed: int,
     quiet: bool,
+    representation: str = "vertices",
+    control_points: tuple[int, int] | None = None,
 ) -> tuple[ShapeModel, list[str]]:
     """Build a model from mesh files and save it; return it and what the user should know.
 
@@ -145,6 +147,8 @@ def build(
         gauge=gauge,
         align=align,
         landmarks=marks,
+        representation=representation,
+        control_points=control_points,
         provenance=provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}",
         licence=licence,
         seed=seed,
@@ -182,7 +186,9 @@ def _landmark_indices(path: Path, first: Mesh, mm: float) -> dict[str, int]:
         except FileFormatError:
             pass  # a CSV of points, not of indices
     points = read_landmarks(path)
-    return {name: int(np.linalg.norm(first.vertices - mm * point, axis=1).argmin()) for name, point in points.items()}
+    # argmin takes a vertex that is missing, and so not-a-number, for the least.
+    there = np.where(np.isnan(first.vertices), np.inf, first.vertices)
+    return {name: int(np.linalg.norm(there - mm * point, axis=1).argmin()) for name, point in points.items()}
 
 
 def info(path: Path) -> dict[str, Any]:
@@ -202,6 +208,7 @@ def info(path: Path) -> dict[str, Any]:
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:
     """Return the facts of a model as plain values."""
+    counts = model.coding.get("control_counts")
     needed = {f"{share:g}": model.modes_for_variance(share) for share in (0.9, 0.95, 0.98, 0.985, 0.99)}
     return {
         "vertices": model.n_vertices,
@@ -217,6 +224,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
         "representation": model.representation,
+        **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,
         "licence": model.licence,
         "hash": model.content_hash,
