@@ -24,7 +24,7 @@ from shapespace.geometry.doctor import examine
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_bytes, read_error, remove_file, write_bytes, write_text
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
-from shapespace.io.meshes import MESH_FORMATS, read_mesh
+from shapespace.io.meshes import MESH_ENDINGS, read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, Mesh
 
@@ -62,12 +62,12 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             inside = sorted(
                 p
                 for p in path.iterdir()
-                if p.is_file() and p.suffix.lower() in MESH_FORMATS and not p.name.startswith(".")
+                if p.is_file() and p.suffix.lower() in MESH_ENDINGS and not p.name.startswith(".")
             )
         except OSError as error:
             raise read_error(path, error) from error
         if not inside:
-            raise InputError(f"{path} holds no meshes; shapespace reads {', '.join(MESH_FORMATS)}.")
+            raise InputError(f"{path} holds no meshes; shapespace reads {', '.join(MESH_ENDINGS)}.")
         found += inside
     return found
 

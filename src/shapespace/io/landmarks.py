@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -44,10 +45,13 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the
     label, points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes
     before. 3D Slicer files are returned in LPS, the frame in which Slicer saves meshes: RAS is turned by
-    changing the sign of x and y. CSV is `name,x,y,z`, with or without that header, `#` for comments.
+    changing the sign of x and y. CSV is `name,x,y,z`, with or without that header, `#` for comments. The points of
+    BU-3DFE (`.bnd`, a vertex number and x y z in each row) have no names: they are called `point_0`, ... by their
+    position in the file. Bosphorus (`.lm3`) names its points.
 
     Args:
-        path: a file with one of the endings in `LANDMARK_FORMATS`; `.json` is told apart by its content.
+        path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; `.json` is told
+            apart by its content.
 
     Returns:
         name -> (3,) float64, in the file's order.
@@ -58,7 +62,8 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
             landmarks at all.
     """
     path = Path(path)
-    pairs = _format(path, "read").read(_content(path), path)
+    read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
+    pairs = read(_content(path), path)
     if not pairs:
         raise damaged(path, "it holds no landmarks")
     landmarks: dict[str, FloatArray] = {}
@@ -141,10 +146,9 @@ def _format(path: Path, verb: str) -> LandmarkFormat:
     for ending in sorted(LANDMARK_FORMATS, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return LANDMARK_FORMATS[ending]
-    raise FileFormatError(
-        f"Cannot {verb} {path}: the ending '{path.suffix}' is not a landmark format; use one of "
-        f"{', '.join(LANDMARK_FORMATS)}."
-    )
+    endings = [*LANDMARK_FORMATS, *(READ_ONLY_LANDMARKS if verb == "read" else ())]
+    what = "can be read, not written" if path.suffix.lower() in READ_ONLY_LANDMARKS else "is not a landmark format"
+    raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}.")
 
 
 def _content(path: Path) -> bytes:
@@ -359,6 +363,35 @@ def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
     return _csv_text([["name", "x", "y", "z"], *rows])
 
 
+def _text_lines(data: bytes) -> list[str]:
+    return [line.strip() for line in data.decode("utf-8-sig", "replace").splitlines()]
+
+
+def _read_bnd(data: bytes, path: Path) -> Pairs:
+    out: Pairs = []
+    for line in filter(None, _text_lines(data)):
+        words = line.replace(",", " ").split()
+        name = f"point_{len(out)}"
+        if len(words) != 4 or not words[0].isascii() or not words[0].isdecimal():
+            raise damaged(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
+        out.append((name, _point(words[1:], name, path)))
+    return out
+
+
+def _read_lm3(data: bytes, path: Path) -> Pairs:
+    lines = [line for line in _text_lines(data) if line]
+    counted = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
+    at, count = next(((i, int(m[1])) for i, m in enumerate(counted) if m), (0, -1))
+    if count < 0:
+        raise damaged(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
+    rest = lines[at + 1 :]
+    if len(rest) != 2 * count:
+        raise damaged(path, f"it says {count} landmarks, but {len(rest)} lines follow; it is damaged or cut short")
+    return [
+        (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(rest[::2], rest[1::2], strict=True)
+    ]
+
+
 LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
         ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
@@ -368,4 +401,9 @@ LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
     }
 )
-"""File name ending -> format: the one place where landmark formats are listed."""
+"""File name ending -> landmark format that is read and written."""
+
+READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxyType(
+    {".bnd": _read_bnd, ".lm3": _read_lm3}
+)
+"""File name ending -> reader (content, path) -> names and points, for formats that are not written."""

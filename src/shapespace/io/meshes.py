@@ -10,12 +10,15 @@ from types import MappingProxyType
 import numpy as np
 
 from shapespace.errors import FileFormatError
+from shapespace.io.bnt import read_bnt
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
 from shapespace.io.obj import read_obj, write_obj
 from shapespace.io.off import read_off, write_off
 from shapespace.io.ply import read_ply, write_ply
+from shapespace.io.raw import read_raw
 from shapespace.io.stl import read_stl, write_stl
+from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
 from shapespace.types import Mesh
 
@@ -48,7 +51,7 @@ def read_mesh(path: Path | str) -> Mesh:
     equal ones are merged in the order of first appearance). Polygons become fans of triangles.
 
     Args:
-        path: a file with one of the endings in `MESH_FORMATS`, in any case.
+        path: a file with one of the endings in `MESH_ENDINGS`, in any case.
 
     Returns:
         The mesh as the file has it, with whatever is wrong with it.
@@ -59,13 +62,13 @@ def read_mesh(path: Path | str) -> Mesh:
         MeshError: faces that point past the end of the vertices.
     """
     path = Path(path)
-    mesh_format = _format(path, "read")
+    read = READ_ONLY_FORMATS.get(path.suffix.lower()) or _format(path, "read").read
     data = read_bytes(path)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
     with np.errstate(invalid="ignore", over="ignore"):
-        return mesh_format.read(data, path)
+        return read(data, path)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
@@ -87,9 +90,11 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 def _format(path: Path, verb: str) -> MeshFormat:
     found = MESH_FORMATS.get(path.suffix.lower())
     if found is None:
+        known = path.suffix.lower() in READ_ONLY_FORMATS
+        what = "can be read, not written" if known else "is not a mesh format"
+        endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
         raise FileFormatError(
-            f"Cannot {verb} {path}: the ending '{path.suffix}' is not a mesh format; use one of "
-            f"{', '.join(MESH_FORMATS)}."
+            f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}."
         )
     return found
 
@@ -111,4 +116,12 @@ MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
         ".gltf": MeshFormat("glTF", read_gltf, write_gltf, exact=False),
     }
 )
-"""File name ending -> format: the one place where formats are listed."""
+"""File name ending -> format that is read and written."""
+
+READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType(
+    {".wrl": read_vrml, ".raw": read_raw, ".bnt": read_bnt}
+)
+"""File name ending -> reader (content, path) -> mesh, for formats that are not written."""
+
+MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
+"""The endings that `read_mesh` takes."""

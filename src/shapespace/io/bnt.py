@@ -1,0 +1,104 @@
+"""Bosphorus (`.bnt`): a scan as a grid of points seen from the front.
+
+Layout, as in the database's own reader (A. Savran, `read_bntfile`, 2008), little-endian and without padding: uint16
+rows, uint16 columns, float64 zmin, uint16 length of the image's name, the name, uint32 count (5 · rows · columns), then
+five runs of rows · columns float64: x, y, z in mm, and two image coordinates from 0 to 1. Where z is zmin there is no
+point.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, mesh_of
+from shapespace.types import FloatArray, Mesh
+
+_HEADER = struct.Struct("<HHdH")
+_COUNT = struct.Struct("<I")
+_COLUMNS = 5
+# Of a surface seen at an angle the steps grow by 1 / cos: 8 keeps what is turned up to 82 degrees from the camera.
+_LONGEST_STEPS = 8.0
+
+
+def read_bnt(data: bytes, path: Path) -> Mesh:
+    """Read a Bosphorus scan: its points row by row, missing ones left out, and triangles between neighbours.
+
+    Each cell of the grid gives two triangles where its four corners are there, one where three are. A triangle with an
+    edge longer than 8 times the median step between neighbours spans a jump in depth and is left out. The faces are
+    turned so that the surface looks along +z, towards the camera.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages and the mesh's name.
+
+    Raises:
+        FileFormatError: the header contradicts itself or the length of the file, or no point is there.
+    """
+    if len(data) < _HEADER.size:
+        raise damaged(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
+    rows, columns, zmin, name_length = _HEADER.unpack_from(data)
+    at = _HEADER.size + name_length
+    if len(data) < at + _COUNT.size:
+        raise damaged(path, f"its header is cut off; {CUT_SHORT}")
+    (count,) = _COUNT.unpack_from(data, at)
+    at += _COUNT.size
+    points = rows * columns
+    if not points or count != _COLUMNS * points:
+        raise damaged(
+            path,
+            f"its header declares {rows} rows, {columns} columns and {count} numbers, which is no Bosphorus file "
+            "(5 numbers a point)",
+        )
+    check_count(count, 8, len(data) - at, "numbers", path)
+    if not math.isfinite(zmin):
+        raise damaged(path, "its depth of missing points is not finite, so it is damaged")
+    grid = np.frombuffer(data, dtype="<f8", count=3 * points, offset=at).reshape(3, points).T.astype(np.float64)
+    # zmin is the least depth there is.
+    there = ~(grid[:, 2] <= zmin)
+    if not there.any():
+        raise damaged(path, "all its points are missing")
+    number = np.full(points, -1, dtype=np.int64)
+    number[there] = np.arange(int(there.sum()))
+    vertices = grid[there]
+    faces = grid_triangles(number.reshape(rows, columns), vertices)
+    return mesh_of(vertices, faces, path)
+
+
+def grid_triangles(number: IndexArray, vertices: FloatArray) -> IndexArray:
+    """Return the triangles (F, 3) between neighbours in a grid, turned to look along +z.
+
+    Args:
+        number: (R, C) which vertex stands where, -1 for none.
+        vertices: (V, 3) float64, in any unit.
+    """
+    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
+    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    has_a, has_b, has_c, has_d = a >= 0, b >= 0, c >= 0, d >= 0
+    corners = [
+        (has_a & has_b & has_c, (a, c, b)),
+        (has_b & has_c & has_d, (b, c, d)),
+        (has_a & has_c & has_d & ~has_b, (a, c, d)),
+        (has_a & has_b & has_d & ~has_c, (a, d, b)),
+    ]
+    faces = np.concatenate([np.stack([corner[whole] for corner in triple], axis=1) for whole, triple in corners])
+    steps = np.concatenate([_steps(number[:, :-1], number[:, 1:], vertices), _steps(number[:-1], number[1:], vertices)])
+    steps = steps[np.isfinite(steps)]
+    if not len(steps):
+        return faces[:0]
+    at = vertices[faces]
+    edges = np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2)
+    # A comparison with NaN is false, so that triangles at points that are no numbers go too.
+    keep = (edges <= _LONGEST_STEPS * np.median(steps)).all(axis=1)
+    faces, at = faces[keep], at[keep]
+    along, across = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    towards = float((along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).sum())
+    return faces[:, ::-1] if towards < 0 else faces
+
+
+def _steps(one: IndexArray, other: IndexArray, vertices: FloatArray) -> FloatArray:
+    both = (one >= 0) & (other >= 0)
+    return np.linalg.norm(vertices[one[both]] - vertices[other[both]], axis=1)
