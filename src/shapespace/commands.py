@@ -25,6 +25,7 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_bytes, read_error, remove_file, write_bytes, write_text
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, Mesh
 
@@ -115,6 +116,7 @@ def build(
     notes: list[str] = []
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
+    representation_named(representation, control_points)
     make_folder(output.absolute().parent)
     loaded: list[Mesh] = []
     with progress_bar(len(files), "reading", "mesh", quiet=quiet) as bar:

@@ -19,8 +19,8 @@ from shapespace.types import FloatArray
 DEGREE = 3
 FEWEST, MOST = 4, 64
 """Control points along each side: a cubic needs four, and beyond 64 the normal equations outgrow memory."""
-_RIDGE = 1e-9
-"""Share of the thin-plate energy that decides what the data leave open."""
+LEAST_SMOOTHNESS = 1e-9
+"""Decides where the data leave the spline open, and hardly moves it elsewhere."""
 
 
 def check_counts(counts: tuple[int, int]) -> None:
@@ -42,19 +42,20 @@ class SplineSquare:
     Args:
         uv: (V, 2) in [0, 1].
         counts: control points along u and along v, `FEWEST` to `MOST`.
+        smoothness: weight of the thin-plate energy (`thin_plate_energy`) beside the mean squared distance.
 
     Raises:
         InputError: places off the square, or counts that cannot be.
     """
 
-    def __init__(self, uv: FloatArray, counts: tuple[int, int]) -> None:
+    def __init__(self, uv: FloatArray, counts: tuple[int, int], smoothness: float = LEAST_SMOOTHNESS) -> None:
         if uv.ndim != 2 or uv.shape[1] != 2 or not len(uv) or not ((uv >= 0) & (uv <= 1)).all():
             raise InputError("A B-spline surface needs the place (u, v) of each vertex on the unit square, (V, 2).")
         check_counts(counts)
         self.uv = uv
         self.counts = counts
         self.matrix: Any = _design_matrix(uv, counts)
-        self._penalty = _RIDGE * len(uv) * thin_plate_energy(counts)
+        self._penalty = smoothness * len(uv) * thin_plate_energy(counts)
         self._factor = self._factored(None)
 
     def values(self, control: FloatArray) -> FloatArray:

@@ -24,6 +24,15 @@ class Representation(Protocol):
     """Whether `encode` takes vertices that are not-a-number."""
 
     @classmethod
+    def check(cls, control_points: tuple[int, int] | None) -> None:
+        """Refuse numbers of control points that it cannot have, before any mesh is read.
+
+        Raises:
+            InputError: they cannot be.
+        """
+        ...
+
+    @classmethod
     def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Representation:
         """Return the representation of surfaces that correspond to `template`, which is finite.
 
@@ -68,14 +77,23 @@ class Vertices:
     takes_holes: ClassVar[bool] = False
 
     @classmethod
+    def check(cls, control_points: tuple[int, int] | None) -> None:
+        """Refuse any control points.
+
+        Raises:
+            InputError: they are given.
+        """
+        if control_points is not None:
+            raise InputError("Only B-spline surfaces have control points; choose the representation bspline for them.")
+
+    @classmethod
     def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Vertices:
         """Return it; `template` is not needed.
 
         Raises:
-            InputError: `control_points` are given, which vertices do not have.
+            InputError: `control_points` are given.
         """
-        if control_points is not None:
-            raise InputError("Only B-spline surfaces have control points; choose the representation bspline for them.")
+        cls.check(control_points)
         return cls()
 
     @classmethod
@@ -123,6 +141,17 @@ class BSplineSurface:
         self.detail = None if detail is None else read_only(detail)
         if self.detail is not None and not (self.detail.shape == (len(uv), 3) and np.isfinite(self.detail).all()):
             raise InputError("The detail of a B-spline surface must be one finite offset (3,) a vertex.")
+        # Nothing but for rounding and smoothing; with it the template comes back exactly.
+        self._net_of_detail = 0.0 if self.detail is None else self.spline.fit(self.detail)
+
+    @classmethod
+    def check(cls, control_points: tuple[int, int] | None) -> None:
+        """Refuse too few or too many control points.
+
+        Raises:
+            InputError: there are too few or too many.
+        """
+        check_counts(control_points or CONTROL_POINTS)
 
     @classmethod
     def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> BSplineSurface:
@@ -132,8 +161,8 @@ class BSplineSurface:
             MeshError: the template cannot be spread out on a square.
             InputError: too few or too many control points.
         """
+        cls.check(control_points)
         counts = control_points or CONTROL_POINTS
-        check_counts(counts)
         if counts[0] * counts[1] > len(template.vertices):
             raise InputError(
                 f"{counts[0]}x{counts[1]} control points are more than the {len(template.vertices)} vertices of the "
@@ -179,9 +208,8 @@ class BSplineSurface:
     def _control_points(self, shape: FloatArray) -> FloatArray:
         plain = shape if self.detail is None else shape - self.detail
         there: BoolArray = np.logical_and.reduce(np.isfinite(plain), axis=1)
-        if there.all():
-            return self.spline.fit(plain)
-        return self.spline.fit(np.where(there[:, None], plain, 0.0), np.asarray(there, dtype=np.float64))
+        weights = None if there.all() else np.asarray(there, dtype=np.float64)
+        return self.spline.fit(np.where(there[:, None], plain, 0.0), weights) + self._net_of_detail
 
     def decode(self, vector: FloatArray) -> FloatArray:
         """Return vertices (..., V, 3) from (..., 3mn).
@@ -216,3 +244,15 @@ REPRESENTATIONS: Mapping[str, type[Representation]] = {
     "bspline-detail": DetailedBSplineSurface,
 }
 """Representations by the name that a model file carries."""
+
+
+def representation_named(name: str, control_points: tuple[int, int] | None) -> type[Representation]:
+    """Return the representation of that name, which can have these control points.
+
+    Raises:
+        InputError: there is none, or it cannot.
+    """
+    if name not in REPRESENTATIONS:
+        raise InputError(f"There is no representation {name!r}; choose one of {', '.join(REPRESENTATIONS)}.")
+    REPRESENTATIONS[name].check(control_points)
+    return REPRESENTATIONS[name]

@@ -21,7 +21,7 @@ from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.holes import fill_holes
 from shapespace.model.pca import PrincipalComponents, principal_components
-from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices
+from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
@@ -137,11 +137,7 @@ class ShapeModel:
             InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
                 representation, control points that cannot be.
         """
-        if representation not in REPRESENTATIONS:
-            raise InputError(
-                f"There is no representation {representation!r}; choose one of {', '.join(REPRESENTATIONS)}."
-            )
-        kind = REPRESENTATIONS[representation]
+        kind = representation_named(representation, control_points)
         faces = common_faces(meshes)
         if len(meshes) < 2:
             raise InputError(
