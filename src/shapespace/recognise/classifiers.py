@@ -1,0 +1,290 @@
+"""Classifiers of whitened coefficients z: scikit-learn pipelines by name, and our own nearest mean direction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import log_softmax, softmax
+
+from shapespace.recognise.learn import (
+    SVC,
+    BaseEstimator,
+    ClassifierMixin,
+    KNeighborsClassifier,
+    LogisticRegression,
+    Pipeline,
+    QuadraticDiscriminantAnalysis,
+    StandardScaler,
+    StratifiedKFold,
+    check_classification_targets,
+    check_is_fitted,
+    validate_data,
+)
+from shapespace.types import FloatArray
+
+LDA_SHRINKAGE = 0.1
+"""Share of the round covariance in that of the LDA, unless cross-validation chooses another."""
+
+_COLDEST, _HOTTEST = 0.02, 10.0
+
+
+class NearestMeanDirection(ClassifierMixin, BaseEstimator):
+    """The class whose mean direction has the largest cosine with a sample, seen from the origin (the paper, figure 9).
+
+    Meant for coefficients relative to the subject's neutral: an expression at another intensity then lies in the same
+    direction. Probabilities are a softmax of the cosines over a temperature, at which the training samples, each left
+    out of its own mean, are most likely. A sample at the origin has no direction and equal probabilities.
+
+    Args:
+        temperature: of the softmax; None finds it in `fit`.
+
+    Attributes:
+        classes_: (C,) the classes, sorted.
+        directions_: (C, K) mean directions, of length 1, or 0 where a class has none.
+        temperature_: the temperature in use.
+    """
+
+    def __init__(self, temperature: float | None = None) -> None:
+        self.temperature = temperature
+
+    def fit(self, X: Any, y: Any) -> NearestMeanDirection:
+        """Take the mean directions of samples `X` (n, K) with classes `y` (n,).
+
+        Raises:
+            ValueError: arrays that do not belong together, values that are not finite, a temperature not above 0.
+        """
+        X, y = validate_data(self, X, y, dtype=np.float64)
+        check_classification_targets(y)
+        if self.temperature is not None and not self.temperature > 0:
+            raise ValueError(f"The temperature must be above 0, not {self.temperature!r}.")
+        self.classes_, own = np.unique(y, return_inverse=True)
+        unit = _directions(X)
+        sums = np.eye(len(self.classes_))[own].T @ unit
+        self.directions_ = _directions(sums)
+        self.temperature_ = self.temperature or _likeliest_temperature(_left_out_cosines(unit, sums, own), own)
+        return self
+
+    def predict_proba(self, X: Any) -> FloatArray:
+        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
+        return np.asarray(softmax(self._cosines(X) / self.temperature_, axis=1))
+
+    def predict(self, X: Any) -> Any:
+        """Return the class (n,) of samples `X` (n, K)."""
+        best = self._cosines(X).argmax(axis=1)
+        return self.classes_[best]
+
+    def _cosines(self, X: Any) -> FloatArray:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return np.asarray(_directions(X) @ self.directions_.T)
+
+
+class ShrinkageLDA(ClassifierMixin, BaseEstimator):
+    """Linear discriminant analysis in closed form, with the pooled covariance S shrunk towards a round one.
+
+    S becomes (1 - a) S + a tr(S) / K I, as in scikit-learn's `LinearDiscriminantAnalysis(solver="lsqr", shrinkage=a)`,
+    which gives the same predictions. Ours does not pretend to transform, and permutation tests call `linear_rule`.
+
+    Args:
+        shrinkage: a, from 0 to 1.
+
+    Attributes:
+        classes_: (C,) the classes, sorted.
+        coef_: (C, K) and
+        intercept_: (C,), of the log probabilities up to a common term.
+    """
+
+    def __init__(self, shrinkage: float = LDA_SHRINKAGE) -> None:
+        self.shrinkage = shrinkage
+
+    def fit(self, X: Any, y: Any) -> ShrinkageLDA:
+        """Fit to samples `X` (n, K) with classes `y` (n,).
+
+        Raises:
+            ValueError: arrays that do not belong together, values that are not finite, shrinkage outside 0 to 1.
+        """
+        X, y = validate_data(self, X, y, dtype=np.float64)
+        check_classification_targets(y)
+        if not 0 <= self.shrinkage <= 1:
+            raise ValueError(f"The shrinkage must lie from 0 to 1, not {self.shrinkage!r}.")
+        self.classes_, own = np.unique(y, return_inverse=True)
+        self.coef_, self.intercept_ = linear_rule(X, np.eye(len(self.classes_))[own], X.T @ X, self.shrinkage)
+        return self
+
+    def predict_proba(self, X: Any) -> FloatArray:
+        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
+        return np.asarray(softmax(self._scores(X), axis=1))
+
+    def predict(self, X: Any) -> Any:
+        """Return the class (n,) of samples `X` (n, K)."""
+        best = self._scores(X).argmax(axis=1)
+        return self.classes_[best]
+
+    def _scores(self, X: Any) -> FloatArray:
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return np.asarray(X @ self.coef_.T + self.intercept_)
+
+
+def linear_rule(X: FloatArray, member: FloatArray, gram: FloatArray, shrinkage: float) -> tuple[FloatArray, FloatArray]:
+    """Return the coefficients (C, K) and intercepts (C,) of the linear discriminants.
+
+    Args:
+        X: (n, K) samples.
+        member: (n, C) one where the sample is of the class, else zero; each class has a sample.
+        gram: (K, K) X.T @ X, which stays when labels are shuffled.
+        shrinkage: share of the round covariance.
+    """
+    counts = member.sum(axis=0)
+    sums = member.T @ X
+    means = sums / counts[:, None]
+    pooled = (gram - sums.T @ means) / len(X)
+    K = X.shape[1]
+    shrunk = (1 - shrinkage) * pooled + shrinkage * np.trace(pooled) / K * np.eye(K)
+    coef = np.asarray(np.linalg.lstsq(shrunk, means.T, rcond=None)[0], dtype=np.float64).T
+    return coef, -0.5 * (coef * means).sum(axis=1) + np.log(counts / len(X))
+
+
+class CalibratedSVC(ClassifierMixin, BaseEstimator):
+    """A support vector machine with a Gaussian kernel whose probabilities come from its calibrated decision function.
+
+    Probabilities are a softmax of the decision values over a temperature, at which the training samples are most likely
+    under machines that did not see them (three stratified folds). `SVC(probability=True)` is deprecated in
+    scikit-learn, and its probabilities may disagree with its predictions; these do not.
+
+    Args:
+        C: how much a sample on the wrong side costs.
+        temperature: of the softmax; None finds it in `fit`, which takes three more machines.
+        random_state: of the folds.
+
+    Attributes:
+        classes_: (C,) the classes, sorted.
+        machine_: the fitted `SVC`.
+        temperature_: the temperature in use; 1 where a class has one sample only.
+    """
+
+    def __init__(self, C: float = 3.0, temperature: float | None = None, random_state: int | None = None) -> None:
+        self.C = C
+        self.temperature = temperature
+        self.random_state = random_state
+
+    def fit(self, X: Any, y: Any) -> CalibratedSVC:
+        """Fit to samples `X` (n, K) with classes `y` (n,).
+
+        Raises:
+            ValueError: arrays that do not belong together, values that are not finite, fewer than two classes.
+        """
+        X, y = validate_data(self, X, y, dtype=np.float64)
+        check_classification_targets(y)
+        self.classes_, own = np.unique(y, return_inverse=True)
+        if self.temperature is not None and not self.temperature > 0:
+            raise ValueError(f"The temperature must be above 0, not {self.temperature!r}.")
+        if len(self.classes_) < 2:
+            raise ValueError("A support vector machine needs at least two classes; the samples have one class.")
+        self.machine_ = SVC(C=self.C).fit(X, own)
+        folds = min(3, int(np.bincount(own).min()))
+        self.temperature_ = self.temperature or 1.0
+        if self.temperature is None and folds > 1:
+            scores = np.zeros((len(X), len(self.classes_)))
+            for train, test in StratifiedKFold(folds, shuffle=True, random_state=self.random_state).split(X, own):
+                scores[test] = _margins(SVC(C=self.C).fit(X[train], own[train]), X[test])
+            self.temperature_ = _likeliest_temperature(scores, own)
+        return self
+
+    def predict_proba(self, X: Any) -> FloatArray:
+        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
+        return np.asarray(softmax(self._scores(X) / self.temperature_, axis=1))
+
+    def predict(self, X: Any) -> Any:
+        """Return the class (n,) of samples `X` (n, K)."""
+        best = self._scores(X).argmax(axis=1)
+        return self.classes_[best]
+
+    def _scores(self, X: Any) -> FloatArray:
+        check_is_fitted(self)
+        return _margins(self.machine_, validate_data(self, X, dtype=np.float64, reset=False))
+
+
+def _margins(machine: Any, X: FloatArray) -> FloatArray:
+    """Return decision values (n, C); of two classes scikit-learn gives one column."""
+    values = np.asarray(machine.decision_function(X), dtype=np.float64)
+    return values if values.ndim == 2 else np.stack([-values, values], axis=1)
+
+
+def _directions(X: FloatArray) -> FloatArray:
+    # Scaled by the largest entry first, since squares of very small or large ones leave float64.
+    largest = np.abs(X).max(axis=1, keepdims=True)
+    scaled = np.divide(X, largest, out=np.zeros_like(X), where=largest > 0)
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return np.divide(scaled, length, out=np.zeros_like(X), where=length > 0)
+
+
+def _left_out_cosines(unit: FloatArray, sums: FloatArray, own: Any) -> FloatArray:
+    """Return cosines (n, C) of each sample with the mean directions of the others."""
+    cosines = unit @ _directions(sums).T
+    rows = np.arange(len(unit))
+    cosines[rows, own] = (_directions(sums[own] - unit) * unit).sum(axis=1)
+    return cosines
+
+
+def _likeliest_temperature(scores: FloatArray, own: Any) -> float:
+    rows = np.arange(len(scores))
+
+    def surprise(log_temperature: float) -> float:
+        return -float(log_softmax(scores / np.exp(log_temperature), axis=1)[rows, own].mean())
+
+    found: Any = minimize_scalar(surprise, bounds=(np.log(_COLDEST), np.log(_HOTTEST)), method="bounded")
+    return float(np.exp(found.x))
+
+
+def _mean_direction(seed: int) -> Pipeline:
+    # The origin is the neutral face, so scaling must not move it.
+    return _pipeline(StandardScaler(with_mean=False), NearestMeanDirection())
+
+
+def _knn(seed: int) -> Pipeline:
+    return _pipeline(StandardScaler(), KNeighborsClassifier(n_neighbors=5, weights="distance"))
+
+
+def _lda(seed: int) -> Pipeline:
+    return _pipeline(StandardScaler(), ShrinkageLDA())
+
+
+def _qda(seed: int) -> Pipeline:
+    return _pipeline(StandardScaler(), QuadraticDiscriminantAnalysis(reg_param=0.3))
+
+
+def _logistic(seed: int) -> Pipeline:
+    return _pipeline(StandardScaler(), LogisticRegression(C=0.1, max_iter=2000))
+
+
+def _svm(seed: int) -> Pipeline:
+    return _pipeline(StandardScaler(), CalibratedSVC(random_state=seed))
+
+
+def _pipeline(scale: Any, classify: Any) -> Pipeline:
+    return Pipeline([("scale", scale), ("classify", classify)])
+
+
+CLASSIFIERS: Mapping[str, Callable[[int], Pipeline]] = {
+    "mean-direction": _mean_direction,
+    "knn": _knn,
+    "lda": _lda,
+    "qda": _qda,
+    "logistic": _logistic,
+    "svm": _svm,
+}
+"""Classifiers by name: each is given a seed and makes a pipeline of the steps `scale` and `classify`."""
+
+GRIDS: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
+    "knn": {"classify__n_neighbors": (5, 15)},
+    "lda": {"classify__shrinkage": (0.02, LDA_SHRINKAGE, 0.4)},
+    "qda": {"classify__reg_param": (0.3, 0.7)},
+    "logistic": {"classify__C": (0.01, 0.1, 1.0)},
+    # Nested cross-validation calibrates what it chose, so the machines need not.
+    "svm": {"classify__C": (1.0, 10.0), "classify__temperature": (0.3,)},
+}
+"""Parameters that nested cross-validation tries, by classifier; one without a grid has nothing to choose."""
