@@ -1,0 +1,394 @@
+"""The simulated study: models of each fold, and every scan fitted with them, as files that a later run goes on from."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from shapespace import __version__
+from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
+from shapespace.datasets.faces import Expression, FaceGenerator, load_faces
+from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
+from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
+from shapespace.datasets.study_people import StudyPeople, holes_of
+from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.settings import Level, RobustSettings
+from shapespace.geometry.mirror import mirror_vertices, mirrored
+from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
+from shapespace.model.additive import AdditiveModel
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
+STATUSES = ("converged", "max_iterations", "doubtful", "failed")
+Progress: TypeAlias = Callable[[str, int, int], None]
+"""Called with (what, done, total)."""
+
+_FIRST = RobustSettings(
+    levels=(
+        Level(0, 1_500, 1_000, False, 8, 1.0),
+        Level(10, 1_500, 1_000, False, 6, 1.0),
+        Level(40, 2_500, 1_500, False, 2, 1.0),
+        Level(None, 2_500, 1_000, False, 6, 0.2),
+        Level(None, 5_000, 1_000, True, 8, 0.05),
+    ),
+    beyond_share=np.inf,
+)
+_AGAIN = RobustSettings(
+    levels=(
+        Level(0, 1_500, 1_000, False, 4, 1.0),
+        Level(None, 2_500, 1_000, False, 8, 0.2),
+        Level(None, 5_000, 1_000, True, 8, 0.05),
+    ),
+    beyond_share=np.inf,
+)
+"""Fits of one scan with the models of other folds start at the pose found first; its shape is found anew."""
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """How the simulated study is made.
+
+    Args:
+        people: whom it is made of.
+        folds: how many times the subjects are parted; models, classifiers and scaling never see those tested.
+        identity_modes: of the additive model: a number, or a share of the variance.
+        expression_modes: the same for expressions.
+        strangers: people of the bundled generator, another one than the training's, who are scanned and recognised.
+        stranger_levels: intensities of their expressions.
+
+    Raises:
+        InputError: folds that leave no one to train or to test.
+    """
+
+    people: StudyPeople = field(default_factory=StudyPeople)
+    folds: int = 4
+    identity_modes: int | float = 0.999
+    expression_modes: int | float = 0.999
+    strangers: int = 25
+    stranger_levels: tuple[float, ...] = (0.75, 1.0)
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.folds <= self.people.people // 2:
+            raise InputError(
+                f"{self.people.people} people cannot be parted into {self.folds} folds; each needs two of them."
+            )
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of every setting and of the version."""
+        text = json.dumps({**asdict(self), "version": __version__}, sort_keys=True, default=str)
+        return sha256(text.encode()).hexdigest()
+
+    def fold_of(self) -> IntArray:
+        """Return (P,) the fold in which each person is tested."""
+        order = np.random.default_rng((self.people.seed, 3)).permutation(self.people.people)
+        fold = np.empty(len(order), dtype=np.int32)
+        fold[order] = np.arange(len(order)) % self.folds
+        return fold
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Every scan of a study fitted with the models of all folds.
+
+    Args:
+        z: (F, N, K) coefficients in standard deviations; K is that of the largest model and the rest is 0; NaN where a
+            fit failed.
+        z_stddev: (F, N, K) theirs.
+        status: (F, N) index of `STATUSES`.
+        error_mm: (N,) mean distance of the vertices to the true ones, in the fold where the scan is tested.
+        seconds: (N,) of that fit.
+        person: (N,) who is scanned.
+        shown: (N,) index of `StudyPeople.shown`.
+    """
+
+    z: FloatArray
+    z_stddev: FloatArray
+    status: IntArray
+    error_mm: FloatArray
+    seconds: FloatArray
+    person: IntArray
+    shown: IntArray
+
+
+def prepare_folder(folder: Path, config: StudyConfig) -> None:
+    """Make `folder` a study of `config`, or see that it is one already.
+
+    Raises:
+        InputError: it holds another study.
+        FileError: it cannot be written.
+    """
+    make_folder(folder)
+    path = folder / "study.json"
+    if path.is_file():
+        try:
+            held = json.loads(read_bytes(path))["digest"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise FileFormatError(f"{path} is damaged; give a new folder.") from error
+        if held != config.digest:
+            raise InputError(
+                f"{folder} holds a study with other settings or of another version; give a new folder, or its settings."
+            )
+        return
+    text = json.dumps({"digest": config.digest, "version": __version__, "settings": asdict(config)}, indent=1)
+    write_text(path, text + "\n")
+
+
+def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Progress | None = None) -> None:
+    """Make the models and all fits of a study in `folder`, leaving out what is there already.
+
+    Args:
+        folder: from `prepare_folder`.
+        config: of the study.
+        workers: processes.
+        on_progress: called after each model and each person.
+
+    Raises:
+        DataError: ICT-FaceKit is not here.
+        FitError: a worker was stopped from outside.
+        FileError: the folder cannot be written.
+    """
+    told = on_progress or (lambda what, done, total: None)
+    load_ict()
+    models = [(_make_model, (folder, config, fold)) for fold in range(config.folds)]
+    people = [(_fit_person, (folder, config, person)) for person in range(config.people.people)]
+    strangers = [(_fit_stranger, (folder, config, person)) for person in range(config.strangers)]
+    paths = {
+        "models": [model_path(folder, fold) for fold in range(config.folds)],
+        "people": [person_path(folder, person) for person in range(config.people.people)],
+        "strangers": [stranger_path(folder, person) for person in range(config.strangers)],
+    }
+    with ExitStack() as stack:
+        pool: Executor | None = None
+        for what, jobs in (("models", models), ("people", people), ("strangers", strangers)):
+            todo = [job for job, path in zip(jobs, paths[what], strict=True) if not path.is_file()]
+            done = len(jobs) - len(todo)
+            told(what, done, len(jobs))
+            if todo and pool is None:
+                pool = stack.enter_context(_pool(workers))
+            for _ in _run(pool, todo):
+                done += 1
+                told(what, done, len(jobs))
+
+
+def _pool(workers: int) -> Executor:
+    start_loading(tell=False)
+    wait_until_loaded()
+    return ProcessPoolExecutor(workers, mp_context=context(), initializer=threadpool_limits, initargs=(1,))
+
+
+def _run(pool: Executor | None, jobs: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> Iterator[None]:
+    if pool is None:
+        return
+    with ExitStack() as stack:
+        with interrupts_ignored():
+            futures = [pool.submit(job, *arguments) for job, arguments in jobs]
+        stack.callback(lambda: [future.cancel() for future in futures])
+        for future in as_completed(futures):
+            try:
+                future.result()
+            except BrokenExecutor as error:
+                raise FitError(
+                    "A worker was stopped from outside, most likely for lack of memory; run again with fewer --jobs."
+                ) from error
+            yield
+
+
+def model_path(folder: Path, fold: int) -> Path:
+    """Return the file of the model made without the subjects of `fold`."""
+    return folder / f"fold_{fold}.h5"
+
+
+def person_path(folder: Path, person: int) -> Path:
+    """Return the file of a person's fits."""
+    return folder / "fits" / f"person_{person:03d}.npz"
+
+
+def stranger_path(folder: Path, person: int) -> Path:
+    """Return the file of a stranger's fits."""
+    return folder / "fits" / f"stranger_{person:03d}.npz"
+
+
+_ict: IctFaces | None = None
+_models: dict[Path, AdditiveModel] = {}
+
+
+def _faces_of_ict() -> IctFaces:
+    global _ict
+    if _ict is None:
+        _ict = load_ict()
+    return _ict
+
+
+def _model(path: Path) -> AdditiveModel:
+    if path not in _models:
+        _models[path] = AdditiveModel.load(path)
+    return _models[path]
+
+
+def training_meshes(
+    config: StudyConfig, ict: IctFaces, people: Sequence[int]
+) -> tuple[list[Mesh], list[str], list[bool]]:
+    """Return corresponding meshes of `people`, neutral and each expression at its strongest, with subject and neutral.
+
+    Each stands beside its mirror image, which is a face as likely as the other and doubles the people.
+    """
+    strongest = max(config.people.levels)
+    meshes: list[Mesh] = []
+    subjects: list[str] = []
+    neutral: list[bool] = []
+    other = mirror_vertices(ict.mesh().vertices)
+    for person in people:
+        faces = config.people.faces(ict, person)
+        for face, (_, level) in zip(faces, config.people.shown, strict=True):
+            if level in (0.0, strongest):
+                meshes += [face, face.with_vertices(mirrored(face.vertices, other))]
+                subjects += [config.people.subject(person), f"{config.people.subject(person)}, mirrored"]
+                neutral += 2 * [level == 0.0]
+    return meshes, subjects, neutral
+
+
+def _make_model(folder: Path, config: StudyConfig, fold: int) -> None:
+    training = np.flatnonzero(config.fold_of() != fold)
+    meshes, subjects, neutral = training_meshes(config, _faces_of_ict(), training.tolist())
+    AdditiveModel.fit(
+        meshes,
+        subjects,
+        neutral,
+        identity_modes=config.identity_modes,
+        expression_modes=config.expression_modes,
+        landmarks=landmark_vertices("face"),
+        provenance=f"{len(training)} simulated people of ICT-FaceKit with {len(config.people.expressions)} expressions",
+        licence="MIT",
+    ).save(model_path(folder, fold))
+
+
+def _fit_person(folder: Path, config: StudyConfig, person: int) -> None:
+    people, ict = config.people, _faces_of_ict()
+    own = int(config.fold_of()[person])
+    order = [own, *(fold for fold in range(config.folds) if fold != own)]
+    scans = [(face, people.scan(face, person, k)) for k, face in enumerate(people.faces(ict, person))]
+    _fit_all(folder, person_path(folder, person), [scan for _, scan in scans], order, config.folds, with_truth=True)
+
+
+def _fit_stranger(folder: Path, config: StudyConfig, person: int) -> None:
+    generator = load_faces()
+    scans = [stranger_scan(generator, config, person, k) for k in range(len(stranger_shown(config)))]
+    _fit_all(folder, stranger_path(folder, person), scans, [0], config.folds, with_truth=False)
+
+
+def stranger_shown(config: StudyConfig) -> tuple[tuple[str, float], ...]:
+    """What each stranger shows: neutral, then the paper's expressions at each level."""
+    return (
+        ("neutral", 0.0),
+        *((name, level) for name in PAPER_EXPRESSIONS for level in config.stranger_levels),
+    )
+
+
+def stranger_scan(generator: FaceGenerator, config: StudyConfig, person: int, shown: int) -> SimulatedScan:
+    """Return a raw scan of a face by the bundled generator, made as those of the study are."""
+    people = config.people
+    who = generator.draw_person(np.random.default_rng((people.seed, 4, person)), f"stranger_{person:03d}")
+    name, level = stranger_shown(config)[shown]
+    rng = np.random.default_rng((people.seed, 5, person, shown))
+    expression: Expression | None = generator.draw_expression(name, level, rng) if level else None
+    face = generator.face(who, expression)
+    return simulate_scan(
+        face,
+        rng,
+        triangles=people.triangles,
+        noise_mm=people.noise_mm,
+        T_scan_model=random_similarity(rng, people.max_angle_deg, (0.9, 1.1)),
+        holes=holes_of(face, people.missing, rng),
+        split=False,
+        name=f"{who.name}_{name}_{round(100 * level):03d}",
+    )
+
+
+def _fit_all(
+    folder: Path, path: Path, scans: Sequence[SimulatedScan], order: Sequence[int], folds: int, *, with_truth: bool
+) -> None:
+    models = {fold: _model(model_path(folder, fold)) for fold in order}
+    k, n = max(model.shape.n_modes for model in models.values()), len(scans)
+    z, stddev = np.full((folds, n, k), np.nan), np.full((folds, n, k), np.nan)
+    status = np.full((folds, n), STATUSES.index("failed"), dtype=np.int32)
+    error_mm, seconds = np.full(n, np.nan), np.full(n, np.nan)
+    for row, scan in enumerate(scans):
+        T: Similarity | None = None
+        for fold in order:
+            shape = models[fold].shape
+            config = FitConfig(unit="mm", robust=_FIRST if T is None else _AGAIN)
+            since = time.perf_counter()
+            try:
+                fitted = fit_scan(shape, scan.scan, config, T_scan_model=T)
+            except ShapespaceError:
+                continue  # stays failed, and is counted as such
+            z[fold, row, : shape.n_modes] = fitted.z
+            stddev[fold, row, : shape.n_modes] = fitted.b_stddev / shape.stddev
+            z[fold, row, shape.n_modes :], stddev[fold, row, shape.n_modes :] = 0.0, 1.0
+            status[fold, row] = STATUSES.index(fitted.status)
+            if T is None:
+                T = fitted.T_scan_model
+                seconds[row] = time.perf_counter() - since
+                if with_truth:
+                    away = T.apply(shape.reconstruct(fitted.b)) - scan.truth_vertices
+                    error_mm[row] = float(np.linalg.norm(away, axis=1).mean()) / scan.T_scan_model.scale
+    memory = io.BytesIO()
+    np.savez(
+        memory,
+        z=z.astype(np.float32),
+        z_stddev=stddev.astype(np.float32),
+        status=status,
+        error_mm=error_mm,
+        seconds=seconds,
+    )
+    make_folder(path.parent)
+    write_bytes(path, memory.getvalue())
+
+
+def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
+    """Return the fits in `paths`, one file a person, with `n_modes` coefficients.
+
+    Raises:
+        FileError: a file cannot be read.
+        FileFormatError: a file is damaged.
+    """
+    parts: list[dict[str, npt.NDArray[Any]]] = []
+    for path in paths:
+        try:
+            with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
+                part = {key: np.asarray(loaded[key]) for key in ("z", "z_stddev", "status", "error_mm", "seconds")}
+        except (ValueError, KeyError, EOFError, OSError) as error:
+            raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
+        for key, rest in (("z", 0.0), ("z_stddev", 1.0)):
+            whole = np.full((*part[key].shape[:2], n_modes), rest)
+            whole[..., : part[key].shape[2]] = part[key]
+            part[key] = whole
+        parts.append(part)
+    counts = [parts[0]["z"].shape[1]] * len(parts)
+    return Fits(
+        z=_joined(parts, "z", 1),
+        z_stddev=_joined(parts, "z_stddev", 1),
+        status=np.concatenate([part["status"] for part in parts], axis=1).astype(np.int32),
+        error_mm=_joined(parts, "error_mm", 0),
+        seconds=_joined(parts, "seconds", 0),
+        person=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
+        shown=np.tile(np.arange(counts[0], dtype=np.int32), len(parts)),
+    )
+
+
+def _joined(parts: Sequence[dict[str, npt.NDArray[Any]]], key: str, axis: int) -> FloatArray:
+    return cast(FloatArray, np.concatenate([part[key] for part in parts], axis=axis).astype(np.float64))
