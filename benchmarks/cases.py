@@ -534,7 +534,7 @@ def floor_mm(model: ShapeModel, scan: Scan) -> float:
 def _floor_mm(model: ShapeModel, truth: FloatArray) -> float:
     # Pose and coefficients are solved for together: in turn they crawl where modes hold pose or size.
     b, T = model.project(truth, align=False), Similarity.identity()
-    modes = model.basis.reshape(-1, 3, model.n_modes)
+    modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
     for _ in range(_FLOOR_STEPS):
         shape = T.apply(model.reconstruct(b))
         arm = shape - T.translation

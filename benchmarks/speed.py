@@ -60,7 +60,7 @@ def contenders(model: ShapeModel, scan: Scan, turned: Scan) -> dict[str, Fit]:
 
     def numpy_version(**stop: float) -> Fit:
         at = (start.scale, start.rotation, start.translation)
-        return lambda: paper_numpy.fit(model.mean_vertices, model.basis, scan.mesh.vertices, *at, **stop)
+        return lambda: paper_numpy.fit(model.mean_vertices, model.vertex_basis, scan.mesh.vertices, *at, **stop)
 
     def loop() -> object:
         engine, T = build_engine(scan.mesh, "vertices"), start
@@ -176,7 +176,7 @@ def same_results(model: ShapeModel, scan: Scan) -> float:
     start = scan.start
     assert start is not None
     b = paper_numpy.fit(
-        model.mean_vertices, model.basis, scan.mesh.vertices, start.scale, start.rotation, start.translation
+        model.mean_vertices, model.vertex_basis, scan.mesh.vertices, start.scale, start.rotation, start.translation
     )[3]
     ours = fit_scan(model, scan.mesh, FitConfig(method="paper", unit="mm"), T_scan_model=start).b
     return float(np.abs(b - ours).max())

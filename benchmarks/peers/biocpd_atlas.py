@@ -17,7 +17,7 @@ def fit(mean: Mesh, model: ShapeModel, scan: Mesh, T_scan_model: Similarity) -> 
 
     cut = model.truncate(min(MODES, model.n_modes))
     # Its modes act before its similarity, so they are turned and scaled into the frame of the placed mean.
-    modes = T_scan_model.scale * (T_scan_model.rotation @ cut.basis.reshape(-1, 3, cut.n_modes))
+    modes = T_scan_model.scale * (T_scan_model.rotation @ cut.vertex_basis.reshape(-1, 3, cut.n_modes))
     began = time.process_time()
     registration = AtlasRegistration(
         X=scan.vertices,
