@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -156,11 +156,9 @@ def _picture(upload: Upload) -> None:
 
 def packed(staged: StagedFit) -> bytes:
     """Return a fit for the page, with all its iterations; a scan of very many triangles is thinned."""
-    from shapespace.report.scene import pack_fit, thinned
+    from shapespace.report.scene import pack_fit
 
-    scan, kept = thinned(staged.scan, LARGEST_SHOWN)
-    distances = {stage: values[kept] for stage, values in staged.scan_to_model_mm.items()}
-    return pack_fit(replace(staged, scan=scan, scan_to_model_mm=distances))
+    return pack_fit(staged, most_sent=LARGEST_SHOWN)
 
 
 def _with_shown_name(sentence: str, upload: Upload) -> str:

@@ -188,6 +188,8 @@ class _Viewer:
                 "scan_colour": colours.SCAN_COLOUR,
                 "model_colour": colours.MODEL_COLOUR,
                 "region_colours": dict(colours.REGION_COLOURS),
+                "unknown_colour": colours.UNKNOWN_COLOUR,
+                "signal_colour": colours.BEYOND_COLOUR,
             }
         )
 

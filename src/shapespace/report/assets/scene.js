@@ -303,7 +303,7 @@
 
   const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws
   const FIELD = (20 * Math.PI) / 180;
-  const GREY = [0.62, 0.62, 0.62];
+  const GREY = [0.66, 0.66, 0.66];
   const SIGNAL = [0.8, 0.1, 0.45];
   const CLAY = [0.82, 0.76, 0.7];
 
@@ -1061,14 +1061,15 @@
 
   // Colour bar ------------------------------------------------------------------------------------------------------
 
-  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond. */
-  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false }) {
+  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond; keys: [text, colour] below it. */
+  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false, keys = [] }) {
     const css = map.map((c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`);
     const middle = (range[0] + range[1]) / 2;
     element.replaceChildren();
     element.classList.add("shapespace-bar");
     element.setAttribute("role", "img");
-    element.setAttribute("aria-label", `${title}, from ${number(range[0])} to ${number(range[1])} ${unit}`);
+    const others = keys.map(([text]) => `; apart from the scale: ${text}`).join("");
+    element.setAttribute("aria-label", `${title}, from ${number(range[0])} to ${number(range[1])} ${unit}${others}`);
     const heading = document.createElement("span");
     heading.className = "shapespace-bar-title";
     heading.textContent = unit ? `${title} (${unit})` : title;
@@ -1084,6 +1085,14 @@
       ticks.appendChild(tick);
     }
     element.append(heading, bar, ticks);
+    for (const [text, colour] of keys) {
+      const key = document.createElement("span"), dot = document.createElement("span");
+      key.className = "shapespace-bar-key";
+      dot.className = "shapespace-bar-dot";
+      dot.style.background = `rgb(${colour.map((v) => Math.round(255 * v)).join(",")})`;
+      key.append(dot, text);
+      element.append(key);
+    }
   };
 
   function number(value) {
@@ -1091,4 +1100,22 @@
     return value.toFixed(digits).replace("-", "\u2212");
   }
   Shapespace.number = number;
+
+  /**
+   * What the colours of a fit's distances mean, for report and viewer: {title, range, map, keys} of `colourBar`.
+   * onModel: painted on the model, else on the scan; colours: {diverging, sequential, unknown}.
+   */
+  Shapespace.distanceScale = function (facts, values, onModel, colours) {
+    const top = facts.scale_mm > 0 ? facts.scale_mm : 1, signed = facts.signed !== false;
+    const unsigned = onModel ? "Distance to the points" : "Distance of the points to the model";
+    const grey = onModel ? "not shown by the scan" : "beyond the model\u2019s rim, not counted";
+    return {
+      title: signed ? "Scan inside (\u2212) or outside (+) of the model" : unsigned,
+      range: [signed ? -top : 0, top],
+      map: signed ? colours.diverging : colours.sequential,
+      keys: values.some(Number.isNaN) ? [[grey, colours.unknown]] : [],
+      unit: "mm",
+      open: true,
+    };
+  };
 })();

@@ -101,12 +101,12 @@
 
     bar(options) {
       $("bar").hidden = !options;
-      const wanted = options ? `${options.title} ${options.range}` : "";
+      const wanted = options ? [options.title, ...options.range, ...(options.keys || []).map(([text]) => text)].join(" ") : "";
       if (options && this._bar !== wanted) Shapespace.colourBar($("bar"), options);
       this._bar = wanted;
     }
 
-    legend(items) {
+    legend(items, note) {
       $("legend").hidden = !items;
       if (!items) return;
       const rgb = (c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`;
@@ -117,7 +117,7 @@
         svg.setAttribute("viewBox", "0 0 12 12");
         svg.append(spot);
         return h("li", {}, svg, text);
-      }));
+      }), ...(note ? [h("li", {}, note)] : []));
     }
 
     clear() {
@@ -719,9 +719,9 @@
       const there = new Float32Array(positions.length);
       mapping(first, true)(mapping(last, false)(positions, there), there);
       if (stage.a.has("model")) stage.a.move("model", there);
-      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour, opacity: 0.8 });
+      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour });
       stage.captions(`${own.name}: the model moves onto the scan`);
-      stage.legend([["scan", about.scan_colour], ["model", about.model_colour]]);
+      stage.legend([["scan", about.scan_colour], ["model", about.model_colour]], Viewer.NEARER);
     } else {
       stage.captions(own.name);
     }
