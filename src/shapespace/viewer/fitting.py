@@ -101,6 +101,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
         # Our own names and folders mean nothing to the visitor.
         record[key] |= {"name": name, "path": ""}
     record["reason"] = _with_shown_name(str(record["reason"]), upload)
+    record |= {"notes": [_with_shown_name(str(note), upload) for note in record["notes"]]} if "notes" in record else {}
     write_record(upload.folder / f"{NAME}.fit.json", record)
     pictured, why = False, ""
     if record["status"] != "failed":
@@ -162,8 +163,10 @@ def packed(staged: StagedFit) -> bytes:
 
 
 def _with_shown_name(sentence: str, upload: Upload) -> str:
-    """Return `sentence` with the file's own name in place of ours."""
+    """Return `sentence` with the file's own name in place of ours, and without our folders."""
     ours = f"{re.escape(str(upload.scan))}|{re.escape(upload.scan.name)}"
+    for folder in (upload.folder, upload.model.parent):
+        sentence = sentence.replace(f"{folder}{os.sep}", "")
     return re.sub(ours, lambda _: upload.shown, sentence)
 
 

@@ -114,7 +114,7 @@ def make_app(
         lifespan=lifespan,
         exception_handlers={
             HTTPException: _told,
-            ShapespaceError: _sentence,
+            ShapespaceError: viewer.sentence,
             ClientDisconnect: _left,
             Exception: _broken,
         },
@@ -345,6 +345,9 @@ class _Viewer:
             raise HTTPException(404, _NO_SCAN)
         return scan
 
+    async def sentence(self, request: Request, error: Exception) -> Response:
+        return refusal(422, self._shown.told(str(error)))
+
     async def packed_model(self) -> tuple[bytes, int]:
         async with self._packing:
             if self._packed is None:
@@ -420,10 +423,6 @@ async def _told(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     plain = "There is nothing at this address." if error.detail == "Not Found" else error.detail
     return refusal(error.status_code, plain)
-
-
-async def _sentence(_: Request, error: Exception) -> Response:
-    return refusal(422, str(error))
 
 
 async def _left(_: Request, error: Exception) -> Response:

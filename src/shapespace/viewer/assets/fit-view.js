@@ -174,7 +174,7 @@
       const { facts, arrays } = this.payload;
       const b = this.source.b || Array.from(arrays.b), sd = this.source.b_stddev || Array.from(arrays.b_stddev);
       const name = facts.name.replace(/\.[^.]*$/, "");
-      Viewer.save(Viewer.coefficientsCsv([{ name, status: facts.status, b, z: this._z(), sd }]), `${name}.coefficients.csv`);
+      Viewer.save(Viewer.coefficientsCsv([{ name, status: facts.status, b, z: this._z(), sd }], this.context.about.modes), `${name}.coefficients.csv`);
     }
 
     /** Put the surfaces of the payload into the views. */
@@ -342,15 +342,15 @@
     }
   };
 
-  /** Coefficients as CSV in the columns of coefficients.csv: rows of {name, status, b, z, sd}. */
-  Viewer.coefficientsCsv = function (rows) {
-    const K = Math.max(...rows.map((row) => row.b.length));
+  /** Coefficients of a model of K modes as CSV in the columns of coefficients.csv: rows of {name, status, b, z, sd}. */
+  Viewer.coefficientsCsv = function (rows, K) {
+    const whole = (values) => Array.from({ length: K }, (_, k) => (k < values.length ? values[k] : ""));
     const each = (letter, end = "") => Array.from({ length: K }, (_, k) => `${letter}${k + 1}${end}`);
     const withError = rows.some((row) => row.sd);
     const lines = [["scan", "status", ...each("b"), ...each("z"), ...(withError ? each("b", "_stddev") : [])].join(",")];
     // A spreadsheet would run a name that starts like a formula.
     const cell = (text) => `"${(/^[=+\-@\t\r]/.test(text) ? "'" : "") + String(text).replace(/"/g, '""')}"`;
-    for (const row of rows) lines.push([cell(row.name), cell(row.status || ""), ...row.b, ...row.z, ...(row.sd || [])].join(","));
+    for (const row of rows) lines.push([cell(row.name), cell(row.status || ""), ...whole(row.b), ...whole(row.z), ...(row.sd ? whole(row.sd) : [])].join(","));
     return new Blob([lines.join("\n") + "\n"], { type: "text/csv" });
   };
 })();
