@@ -49,12 +49,32 @@ def address(world: World) -> Iterator[str]:
     assert process.returncode in (0, 130)
 
 
-def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("how", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch, how: str) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     process, _ = serve(str(world.model))
     assert list(tmp_path.glob("shapespace-view-*"))
-    end(process, signal.SIGTERM)
+    end(process, signal.Signals[how])
     assert not list(tmp_path.glob("shapespace-view-*"))
+
+
+def test_what_a_killed_viewer_left_goes_with_the_next_one(world: World, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    killed, _ = serve(str(world.model))
+    (left,) = tmp_path.glob("shapespace-view-*")
+    alive, _ = serve(str(world.model))
+    assert left.is_dir()  # its viewer still runs
+    end(killed, signal.SIGKILL)
+    assert left.is_dir()
+    foreign = tmp_path / "shapespace-view-of-something-else"
+    foreign.mkdir()
+    process, _ = serve(str(world.model))
+    found = set(tmp_path.glob("shapespace-view-*"))
+    assert left not in found
+    assert foreign in found and len(found) == 3  # without a lock nobody knows, and the living are left alone
+    for one in (alive, process):
+        end(one, signal.SIGTERM)
+    assert set(tmp_path.glob("shapespace-view-*")) == {foreign}
 
 
 def ready(tab, part: str = "model"):
