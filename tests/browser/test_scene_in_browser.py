@@ -330,6 +330,29 @@ def test_the_widgets_work_by_their_controls(page_of, staged: StagedFit) -> None:
     assert tab.complaints == [] and tab.asked == []
 
 
+@pytest.mark.parametrize(
+    ("most", "ticks"),
+    [(23.0, ["10", "20"]), (0.9, ["0.2", "0.4", "0.6", "0.8"]), (4100.0, ["2000", "4000"]), (3.0, ["1", "2", "3"])],
+)
+def test_the_axes_of_a_scatter_have_numbers(page_of, most: float, ticks: list[str]) -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (12, 3)) * most
+    points[0, 1] = -most
+    data = scene.pack_scatter(points, ["one"] * 12, [str(k) for k in range(12)], axes=["b1", "b2", "b3"])
+    script = 'Shapespace.widgets.scatter(document.getElementById("s"), "s-data").then((w) => (window.w = w));'
+    tab = page_of(PLACES, script, **{"s-data": data})
+    tab.page.wait_for_function("window.w && w.view.frames > 0")
+    found = tab.page.evaluate("w.ticks()")
+    assert found == [sign + tick for tick in ticks for sign in ("\u2212", "")] * 3
+    tab.page.wait_for_timeout(300)
+    tab.shot(f"{most:g}")
+    # They are drawn: without them the picture is another one.
+    with_them = tab.page.locator("#s .ss-plate").screenshot()
+    tab.page.evaluate("w.view.texts('axes', [])")
+    tab.page.wait_for_timeout(300)
+    assert tab.page.locator("#s .ss-plate").screenshot() != with_them
+    assert tab.complaints == []
+
+
 @pytest.mark.parametrize("kind", ["surface", "points"])
 def test_a_fit_says_what_its_colours_mean(page_of, staged: StagedFit, kind: str) -> None:
     from dataclasses import replace

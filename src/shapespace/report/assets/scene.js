@@ -557,7 +557,7 @@
       this.request();
     }
 
-    /** Write words at places: [{position, label}]. */
+    /** Write words at places: [{position, label, small, left}]; small ones give way to others; left: left of the place. */
     texts(id, texts) {
       this._texts.set(id, texts);
       this.request();
@@ -791,12 +791,18 @@
           if (mark.label && named && depth < 0.02 * Math.hypot(...this._camera.extent)) write(mark.label, x + 10, y);
         });
       }
-      for (const texts of this._texts.values()) {
-        for (const text of texts) {
-          const [x, y] = this.project(text.position);
-          write(text.label, x + 4, y);
-        }
+      const taken = [], font = context.font;
+      for (const { position, label, small, left } of Array.from(this._texts.values()).flat()) {
+        context.font = small ? font.replace(/^[\d.]+px/, `${10.5 * ratio}px`) : font;
+        const [x, y] = this.project(position), width = context.measureText(label).width / ratio;
+        const at = !small ? [x + 4, y] : left ? [x - width - 5, y] : [x - width / 2, y + 9];
+        const place = [at[0] - 3, at[1] - 6, at[0] + width + 3, at[1] + 6];
+        // Small ones give way where an axis is seen from its end.
+        if (small && taken.some((t) => t[0] < place[2] && place[0] < t[2] && t[1] < place[3] && place[1] < t[3])) continue;
+        taken.push(place);
+        write(label, ...at);
       }
+      context.font = font;
     }
 
     /** CSS pixels of a point in the canvas, and how far it lies behind the camera's target. */

@@ -393,6 +393,12 @@
       return { view, state };
     });
 
+  /** A round step of which two or three fit below `most`. */
+  function tickStep(most) {
+    const power = 10 ** Math.floor(Math.log10(most / 2));
+    return [5, 2, 1].map((factor) => factor * power).find((step) => 2 * step <= most * 1.0001) || power;
+  }
+
   // Scatter ---------------------------------------------------------------------------------------------------------
 
   /** Coefficients as points in three dimensions, coloured by label. */
@@ -422,16 +428,26 @@
         view.setSurface("points", { positions, faces: null, size: 0.055 * size });
         view.paint("points", arrays.labels, { categories: [...new Set(arrays.labels)].length ? palette() : [] });
         const s = size, axisNames = axes.map((k) => facts.axes[k] || `b${k + 1}`);
-        view.lines("axes", [[-s, 0, 0], [s, 0, 0], [0, -s, 0], [0, s, 0], [0, 0, -s], [0, 0, s]], [0.55, 0.55, 0.55]);
-        view.texts("axes", [
-          { position: [s, 0, 0], label: axisNames[0] }, { position: [0, s, 0], label: axisNames[1] },
-          { position: [0, 0, s], label: axisNames[2] },
-        ]);
+        const on = (axis, at, aside = 0) => [0, 1, 2].map((k) => (k === axis ? at : k === (axis === 1 ? 0 : 1) ? aside : 0));
+        const step = tickStep(most), digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+        const segments = [], texts = axisNames.map((label, axis) => ({ position: on(axis, s), label }));
+        for (const axis of [0, 1, 2]) {
+          segments.push(on(axis, -s), on(axis, s));
+          for (let k = 1; k * step < 0.93 * s; k++) {
+            for (const at of [-k * step, k * step]) {
+              segments.push(on(axis, at, -0.018 * s), on(axis, at, 0.018 * s));
+              texts.push({ position: on(axis, at, -0.018 * s), label: signed(at, digits).replace("+", ""), small: true, left: axis === 1 });
+            }
+          }
+        }
+        view.lines("axes", segments, [0.55, 0.55, 0.55]);
+        view.texts("axes", texts);
+        ticks = texts.filter((text) => text.small).map((text) => text.label);
         if (!framed) view.frame(["axes"]), (view.camera = { yaw: 0.55, pitch: 0.35 });
         framed = true;
         show(null);
       }
-      let framed = false;
+      let framed = false, ticks = [];
       const palette = () => facts.labels.map((_, k) => colours().categories[k % colours().categories.length]);
 
       function show(v, at) {
@@ -483,6 +499,6 @@
         make("p", { class: "ss-hint", text: facts.unit ? `Axes in ${facts.unit}.` : "" })
       );
       place();
-      return { view, axes };
+      return { view, axes, ticks: () => ticks };
     });
 })();
