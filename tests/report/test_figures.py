@@ -541,6 +541,29 @@ def test_coefficients_are_scattered_for_any_number_of_labels_and_modes(labels: l
             figures.scatter_3d(every)
 
 
+@pytest.mark.parametrize("size_mm", [3.0, 300.0, 20000.0])
+@pytest.mark.parametrize("labels", [1, 5, 6, 20])
+def test_nothing_is_cut_or_covered_in_space(labels: int, size_mm: float) -> None:
+    rng = np.random.default_rng(1)
+    names = [f"surprise_mouth_open_{k}" for k in range(labels)]
+    points = [point for name in names for point in scans(rng.normal(size=(2, 3)), name, np.full(3, size_mm))]
+    figure = figures.b_space(points, neutral_b=np.zeros(3), neutral_z=np.zeros(3))
+    picture = decoded(figure)
+    (legend,) = figure.legends
+    boxes = [legend.get_window_extent()]
+    assert boxes[0].x0 >= 0 and boxes[0].x1 <= draw.WIDTH and boxes[0].y0 >= 0
+    for axes in figure.axes:
+        boxes += [axis.label.get_window_extent() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+        low, high = axes.get_zlim()
+        for tick in axes.zaxis.get_major_ticks():
+            if low <= tick.get_loc() <= high and tick.label1.get_visible():
+                boxes.append(tick.label1.get_window_extent())
+    assert len(boxes) >= 9
+    for k, one in enumerate(boxes):
+        assert one.x0 >= 0 and one.x1 <= picture.shape[1]
+        assert not any(one.overlaps(other) for other in boxes[:k])
+
+
 def test_coefficients_that_do_not_go_together_are_refused() -> None:
     one, other = (figures.Coefficients("a", "", 0, np.ones(k), np.ones(k)) for k in (2, 3))
     with pytest.raises(InputError, match="different models"):

@@ -22,6 +22,7 @@ from shapespace.report.colours import (
     as_hex,
 )
 from shapespace.report.figures.draw import (
+    DPI,
     GREY,
     INK,
     MEAN_WORDS,
@@ -41,7 +42,9 @@ from shapespace.report.figures.draw import (
     grid,
     in_rows,
     legend,
+    line_height,
     mean_mm,
+    measured,
     mm,
     plain,
     scan_over,
@@ -73,6 +76,8 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _MOST_IN_LEGEND = 16
 _MOST_DOTS_BIG = 60
 _NO_PICTURE = 0.945
+_LEGEND_MARK, _LEGEND_LINE = 3.6 * SMALL * DPI / 72, 1.1
+_SPACE_INCHES = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,15 +427,22 @@ def _space(
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
     groups = _groups(scans)
+    handles = _handles(groups) if any(name for name, _, _ in groups) else []
+    if neutral_b is not None:
+        handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.4))
+    columns = _legend_columns([str(handle.get_label()) for handle in handles])
+    lines = int(np.ceil(len(handles) / columns))
     # Panels are placed by hand, since matplotlib leaves half of a 3-D plot empty.
-    figure, plots = charts(title, [3.35])
+    foot_px = lines * _LEGEND_LINE * line_height(SMALL)
+    figure, plots = charts(title, [_SPACE_INCHES + foot_px / DPI])
     figure.delaxes(plots[0])
     within = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
-    foot = 0.13 if len(groups) <= 6 else 0.2
+    total = figure.get_figheight()
+    foot = within[1] + foot_px / DPI / total
     size = _dot_size(len(scans))
     for k, azimuth in enumerate((-62, 24)):
         # matplotlib's 3-D axes have no usable types.
-        place = (0.53 * k, within[1] + foot - 0.04, 0.46, within[3] - within[1] - foot + 0.16)
+        place = (0.54 * k, foot + 0.06 / total, 0.44, within[3] - foot + 0.5 / total)
         axes = cast(Any, figure.add_axes(place, projection="3d"))
         for _, look, at in groups:
             own = [scans[i] for i in at]
@@ -453,17 +465,38 @@ def _space(
         axes.zaxis.set_rotate_label(False)
         axes.zaxis.label.set_rotation(90)
         axes.tick_params(labelsize=SMALL - 2, colors=GREY, pad=-1)
+        # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
+        wider = _wider_than_three(axes.zaxis)
+        axes.tick_params(axis="z", pad=wider / 2 - 1)
+        axes.zaxis.labelpad = 2 + 0.6 * wider
+        aside = wider / 72 * DPI / WIDTH
+        axes.set_position((place[0] + k * aside, place[1], place[2] - aside, place[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
-    if any(name for name, _, _ in groups) or neutral_b is not None:
-        handles = _handles(groups)
-        if neutral_b is not None:
-            handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.4))
+    if handles:
         figure.legend(
-            handles=handles, loc="lower center", ncols=min(5, len(handles)), fontsize=SMALL, frameon=False,
+            handles=handles, loc="lower center", ncols=columns, fontsize=SMALL, frameon=False,
             labelcolor=INK, handletextpad=0.2, columnspacing=1.2, bbox_to_anchor=(0.5, within[1]), borderpad=0.1,
         )  # fmt: skip
     return figure
+
+
+def _wider_than_three(axis: Any) -> float:
+    """Return by how many points the widest number of an axis is wider than three digits."""
+    formatter = axis.get_major_formatter()
+    low, high = axis.get_view_interval()
+    told = formatter.format_ticks([at for at in axis.get_majorticklocs() if low <= at <= high])
+    widest = max((measured(text, SMALL - 2) for text in told), default=0.0)
+    return max(0.0, widest - measured("000", SMALL - 2)) * 72 / DPI
+
+
+def _legend_columns(names: Sequence[str]) -> int:
+    """Return into how many columns the entries of a legend below a figure go, so that none is cut."""
+    for columns in range(min(len(names), 5), 1, -1):
+        parts = np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
+        if sum(float(part.max()) + _LEGEND_MARK for part in parts) < WIDTH:
+            return columns
+    return 1
 
 
 def faces_grid(
