@@ -130,6 +130,22 @@ def test_stages_come_in_order_with_their_mean_distances(head: MakeHead) -> None:
         assert draw.mm(float(np.nanmean(np.abs(fit.model_to_scan_mm[stage])))) in told
 
 
+@pytest.mark.parametrize("draw_it", [figures.stages_figure, figures.overlay_figure])
+def test_a_start_that_was_near_is_not_cut_and_one_far_away_makes_nothing_small(
+    head: MakeHead, draw_it: Callable[..., Figure]
+) -> None:
+    fit = make_fit(head(10))
+    for panel in pictures(draw_it(fit)):
+        assert (panel[:, [0, -1]] == 255).all()
+    final = fit.surfaces["final"]
+    away = final.with_vertices(final.vertices + np.array([5000.0, 0, 0]))
+    far, near = (
+        (pictures(draw_it(one))[2] < 250).any(axis=2).mean()
+        for one in (replace(fit, surfaces={**fit.surfaces, "before": away}), fit)
+    )
+    assert far > near
+
+
 def test_distances_in_front_and_behind_have_opposite_colours_on_one_scale(head: MakeHead) -> None:
     mesh = head(10)
     for sign, channel in ((1.0, 0), (-1.0, 2)):
@@ -438,6 +454,7 @@ def test_signs_are_named_in_one_way_and_those_of_distances_to_points_are_not_dra
 def test_rows_of_surfaces_and_points_share_a_scale_without_signs(head: MakeHead) -> None:
     told = words(figures.portrait_figure([make_fit(head(8)), make_fit(head(8), cloud=True)]))
     assert SIGNS not in told and "distance from the model to the scan (mm)" in told
+    assert "That to a point cloud is to its points." in told.replace("\n", " ")
     assert "to the points" in figures.distance_histograms(make_fit(head(8), cloud=True)).axes[-1].get_xlabel()
 
 

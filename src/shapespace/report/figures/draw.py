@@ -44,7 +44,6 @@ SIGNED = "distance (mm): scan inside (−) or outside (+) of the model"
 UNSIGNED = "distance to the points (mm), which have no inside or outside"
 NOT_SHOWN = "not shown by the scan"
 """What all figures call the signs of distances, distances to a point cloud, and vertices without a distance."""
-MEAN_WORDS = "In mm: mean distance to the scan of the vertices that the scan shows."
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
 FORWARD, BACKWARD = "#0072B2", "#D55E00"
@@ -485,6 +484,12 @@ def mean_mm(fit: StagedFit, stage: str = "final") -> float:
     """Return the mean distance to the scan of the vertices that it shows; not-a-number where it shows none."""
     values = absolute(fit.model_to_scan_mm[stage])
     return float(values.mean()) if len(values) else float("nan")
+
+
+def mean_words(fits: Sequence[StagedFit]) -> str:
+    """Return what the means below the pictures of `fits` are of."""
+    cloud = " That to a point cloud is to its points." if any(fit.scan.faces is None for fit in fits) else ""
+    return f"In mm: mean distance to the scan of the vertices that the scan shows.{cloud}"
 
 
 def unknown(values: FloatArray) -> float:

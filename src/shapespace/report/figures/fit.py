@@ -25,7 +25,6 @@ from shapespace.report.figures.draw import (
     FORWARD,
     GREY,
     INK,
-    MEAN_WORDS,
     NOT_SHOWN,
     SMALL,
     STAGE_WORDS,
@@ -39,6 +38,7 @@ from shapespace.report.figures.draw import (
     grid,
     legend,
     mean_mm,
+    mean_words,
     mm,
     number_axis,
     percent,
@@ -65,6 +65,7 @@ _REGION_WORDS = {
     "unseen": NOT_SHOWN,
 }
 _MOST_MODES = 30
+_NEAR_START = 0.35
 _TOWERS = 2.0
 """Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
 _NEAREST_MM, _FARTHEST_MM = 0.01, 300.0
@@ -88,7 +89,7 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
         _from_two_sides(fit, layers, captions),
         title=title
         or f"{short(fit.label)}: the scan, and the model before, after finding pose and after finding shape{dense}",
-        note=MEAN_WORDS,
+        note=mean_words([fit]),
     )
 
 
@@ -104,7 +105,7 @@ def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
         _from_two_sides(fit, layers, captions),
         title=title or f"{short(fit.label)}: scan and model over each other, the nearer one is seen",
         keys=keys,
-        note=f"{MEAN_WORDS} Where both mix finely, the fit is close.",
+        note=f"{mean_words([fit])} Where both mix finely, the fit is close.",
     )
 
 
@@ -365,6 +366,10 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
     points = surroundings(fit)
+    before, final = fit.surfaces["before"].vertices, fit.surfaces["final"].vertices
+    # Of a start that was near, all is shown; one that was far away would make the rest small.
+    if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
+        points = np.concatenate([points, before])
     size = view(points, len(layers)).size
     rows: list[Row] = []
     for k, yaw in enumerate(_FRONT_AND_SIDE):

@@ -25,7 +25,6 @@ from shapespace.report.figures.draw import (
     DPI,
     GREY,
     INK,
-    MEAN_WORDS,
     NOT_SHOWN,
     SMALL,
     TEXT,
@@ -44,6 +43,7 @@ from shapespace.report.figures.draw import (
     legend,
     line_height,
     mean_mm,
+    mean_words,
     measured,
     mm,
     plain,
@@ -170,7 +170,8 @@ def gallery(fits: Sequence[StagedFit | Entry], *, columns: int = 3, most: int = 
         rows,
         title=title or f"{counted(len(entries), 'fit')}, the worst first: {told or 'none is in doubt'}",
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
-        note=MEAN_WORDS + (f" {counted(left, 'more fit')} with smaller distances not shown." if left else ""),
+        note=mean_words([entry.fit for entry in shown if entry.fit is not None])
+        + (f" {counted(left, 'more fit')} with smaller distances not shown." if left else ""),
     )
 
 
@@ -546,7 +547,7 @@ def portrait_figure(
         title=title,
         scale=distance_scale(top, signed=signed) if signed else _unsigned(fits, top),
         keys=_grey(fits),
-        note=MEAN_WORDS,
+        note=mean_words(fits),
     )
 
 
@@ -561,7 +562,7 @@ def aligned_grid(
         _captioned(images, fits, columns),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
-        note=MEAN_WORDS,
+        note=mean_words(fits),
     )
 
 
@@ -585,7 +586,7 @@ def distance_maps(
         title=title,
         scale=_unsigned(fits, top),
         keys=_grey(fits),
-        note=MEAN_WORDS,
+        note=mean_words(fits),
     )
 
 
