@@ -210,6 +210,7 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     tab.page.wait_for_timeout(800)
     assert drawn_share(view(tab)) > 0.1
     tab.shot("verdict")
+    assert "mean where the scan shows it" in tab.page.get_by_test_id("verdict").inner_text()
     with tab.page.expect_download() as waiting:
         tab.page.get_by_test_id("scan-record").click()
     waiting.value.save_as(tmp_path / "dropped.fit.json")

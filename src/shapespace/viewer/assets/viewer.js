@@ -527,12 +527,16 @@
     return rest.charAt(0).toUpperCase() + rest.slice(1);
   }
 
-  function distanceFacts(distances) {
+  /** Distances of the verdict; of the model's where the scan shows it, once the surfaces (`payload`) tell where. */
+  function distanceFacts(distances, payload) {
     const final = distances && distances.final;
     if (!final) return null;
     const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
+    const seen = payload && payload.arrays.model_to_scan_final;
+    const forward = seen ? `${mm(payload.facts.mean_mm.final.model)} mean where the scan shows it, 95 % within ${mm(quantile(seen, 0.95))}`
+      : `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`;
     const told = [
-      ["Model to scan", `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`],
+      ["Model to scan", forward],
       ["Scan to model", `${mm(final.scan_to_model.mean)} mean over ${Math.round(100 * final.scan_to_model.fraction)} % of the scan`],
     ];
     return h("dl", { class: "facts" }, ...told.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
@@ -808,6 +812,8 @@
     if (!told.pictured) return;
     const payload = await binary(`/api/scans/${mine.id}/picture`);
     if (own !== mine || mine.placing) return;
+    const first = $("verdict").querySelector(".facts");
+    if (first) first.replaceWith(distanceFacts(told.distances_mm, payload));
     scanView.show(payload, { scan: mine.id, b: told.b, z: told.z, b_stddev: told.b_stddev });
     $("scan-detail").append(h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {
