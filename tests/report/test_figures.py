@@ -514,6 +514,7 @@ def test_modes_are_counted_from_1_to_the_last_in_whole_numbers(head: MakeHead, m
         assert modes > 22 or len(ticks) == modes
         low, high = axes.get_xlim()
         assert low < 1 and high > modes and low + high == pytest.approx(1 + modes)
+        assert high - low > 5
     title = words(figures.coefficients_figure(make_fit(head(6), modes=modes))).replace("\n", " ")
     assert ("its coefficient, how sure it is" in title) == (modes == 1)
 
@@ -572,9 +573,11 @@ def test_nothing_is_cut_or_covered_in_space(labels: int, size_mm: float) -> None
     for axes in figure.axes:
         boxes += [axis.label.get_window_extent() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
         low, high = axes.get_zlim()
+        upright = axes.transData.transform(np.transpose(axes.zaxis.line.get_data()))[:, 0]
         for tick in axes.zaxis.get_major_ticks():
             if low <= tick.get_loc() <= high and tick.label1.get_visible():
                 boxes.append(tick.label1.get_window_extent())
+                assert boxes[-1].x0 > upright.max() or boxes[-1].x1 < upright.min()
     assert len(boxes) >= 9
     for k, one in enumerate(boxes):
         assert one.x0 >= 0 and one.x1 <= picture.shape[1]
