@@ -330,6 +330,60 @@ def test_the_widgets_work_by_their_controls(page_of, staged: StagedFit) -> None:
     assert tab.complaints == [] and tab.asked == []
 
 
+@pytest.mark.parametrize(
+    ("most", "ticks"),
+    [(23.0, ["10", "20"]), (0.9, ["0.2", "0.4", "0.6", "0.8"]), (4100.0, ["2000", "4000"]), (3.0, ["1", "2", "3"])],
+)
+def test_the_axes_of_a_scatter_have_numbers(page_of, most: float, ticks: list[str]) -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (12, 3)) * most
+    points[0, 1] = -most
+    data = scene.pack_scatter(points, ["one"] * 12, [str(k) for k in range(12)], axes=["b1", "b2", "b3"])
+    script = 'Shapespace.widgets.scatter(document.getElementById("s"), "s-data").then((w) => (window.w = w));'
+    tab = page_of(PLACES, script, **{"s-data": data})
+    tab.page.wait_for_function("window.w && w.view.frames > 0")
+    found = tab.page.evaluate("w.ticks()")
+    assert found == [sign + tick for tick in ticks for sign in ("\u2212", "")] * 3
+    tab.page.wait_for_timeout(300)
+    tab.shot(f"{most:g}")
+    # They are drawn: without them the picture is another one.
+    with_them = tab.page.locator("#s .ss-plate").screenshot()
+    tab.page.evaluate("w.view.texts('axes', [])")
+    tab.page.wait_for_timeout(300)
+    assert tab.page.locator("#s .ss-plate").screenshot() != with_them
+    assert tab.complaints == []
+
+
+@pytest.mark.parametrize("kind", ["surface", "points"])
+def test_a_fit_says_what_its_colours_mean(page_of, staged: StagedFit, kind: str) -> None:
+    from dataclasses import replace
+
+    from shapespace.types import Mesh
+
+    forward = {stage: np.where(np.arange(len(d)) % 2, d, np.nan) for stage, d in staged.model_to_scan_mm.items()}
+    backward = {stage: np.nan_to_num(d) for stage, d in staged.scan_to_model_mm.items()}
+    given = replace(staged, model_to_scan_mm=forward, scan_to_model_mm=backward)
+    if kind == "points":
+        given = replace(given, scan=Mesh(staged.scan.vertices))
+    tab = page_of(PLACES, 'Shapespace.widgets.fit(document.getElementById("f"), "f-data").then((w) => (window.w = w));',
+                  **{"f-data": scene.pack_fit(given, largest_scan=900)})  # fmt: skip
+    tab.page.wait_for_function("window.w")
+    bar, end = tab.page.locator("#f .ss-bar").first, f"{given.scale_mm:g}"
+    told = bar.inner_text()
+    assert "not shown by the scan" in told
+    assert f"\u2265 {end}" in told
+    if kind == "points":
+        assert "Distance to the points (mm)" in told and "\u2212" not in told
+    else:
+        assert "Scan inside (\u2212) or outside (+) of the model (mm)" in told and f"\u2264 \u2212{end}" in told
+    tab.page.get_by_label("Colour").last.select_option("scan")
+    assert "not shown by the scan" not in bar.inner_text()
+    tab.page.get_by_label("Mark what lies beyond a threshold").check()
+    assert "beyond " in bar.inner_text()
+    tab.page.get_by_label("Colour").last.select_option("none")
+    assert "nearer one is shown" in tab.page.inner_text("#f .ss-said")
+    assert tab.complaints == []
+
+
 def test_the_widgets_fit_a_narrow_phone(browser, open_tab, page_of, staged: StagedFit) -> None:
     tab = page_of(PLACES, WIDGETS, **payloads(staged))
     tab.page.set_viewport_size({"width": 340, "height": 700})

@@ -49,12 +49,32 @@ def address(world: World) -> Iterator[str]:
     assert process.returncode in (0, 130)
 
 
-def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("how", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch, how: str) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     process, _ = serve(str(world.model))
     assert list(tmp_path.glob("shapespace-view-*"))
-    end(process, signal.SIGTERM)
+    end(process, signal.Signals[how])
     assert not list(tmp_path.glob("shapespace-view-*"))
+
+
+def test_what_a_killed_viewer_left_goes_with_the_next_one(world: World, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    killed, _ = serve(str(world.model))
+    (left,) = tmp_path.glob("shapespace-view-*")
+    alive, _ = serve(str(world.model))
+    assert left.is_dir()  # its viewer still runs
+    end(killed, signal.SIGKILL)
+    assert left.is_dir()
+    foreign = tmp_path / "shapespace-view-of-something-else"
+    foreign.mkdir()
+    process, _ = serve(str(world.model))
+    found = set(tmp_path.glob("shapespace-view-*"))
+    assert left not in found
+    assert foreign in found and len(found) == 3  # without a lock nobody knows, and the living are left alone
+    for one in (alive, process):
+        end(one, signal.SIGTERM)
+    assert set(tmp_path.glob("shapespace-view-*")) == {foreign}
 
 
 def ready(tab, part: str = "model"):
@@ -165,6 +185,7 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     tab.page.get_by_test_id("tab-fits").click()
     rows = tab.page.get_by_test_id("fit")
     rows.first.wait_for()
+    assert tab.page.get_by_test_id("fit-filter").is_hidden()  # there are few
     assert rows.first.get_attribute("data-name") == "broken"
     tab.page.get_by_test_id("next-doubtful").click()
     assert "broken" in tab.page.get_by_test_id("fit-detail").inner_text()
@@ -189,6 +210,7 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     tab.page.wait_for_timeout(800)
     assert drawn_share(view(tab)) > 0.1
     tab.shot("verdict")
+    assert "mean where the scan shows it" in tab.page.get_by_test_id("verdict").inner_text()
     with tab.page.expect_download() as waiting:
         tab.page.get_by_test_id("scan-record").click()
     waiting.value.save_as(tmp_path / "dropped.fit.json")
@@ -218,6 +240,127 @@ def test_what_is_no_scan_is_refused_in_a_sentence(open_tab, address: str, tmp_pa
     message = tab.page.get_by_test_id("message")
     message.wait_for(state="visible")
     assert "notes.txt" in message.inner_text()
+
+
+def add_csv(tab, path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+    tab.page.get_by_test_id("csv-file").set_input_files(path)
+
+
+def test_coefficients_of_another_model_are_refused(open_tab, address: str, world: World, tmp_path: Path) -> None:
+    tab = ready(open_tab(address), "compare")
+    message, to = tab.page.get_by_test_id("message"), tab.page.get_by_test_id("compare-b")
+    text = (world.fits / "coefficients.csv").read_text()
+    head, *rows = list(csv.reader(io.StringIO(text)))
+    K = sum(name[1:].isdigit() and name[0] == "z" for name in head)
+
+    def table(keep) -> str:
+        kept = [i for i, name in enumerate(head) if keep(name)]
+        return "\n".join(",".join(row[i] for i in kept) for row in (head, *rows)) + "\n"
+
+    fewer = table(lambda name: name == "scan" or (name[0] == "z" and name[1:].isdigit() and int(name[1:]) <= K - 2))
+    add_csv(tab, tmp_path / "fewer.csv", fewer)
+    message.wait_for(state="visible")
+    assert f"fewer.csv holds {K - 2} coefficients and model.h5 has {K}" in message.inner_text()
+    holes = table(lambda name: name == "scan" or (name[0] == "z" and name[1:].isdigit() and name != "z3"))
+    add_csv(tab, tmp_path / "holes.csv", holes)
+    tab.until("document.querySelector('[data-testid=message]').innerText.includes('holes.csv')")
+    at = head.index("b2")
+    scaled = [head] + [[*row[:at], str(2 * float(row[at])), *row[at + 1 :]] for row in rows if row[at]]
+    add_csv(tab, tmp_path / "other.csv", "\n".join(",".join(row) for row in scaled) + "\n")
+    tab.until("document.querySelector('[data-testid=message]').innerText.includes('another model')")
+    assert "csv" not in to.inner_text()
+
+    add_csv(tab, tmp_path / "own.csv", text)
+    message.wait_for(state="hidden")  # the older message goes when something succeeds
+    assert "(own.csv)" in to.inner_text()
+    # What the viewer writes itself is read again.
+    with tab.page.expect_download() as waiting:
+        tab.page.get_by_test_id("tab-model").click()
+        slide(tab, 2, 1.5)
+        tab.page.get_by_test_id("panel-model").get_by_test_id("export-csv").click()
+    waiting.value.save_as(tmp_path / "shape.csv")
+    tab.page.get_by_test_id("tab-compare").click()
+    tab.page.get_by_test_id("csv-file").set_input_files(tmp_path / "shape.csv")
+    tab.until("document.querySelector('#compare-b').innerText.includes('(shape.csv)')")
+    assert message.is_hidden()
+    assert tab.complaints == []
+
+
+def box(locator) -> tuple[float, float, float, float]:
+    found = locator.bounding_box()
+    return found["x"], found["y"], found["x"] + found["width"], found["y"] + found["height"]
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_a_message_covers_nothing_and_goes(open_tab, address: str, tmp_path: Path, viewport: dict) -> None:
+    tab = ready(open_tab(address, viewport))
+    tab.page.get_by_test_id("map").check()
+    message = tab.page.get_by_test_id("message")
+
+    def fail() -> None:
+        (tmp_path / "notes.txt").write_text("not a scan")
+        drop(tab, tmp_path / "notes.txt")
+        message.wait_for(state="visible")
+
+    fail()
+    tab.shot(f"{viewport['width']}")
+    x0, y0, x1, y1 = box(message)
+    for name in ("view", "view-home", "export-png", "tab-model", "choose"):
+        a0, b0, a1, b1 = box(tab.page.get_by_test_id(name))
+        assert min(x1, a1) - max(x0, a0) < 1 or min(y1, b1) - max(y0, b0) < 1, name
+    tab.page.get_by_test_id("message-close").click()
+    assert message.is_hidden()
+    fail()
+    tab.page.keyboard.press("Escape")
+    assert message.is_hidden()
+    fail()
+    tab.page.get_by_test_id("tab-model").click()
+    message.wait_for(state="hidden")
+    fail()
+    tab.page.route("**/api/export*", lambda route: route.abort())
+    tab.page.get_by_test_id("tab-model").click()
+    tab.page.get_by_test_id("panel-model").get_by_test_id("export-ply").click()
+    tab.until("document.querySelector('[data-testid=message]').innerText.includes('does not answer')")
+    tab.page.wait_for_timeout(200)
+    assert message.is_visible()  # a failure is no success
+
+
+def test_the_names_of_files_keep_their_letters(open_tab, address: str) -> None:
+    tab = open_tab()
+    told = {
+        "a": ("failed", "broken.ply: it is empty."),
+        "b": ("doubtful", "Do not trust this fit: its vertices are expected to be 9.0 mm off."),
+    }
+    rows = [
+        {"name": name, "label": name, "status": status, "reason": reason, "pictured": False, "why_not": "",
+         "fitted": False, "z": None, "model_to_scan_mm": None, "scan_to_model_mm": None if name == "a" else 1.234,
+         "expected_error_mm": None}
+        for name, (status, reason) in told.items()
+    ]  # fmt: skip
+    rows += [{**rows[1], "name": f"fit {k}", "label": f"fit {k}", "status": "converged"} for k in range(12)]
+    tab.page.route("**/api/fits", lambda route: route.fulfill(json=rows))
+    tab.page.goto(address)
+    ready(tab, "fits")
+    detail = tab.page.get_by_test_id("fit-detail")
+    tab.page.locator('[data-testid="fit"][data-name="a"]').click()
+    assert "broken.ply: it is empty." in detail.inner_text()
+    tab.page.locator('[data-testid="fit"][data-name="b"]').click()
+    assert "Its vertices are expected" in detail.inner_text()
+    assert "scan to model, mean" in tab.page.get_by_test_id("fit-head").inner_text()
+    assert "1.23 mm" in tab.page.locator('[data-testid="fit"][data-name="b"]').inner_text()
+    # About ten of them are seen at once, and a filter finds the others.
+    lists = tab.page.get_by_test_id("fit-list").bounding_box()
+    row = tab.page.get_by_test_id("fit").first.bounding_box()
+    assert 9 <= lists["height"] / row["height"] <= 11
+    tab.shot("list")
+    tab.page.get_by_test_id("fit-filter").fill("Fit 1")
+    shown = [one.get_attribute("data-name") for one in tab.page.get_by_test_id("fit").all() if one.is_visible()]
+    assert shown == ["fit 1", "fit 10", "fit 11"]
+    assert "3 of 14 fits" in tab.page.get_by_test_id("fit-filter-said").inner_text()
+    tab.page.get_by_test_id("fit-filter").fill("failed")
+    shown = [one.get_attribute("data-name") for one in tab.page.get_by_test_id("fit").all() if one.is_visible()]
+    assert shown == ["a"]
 
 
 def test_a_reload_keeps_ones_own_scans_and_nobody_elses(open_tab, address: str, world: World) -> None:

@@ -11,6 +11,7 @@ from PIL import Image
 
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.regions import UNSEEN
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.figures import draw
@@ -23,7 +24,7 @@ NASTY = "a $x^ \\frac $ 你\x00\x1b[31m\n<b>\u202e" + "wide " * 40 + "W" * 300
 
 
 def make_fit(head: Mesh, *, dense: bool = False, cloud: bool = False, modes: int = 4, **changes: object) -> StagedFit:
-    """A fit of known distances: 20 mm off before, 4 mm after phase 1, within 1 mm at the end."""
+    """A fit of known distances: 20 mm off before, 4 mm after phase 1, within 1 mm at the end; some vertices unseen."""
     rng = np.random.default_rng(0)
     stages = {"before": 20.0, "initial": 4.0, "final": 1.0} | ({"dense": 0.1} if dense else {})
     V = len(head.vertices)
@@ -31,6 +32,7 @@ def make_fit(head: Mesh, *, dense: bool = False, cloud: bool = False, modes: int
     for values in backward.values():
         values[: V // 5] = np.nan
     z = rng.normal(0, 1, modes)
+    regions = (np.arange(V) // 40 % 4).astype(np.int32)
     fit = StagedFit(
         name="one",
         label="one",
@@ -38,10 +40,12 @@ def make_fit(head: Mesh, *, dense: bool = False, cloud: bool = False, modes: int
         reason="It stood still.",
         scan=Mesh(head.vertices * 1.01, None if cloud else head.faces),
         surfaces={stage: head.with_vertices(head.vertices + np.array([size, 0, 0])) for stage, size in stages.items()},
-        model_to_scan_mm={stage: rng.uniform(-size, size, V) for stage, size in stages.items()},
+        model_to_scan_mm={
+            stage: np.where(regions == UNSEEN, np.nan, rng.uniform(-size, size, V)) for stage, size in stages.items()
+        },
         scan_to_model_mm=backward,
-        regions=(np.arange(V) // 40 % 4).astype(np.int32),
-        b=z * np.arange(40, 40 - 5 * modes, -5),
+        regions=regions,
+        b=z * np.linspace(40, 10, modes),
         z=z,
         b_stddev=np.full(modes, 2.0),
         shrinkage=np.linspace(1, 0.2, modes),
@@ -123,7 +127,23 @@ def test_stages_come_in_order_with_their_mean_distances(head: MakeHead) -> None:
     places = [told.index(word) for word in ("\nscan\n", "\nbefore", "\nphase 1", "\nphase 2", "\ndense")]
     assert places == sorted(places)
     for stage in fit.surfaces:
-        assert draw.mm(float(np.abs(fit.model_to_scan_mm[stage]).mean())) in told
+        assert draw.mm(float(np.nanmean(np.abs(fit.model_to_scan_mm[stage])))) in told
+
+
+@pytest.mark.parametrize("draw_it", [figures.stages_figure, figures.overlay_figure])
+def test_a_start_that_was_near_is_not_cut_and_one_far_away_makes_nothing_small(
+    head: MakeHead, draw_it: Callable[..., Figure]
+) -> None:
+    fit = make_fit(head(10))
+    for panel in pictures(draw_it(fit)):
+        assert (panel[:, [0, -1]] == 255).all()
+    final = fit.surfaces["final"]
+    away = final.with_vertices(final.vertices + np.array([5000.0, 0, 0]))
+    far, near = (
+        (pictures(draw_it(one))[2] < 250).any(axis=2).mean()
+        for one in (replace(fit, surfaces={**fit.surfaces, "before": away}), fit)
+    )
+    assert far > near
 
 
 def test_distances_in_front_and_behind_have_opposite_colours_on_one_scale(head: MakeHead) -> None:
@@ -144,7 +164,9 @@ def test_points_beyond_the_rim_are_grey_and_their_share_is_told(head: MakeHead) 
     mesh = head(10)
     nothing = {stage: np.full(len(mesh.vertices), np.nan) for stage in ("before", "initial", "final")}
     figure = figures.signed_maps(replace(make_fit(mesh), scan_to_model_mm=nothing))
-    assert "not counted (100 % of the scan)" in words(figure) and "no point counted" in words(figure)
+    assert "on the scan: beyond the model's rim, not counted (100 %)" in words(figure) and "no point counted" in words(
+        figure
+    )
     image = pictures(figure)[3].astype(int)
     middle = image[image.shape[0] // 2, image.shape[1] // 2]
     assert np.ptp(middle) < 12 and middle.mean() < 220
@@ -179,7 +201,7 @@ def test_regions_are_drawn_in_their_own_colours_with_nothing_between(head: MakeH
     figure = figures.regions_figure(make_fit(mesh, regions=half))
     told = words(figure)
     assert f"followed ({draw.percent(float((half == 0).mean()))})" in told
-    assert "not seen" in told and "rejected" not in told and "border (" not in told
+    assert "not shown by the scan (50 %)" in told and "rejected" not in told and "border (" not in told
     # Codes 0 and 3: the colours of 1 and 2, red and yellow, appear nowhere along the seam.
     image = pictures(figure)[1].astype(int)
     assert not ((image[..., 0] > image[..., 2] + 40) & (image[..., 0] > 120)).any()
@@ -225,6 +247,12 @@ def test_every_figure_of_a_model_is_drawn(model: ShapeModel, modes: int) -> None
         picture = decoded(figure)
         assert picture.shape[1] == draw.WIDTH and (picture < 250).any(axis=2).mean() > 0.02
     assert len(pictures(figures.modes_figure(small, modes=9))) == 4 * modes
+    told = words(figures.modes_figure(small, modes=1)) + words(figures.spectrum_figure(small))
+    assert ("one mode does" in told and "one mode holds" in told) == (modes == 1)
+    assert ("the first of 5 modes does" in told) == (modes == 5)
+    assert modes == 1 or "the first 3 of 5 modes do to" in words(figures.modes_figure(small, modes=3)).replace(
+        "\n", " "
+    )
     decoded(figures.modes_figure(replace(small, faces=None), modes=1))
 
 
@@ -258,7 +286,7 @@ def test_an_animation_sways_from_one_end_to_the_other_and_back(model: ShapeModel
 def test_the_spectrum_names_the_modes_for_each_share(model: ShapeModel) -> None:
     stddev = np.sqrt([60.0, 31.0, 5.0, 2.5, 0.4])
     told = words(figures.spectrum_figure(replace(model, stddev=stddev, total_variance=100.0)))
-    for line in ("90 %: 2 modes", "95 %: 3 modes", "98 %: 4 modes", "99 %: more than 5"):
+    for line in ("90 %: 2 modes", "95 %: 3 modes", "98 %: 4 modes", "99 %: more than 5 modes"):
         assert line in told
 
 
@@ -323,6 +351,174 @@ def test_error_curves_reach_their_quantiles(head: MakeHead, count: int) -> None:
     decoded(figures.error_curves({"a $b": far, "none": np.array([np.nan])}))
 
 
+def nothing_seen(fit: StagedFit) -> StagedFit:
+    none = {stage: np.full(len(fit.regions), np.nan) for stage in fit.surfaces}
+    return replace(
+        fit, model_to_scan_mm=none, scan_to_model_mm=none, regions=np.full(len(fit.regions), UNSEEN, dtype=np.int32)
+    )
+
+
+OF_MANY_FITS = [
+    figures.portrait_figure,
+    figures.distance_maps,
+    figures.aligned_grid,
+    figures.gallery,
+    figures.error_curves,
+    figures.threshold_figure,
+]
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+@pytest.mark.parametrize("draw_it", [*OF_ONE_FIT, *OF_MANY_FITS])
+def test_a_fit_of_which_the_scan_shows_nothing_is_drawn_without_a_number(
+    head: MakeHead, draw_it: Callable[..., Figure], cloud: bool
+) -> None:
+    fit = nothing_seen(make_fit(head(8), dense=True, cloud=cloud))
+    figure = draw_it([fit] if draw_it in OF_MANY_FITS else fit)
+    decoded(figure)
+    told = words(figure)
+    assert "nan" not in told and "0.00 mm" not in told
+
+
+def test_curves_leave_out_a_fit_of_which_nothing_is_seen(head: MakeHead) -> None:
+    fit = make_fit(head(8))
+    alone, both = figures.error_curves([fit]), figures.error_curves([nothing_seen(fit), fit])
+    assert len(both.axes[0].lines) == len(alone.axes[0].lines)
+    assert "No vertex of a model is shown" in words(figures.error_curves([nothing_seen(fit)]))
+
+
+@pytest.mark.parametrize(
+    "draw_it", [figures.signed_maps, figures.threshold_figure, figures.portrait_figure, figures.distance_maps]
+)
+def test_vertices_that_the_scan_does_not_show_are_grey_and_the_key_says_so(
+    head: MakeHead, draw_it: Callable[..., Figure]
+) -> None:
+    fit = make_fit(head(10))
+    argument = [fit] if draw_it in OF_MANY_FITS else fit
+    assert "not shown by the scan" in words(draw_it(argument))
+    seen = replace(fit, model_to_scan_mm={stage: np.nan_to_num(d) for stage, d in fit.model_to_scan_mm.items()})
+    told = words(draw_it([seen] if draw_it in OF_MANY_FITS else seen))
+    assert "not shown by the scan" not in told
+
+    def greys(figure: Figure) -> int:
+        count = 0
+        for image in pictures(figure):
+            pixels = image.astype(int)
+            count += int(((np.ptp(pixels, axis=2) < 14) & (pixels.max(axis=2) < 200)).sum())
+        return count
+
+    assert greys(draw_it(argument)) > 1.3 * greys(draw_it([seen] if draw_it in OF_MANY_FITS else seen)) + 100
+
+
+def test_shares_means_and_histograms_count_only_what_the_scan_shows(head: MakeHead) -> None:
+    mesh = head()
+    far = np.full(len(mesh.vertices), np.nan)
+    far[:100], far[100:200] = 3.0, -9.0
+    distances = dict.fromkeys(("before", "initial", "final"), far)
+    fit = replace(make_fit(mesh), model_to_scan_mm=distances)
+    told = words(figures.threshold_figure(fit))
+    assert "4 mm\n50 %\n6 mm\n50 %" in told and "vertices that the scan shows" in told
+    for figure in (figures.stages_figure(fit), figures.overlay_figure(fit), figures.distance_maps([fit])):
+        assert "6.00 mm" in words(figure)
+        assert "of the vertices that the scan shows" in words(figure).replace("\n", " ")
+    figure = figures.distance_histograms(fit)
+    total = sum(patch.get_data().values.clip(0).sum() for patch in figure.axes[0].patches if patch.get_fill())
+    assert total == pytest.approx(100.0)
+    assert "mean 6.00 mm" in words(figure) and "vertices that the scan shows" in words(figure).replace("\n", " ")
+
+
+SIGNS = "scan inside (−) or outside (+) of the model"
+
+
+@pytest.mark.parametrize("draw_it", [figures.signed_maps, figures.portrait_figure])
+def test_signs_are_named_in_one_way_and_those_of_distances_to_points_are_not_drawn(
+    head: MakeHead, draw_it: Callable[..., Figure]
+) -> None:
+    mesh = head(10)
+
+    def drawn(sign: float, cloud: bool) -> Figure:
+        distances = {stage: np.full(len(mesh.vertices), 2.0 * sign) for stage in ("before", "initial", "final")}
+        fit = replace(make_fit(mesh, cloud=cloud), model_to_scan_mm=distances, scan_to_model_mm=distances)
+        return draw_it([fit] if draw_it in OF_MANY_FITS else fit)
+
+    surface, cloud = drawn(1.0, False), drawn(1.0, True)
+    assert SIGNS in words(surface) and "distance to the points" not in words(surface)
+    assert SIGNS not in words(cloud) and "distance to the points" in words(cloud)
+
+    def alike(one: Figure, other: Figure) -> bool:
+        return all((a == b).all() for a, b in zip(pictures(one), pictures(other), strict=True))
+
+    assert alike(cloud, drawn(-1.0, True)) and not alike(surface, drawn(-1.0, False))
+
+
+def test_rows_of_surfaces_and_points_share_a_scale_without_signs(head: MakeHead) -> None:
+    told = words(figures.portrait_figure([make_fit(head(8)), make_fit(head(8), cloud=True)]))
+    assert SIGNS not in told and "distance from the model to the scan (mm)" in told
+    assert "That to a point cloud is to its points." in told.replace("\n", " ")
+    assert "to the points" in figures.distance_histograms(make_fit(head(8), cloud=True)).axes[-1].get_xlabel()
+
+
+def test_the_words_of_a_histogram_stand_clear_of_its_bars(head: MakeHead) -> None:
+    figure = figures.distance_histograms(make_fit(head(10), dense=True))
+    decoded(figure)
+    for axes in figure.axes:
+        up = axes.transData.inverted()
+        bars = np.concatenate([patch.get_data().values for patch in axes.patches if patch.get_fill()])
+        boxes = [up.transform(text.get_window_extent()) for text in axes.texts]
+        assert len(boxes) == 2
+        for box in boxes:
+            low, high = sorted(box[:, 1])
+            assert low > bars.max() or high < bars.min()
+
+
+def test_a_first_bar_that_towers_is_explained(head: MakeHead) -> None:
+    fit = make_fit(head(10))
+    even = {stage: np.geomspace(0.1, 10.0, len(fit.regions)) for stage in fit.surfaces}
+    fit = replace(fit, model_to_scan_mm=even, scan_to_model_mm=even)
+    said = "The first bar holds all distances below"
+    assert said not in words(figures.distance_histograms(fit))
+    near = fit.model_to_scan_mm["final"].copy()
+    near[: len(near) // 2] = 1e-5
+    touching = replace(fit, model_to_scan_mm={**fit.model_to_scan_mm, "final": near})
+    assert said in words(figures.distance_histograms(touching)).replace("\n", " ")
+
+
+@pytest.mark.parametrize(("fall", "scale"), [(0.05, "log"), (0.9, "linear")])
+def test_the_history_says_its_scale_and_its_ends_where_they_hide_nothing(
+    head: MakeHead, fall: float, scale: str
+) -> None:
+    fit = make_fit(head(6))
+    rms = np.linspace(10.0, 10.0 * fall, 10)
+    history = tuple(replace(moment, rms_mm=float(v)) for moment, v in zip(fit.history, rms, strict=True))
+    figure = figures.history_figure(replace(fit, history=history))
+    decoded(figure)
+    (axes,) = figure.axes
+    assert axes.get_ylabel() == f"RMS distance (mm, {scale} scale)" and axes.get_yscale() == scale
+    told = words(figure)
+    assert f"ends at {draw.mm(float(rms[4]))}" in told and f"ends at {draw.mm(float(rms[9]))}" in told
+    legend = axes.get_legend()
+    assert legend is not None and not axes.texts
+    assert legend.get_window_extent().y0 >= axes.get_window_extent().y1 - 1
+    assert legend.get_window_extent().x1 <= draw.WIDTH
+
+
+@pytest.mark.parametrize("modes", [1, 2, 4, 30])
+def test_modes_are_counted_from_1_to_the_last_in_whole_numbers(head: MakeHead, model: ShapeModel, modes: int) -> None:
+    drawn = [figures.coefficients_figure(make_fit(head(6), modes=modes)).axes[0]]
+    drawn += figures.quality_figure({"compactness": [1.0] * modes, "specificity": [2.0] * modes}).axes
+    if modes <= 5:
+        drawn.append(figures.spectrum_figure(model.truncate(modes)).axes[0])
+    for axes in drawn:
+        ticks = list(axes.get_xticks())
+        assert ticks[0] == 1 and ticks[-1] == modes and all(tick == round(tick) for tick in ticks)
+        assert modes > 22 or len(ticks) == modes
+        low, high = axes.get_xlim()
+        assert low < 1 and high > modes and low + high == pytest.approx(1 + modes)
+        assert high - low > 5
+    title = words(figures.coefficients_figure(make_fit(head(6), modes=modes))).replace("\n", " ")
+    assert ("its coefficient, how sure it is" in title) == (modes == 1)
+
+
 def scans(z: np.ndarray, expression: str, stddev: np.ndarray) -> list[figures.Coefficients]:
     return [figures.Coefficients(f"{expression}{k}", expression, (k + 1) / 4, v * stddev, v) for k, v in enumerate(z)]
 
@@ -361,6 +557,31 @@ def test_coefficients_are_scattered_for_any_number_of_labels_and_modes(labels: l
     else:
         with pytest.raises(InputError, match="three coefficients"):
             figures.scatter_3d(every)
+
+
+@pytest.mark.parametrize("size_mm", [3.0, 300.0, 20000.0])
+@pytest.mark.parametrize("labels", [1, 5, 6, 20])
+def test_nothing_is_cut_or_covered_in_space(labels: int, size_mm: float) -> None:
+    rng = np.random.default_rng(1)
+    names = [f"surprise_mouth_open_{k}" for k in range(labels)]
+    points = [point for name in names for point in scans(rng.normal(size=(2, 3)), name, np.full(3, size_mm))]
+    figure = figures.b_space(points, neutral_b=np.zeros(3), neutral_z=np.zeros(3))
+    picture = decoded(figure)
+    (legend,) = figure.legends
+    boxes = [legend.get_window_extent()]
+    assert boxes[0].x0 >= 0 and boxes[0].x1 <= draw.WIDTH and boxes[0].y0 >= 0
+    for axes in figure.axes:
+        boxes += [axis.label.get_window_extent() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+        low, high = axes.get_zlim()
+        upright = axes.transData.transform(np.transpose(axes.zaxis.line.get_data()))[:, 0]
+        for tick in axes.zaxis.get_major_ticks():
+            if low <= tick.get_loc() <= high and tick.label1.get_visible():
+                boxes.append(tick.label1.get_window_extent())
+                assert boxes[-1].x0 > upright.max() or boxes[-1].x1 < upright.min()
+    assert len(boxes) >= 9
+    for k, one in enumerate(boxes):
+        assert one.x0 >= 0 and one.x1 <= picture.shape[1]
+        assert not any(one.overlaps(other) for other in boxes[:k])
 
 
 def test_coefficients_that_do_not_go_together_are_refused() -> None:

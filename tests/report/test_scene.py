@@ -222,11 +222,39 @@ def test_the_numbers_of_a_fit_are_of_all_its_vertices(staged: StagedFit, largest
     assert facts["mean_mm"]["final"]["scan"] is None
 
 
+@pytest.mark.parametrize("largest", [None, 400])
+def test_what_the_scan_does_not_show_stays_unknown_and_the_scale_is_that_of_the_fit(
+    staged: StagedFit, largest: int | None
+) -> None:
+    seen = np.arange(len(staged.regions)) % 3 > 0
+    forward = {stage: np.where(seen, d, np.nan) for stage, d in staged.model_to_scan_mm.items()}
+    facts, arrays = unpack(scene.pack_fit(replace(staged, model_to_scan_mm=forward), largest_scan=largest))
+    assert facts["signed"] is True
+    assert facts["scale_mm"] == replace(staged, model_to_scan_mm=forward).scale_mm
+    for stage in staged.surfaces:
+        unknown = np.isnan(arrays[f"model_to_scan_{stage}"])
+        assert 0.2 < unknown.mean() < 0.5
+        if largest is None:
+            assert np.array_equal(unknown, ~seen)
+
+
+def test_a_scan_that_is_thinned_to_be_sent_keeps_the_scale_and_the_numbers(staged: StagedFit) -> None:
+    whole, _ = unpack(scene.pack_fit(staged))
+    facts, arrays = unpack(scene.pack_fit(staged, most_sent=300))
+    assert len(arrays["scan_faces"]) <= 300 and len(arrays["history_phase"]) == len(staged.history)
+    assert len(arrays["surface_final"]) == len(staged.surfaces["final"].vertices)
+    assert len(arrays["scan_to_model_final"]) == len(arrays["scan"]) < len(staged.scan.vertices)
+    assert facts == {**whole, "thinned": True}
+
+
 def test_a_fit_of_points_is_packed_without_triangles(staged: StagedFit) -> None:
     cloud = replace(staged, scan=Mesh(staged.scan.vertices, None))
     for largest in (None, 100):
-        _, arrays = unpack(scene.pack_fit(cloud, largest_scan=largest))
+        facts, arrays = unpack(scene.pack_fit(cloud, largest_scan=largest))
         assert "scan_faces" not in arrays
+        # Points have no inside: what is told of them are lengths.
+        assert facts["signed"] is False
+        assert all(not (arrays[f"{key}_final"] < 0).any() for key in ("model_to_scan", "scan_to_model"))
         assert largest is None or len(arrays["scan"]) <= largest
     with pytest.raises(InputError, match="at least one"):
         scene.pack_fit(cloud, largest_scan=0)

@@ -20,7 +20,7 @@ from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import Upload
 from shapespace.viewer.serve import listen, page_address, serve
-from shapespace.viewer.shown import Shown
+from shapespace.viewer.shown import Shown, without_folders
 
 __all__ = ["model", "scan_file", "start"]
 
@@ -348,6 +348,52 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("d", "unreadable"),
         ("e", "unreadable"),
     ]
+
+
+def test_doubt_comes_first_and_then_the_error_a_fit_expects(fits: Path, model: ShapeModel) -> None:
+    record = json.loads((fits / "a.fit.json").read_text())
+    for name, status, expected in (("g", "converged", 9.0), ("h", "doubtful", 0.1), ("i", "converged", None)):
+        evidence = {**record["evidence"], "expected_error_mm": expected}
+        (fits / f"{name}.fit.json").write_text(json.dumps(record | {"status": status, "evidence": evidence}))
+    ours = record["evidence"]["expected_error_mm"]
+    by_scan = record["distances_mm"]["final"]["scan_to_model"]["mean"]
+    assert 0 < ours < 9 and 0 < by_scan < 9
+    rows = {row["name"]: row for row in Shown.open(fits).fit_list()}
+    assert list(rows)[:4] == ["d", "c", "h", "g"]
+    assert rows["a"]["expected_error_mm"] == ours and rows["i"]["expected_error_mm"] is None
+    # One that expects nothing of itself is ranked by what was measured.
+    assert (list(rows).index("i") > list(rows).index("a")) == (by_scan <= ours)
+
+
+def test_no_folder_of_this_machine_reaches_a_visitor(start: Start, fits: Path, tmp_path: Path) -> None:
+    record = json.loads((fits / "c.fit.json").read_text())
+    assert str(tmp_path) in record["reason"]  # as long as records hold what was typed
+    odd = tmp_path / "two words" / "a scan.ply"
+    record |= {"reason": f"Cannot read {odd}: it is empty.", "scan": {**record["scan"], "name": "a scan.ply"}}
+    (fits / "f.fit.json").write_text(json.dumps(record))
+    (fits / "a.stages.npz").write_bytes(b"damaged")
+    visitor = start(Shown.open(fits)).visitor()
+    answers = [visitor.get("/api/fits"), visitor.get("/api/fits/a"), visitor.get("/api/fits/d")]
+    assert [answer.status_code for answer in answers] == [200, 422, 422]
+    assert all(str(tmp_path.parent) not in answer.text and tmp_path.name not in answer.text for answer in answers)
+    reasons = {row["name"]: row["reason"] for row in answers[0].json()}
+    assert "empty.ply: it is empty" in reasons["c"] and reasons["f"] == "Cannot read a scan.ply: it is empty."
+    assert "d.fit.json" in reasons["d"] and "a.stages.npz" in sentence(answers[1])
+    (fits / "a.fitted.ply").unlink()
+    gone = visitor.post("/api/export?format=ply", json={"fit": "a"})
+    assert tmp_path.name not in gone.text and sentence(gone)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("Cannot read /home/me/scans/a.ply: it is empty.", "Cannot read a.ply: it is empty."),
+        ("'/data/x' and C:\\Users\\me\\b.obj, (/tmp/y/z.npz)", "'x' and b.obj, (z.npz)"),
+        ("mixed/a.ply or ../b.ply: 3/4 and/or http://127.0.0.1/x", "mixed/a.ply or ../b.ply: 3/4 and/or http://127.0.0.1/x"),
+    ],
+)  # fmt: skip
+def test_a_path_is_told_by_its_last_part(given: str, told: str) -> None:
+    assert without_folders(given) == told
 
 
 @pytest.mark.parametrize(

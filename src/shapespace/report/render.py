@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
-from shapespace.report.colours import CLAY, UNKNOWN_COLOUR, WHITE, Colour
+from shapespace.report.colours import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, WHITE, Colour
 from shapespace.report.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
@@ -141,6 +141,20 @@ class Layer:
             raise InputError(f"{name}: scalars need a colour map of the shape (N, 3).")
         if not self.vmax > self.vmin:
             raise InputError(f"{name}: the scale from {self.vmin} to {self.vmax} is empty.")
+
+
+def distance_layer(mesh: Mesh, distances_mm: FloatArray, limit_mm: float, *, signed: bool) -> Layer:
+    """Return a layer coloured by distances, on a scale whose end is `limit_mm`.
+
+    Args:
+        mesh: the surface or points.
+        distances_mm: (V,) signed; not-a-number is drawn in grey.
+        limit_mm: positive.
+        signed: whether the signs mean something, which distances to a point cloud's do not.
+    """
+    if signed:
+        return Layer(mesh, scalars=distances_mm, colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
+    return Layer(mesh, scalars=np.abs(distances_mm), colormap=SEQUENTIAL, vmax=limit_mm)
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,25 +173,28 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     return pack(arrays, facts)
 
 
-def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
+def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
     """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
 
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
-    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed; `beyond_model_STAGE` and
+    `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
+    the scan is a point cloud, not-a-number where unknown; `beyond_model_STAGE` and
     `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes;
     `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
-    and `history_rms_mm` (n,).
+    and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
 
     Args:
         staged: a fit with its stages.
         largest_scan: for a report: scan and model are thinned to at most this many triangles (or points) each, rounded
             to 0.02 mm, their vertices put in another order, and the iterations left out. None packs all as it is.
+        most_sent: without `largest_scan`: the scan alone is thinned to at most this many triangles (or points).
 
     Raises:
-        InputError: `largest_scan` below 1.
+        InputError: `largest_scan` or `most_sent` below 1.
     """
-    if largest_scan is not None and largest_scan < 1:
-        raise InputError(f"A scan must keep at least one triangle, not {largest_scan}.")
+    for limit in (largest_scan, most_sent):
+        if limit is not None and limit < 1:
+            raise InputError(f"A scan must keep at least one triangle, not {limit}.")
     small = largest_scan is not None
     last = list(staged.surfaces.values())[-1]
     scan, model = staged.scan, last
@@ -199,6 +202,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
     if largest_scan is not None:
         scan, of_scan = _small(scan, largest_scan)
         model, of_model = _small(last, largest_scan)
+    elif most_sent is not None:
+        scan, of_scan = thinned(scan, most_sent)
     arrays: dict[str, npt.NDArray[Any] | Steps] = {"scan": _places(scan.vertices, small)}
     if scan.faces is not None:
         arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
@@ -207,8 +212,12 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
     surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
     arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
     step = _DISTANCE_STEP_MM if small else 0.0
+    # Points have no inside.
+    signed = staged.scan.faces is not None
     for stage in staged.surfaces:
         forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
+        if not signed:
+            forward, backward = np.abs(forward), np.abs(backward)
         arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
         arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
         arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
@@ -236,6 +245,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None) -> bytes:
         "status": staged.status,
         "reason": staged.reason,
         "stages": list(staged.surfaces),
+        "scale_mm": staged.scale_mm,
+        "signed": signed,
         "mean_mm": {
             stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
             for stage in staged.surfaces

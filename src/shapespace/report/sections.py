@@ -149,7 +149,9 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
         "modes",
         pack_model(model, count, small=True),
         page.image(still.data, still.size, alt="The mean shape"),
-        f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand.",
+        f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand."
+        if count < model.n_modes
+        else f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}, to be moved by hand.",
         label="Modes of the model, one slider each",
         still="The still shows the mean.",
     )
@@ -164,6 +166,11 @@ def fit_to_turn(page: Page, fit: StagedFit) -> str:
     from shapespace.report.scene import pack_fit
 
     limit_mm = fit.scale_mm
+    scale = (
+        f"the signed distance to the scan, −{limit_mm:g} (blue) to +{limit_mm:g} mm (red)."
+        if fit.scan.faces is not None
+        else f"the distance to the points of the scan, 0 to {limit_mm:g} mm."
+    )
     still = stills.fit_strip(fit, limit_mm, (300, 372))
     return page.turning(
         "fit",
@@ -171,8 +178,7 @@ def fit_to_turn(page: Page, fit: StagedFit) -> str:
         page.image(still.data, still.size, alt=strip_alt(fit, limit_mm)),
         f"{fit.label}: the scan, and the model at each stage.",
         label=f"Scan and model of {fit.label}, to be turned",
-        still="The still shows the scan, both over each other, and the signed distance to the scan, "
-        f"−{limit_mm:g} (blue) to +{limit_mm:g} mm (red).",
+        still=f"The still shows the scan, both over each other, and {scale}",
     )
 
 
@@ -226,8 +232,8 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = Non
         ),
         lambda: page.figure(
             figures.signed_maps(fit),
-            "Signed distances both ways: positive where the scan lies outside of the model. Scan points beyond the "
-            "model's rim are not counted.",
+            "Signed distances both ways, positive where the scan lies outside of the model; those of a scan of points "
+            "only have no sign. Scan points beyond the model's rim are not counted.",
             alt=f"Signed distance maps of {fit.label}, model to scan and scan to model",
         ),
         lambda: page.figure(
@@ -345,7 +351,8 @@ def scale_key(page: Page, limit_mm: float) -> str:
         '<div class="key"><p>Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the '
         "nearer one shown; the distance from the model to the scan, one scale for all:</p>"
         f'<p class="bar"><span>−{limit_mm:g} mm, scan inside</span>{colours}'
-        f"<span>+{limit_mm:g} mm, scan outside</span></p></div>\n"
+        f"<span>+{limit_mm:g} mm, scan outside</span></p><p>Grey is what the scan does not show. Distances to a "
+        f"scan of points only have no sign: their map runs from 0 to {limit_mm:g} mm.</p></div>\n"
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from shapespace.report.colours import CLAY, DIVERGING, MODEL_COLOUR, SCAN_COLOUR
-from shapespace.report.render import Camera, Image, Layer, render_series
+from shapespace.report.render import Camera, Image, Layer, distance_layer, render_series
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
@@ -35,18 +35,21 @@ class Still:
 
 
 def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
-    """Return three panels: the scan, scan and model over each other, signed distances from model to scan.
+    """Return three panels: the scan, scan and model over each other, distances from model to scan.
+
+    The distances are signed, on `colours.DIVERGING` from -limit_mm; those to a point cloud, which has no inside, are on
+    `colours.SEQUENTIAL` from 0. Vertices that the scan does not show are grey.
 
     Args:
         fit: with its stages.
-        limit_mm: both ends of the scale of the distances.
+        limit_mm: where the scale of the distances ends.
         panel: width and height of each panel in pixels.
     """
     surface = fit.surfaces["final"]
     camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.02)
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
     plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
-    distances = Layer(surface, scalars=fit.model_to_scan_mm["final"], colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
+    distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
     (seen,) = render_series([[distances]], camera=camera, size=panel)
     return encoded(np.concatenate([plain, both, seen], axis=1))
 

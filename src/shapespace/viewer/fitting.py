@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -101,6 +101,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
         # Our own names and folders mean nothing to the visitor.
         record[key] |= {"name": name, "path": ""}
     record["reason"] = _with_shown_name(str(record["reason"]), upload)
+    record |= {"notes": [_with_shown_name(str(note), upload) for note in record["notes"]]} if "notes" in record else {}
     write_record(upload.folder / f"{NAME}.fit.json", record)
     pictured, why = False, ""
     if record["status"] != "failed":
@@ -156,16 +157,16 @@ def _picture(upload: Upload) -> None:
 
 def packed(staged: StagedFit) -> bytes:
     """Return a fit for the page, with all its iterations; a scan of very many triangles is thinned."""
-    from shapespace.report.scene import pack_fit, thinned
+    from shapespace.report.scene import pack_fit
 
-    scan, kept = thinned(staged.scan, LARGEST_SHOWN)
-    distances = {stage: values[kept] for stage, values in staged.scan_to_model_mm.items()}
-    return pack_fit(replace(staged, scan=scan, scan_to_model_mm=distances))
+    return pack_fit(staged, most_sent=LARGEST_SHOWN)
 
 
 def _with_shown_name(sentence: str, upload: Upload) -> str:
-    """Return `sentence` with the file's own name in place of ours."""
+    """Return `sentence` with the file's own name in place of ours, and without our folders."""
     ours = f"{re.escape(str(upload.scan))}|{re.escape(upload.scan.name)}"
+    for folder in (upload.folder, upload.model.parent):
+        sentence = sentence.replace(f"{folder}{os.sep}", "")
     return re.sub(ours, lambda _: upload.shown, sentence)
 
 

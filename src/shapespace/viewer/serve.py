@@ -62,11 +62,13 @@ def serve(
             )
     # While this process loads its own code.
     start_loading(tell=may_tell(quiet=quiet))
+    from shapespace.viewer.scratch import sweep
     from shapespace.viewer.server import make_app
     from shapespace.viewer.sessions import Limits
     from shapespace.viewer.shown import Shown
 
-    with _ended_by_sigterm():
+    with _ended_by_signals():
+        sweep()
         shown = Shown.open(path, model)
         listening = listen(host, port)
         taken = int(listening.getsockname()[1])
@@ -86,9 +88,16 @@ def serve(
         run(app, sessions, listening, started)
 
 
+def _ending_signals() -> list[signal.Signals]:
+    """Return the signals beside Ctrl-C that end a viewer: SIGTERM, and SIGHUP unless it is ignored as under nohup."""
+    hangup = getattr(signal, "SIGHUP", None)
+    heard = hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN
+    return [signal.SIGTERM, hangup] if heard and hangup is not None else [signal.SIGTERM]
+
+
 @contextlib.contextmanager
-def _ended_by_sigterm() -> Generator[None]:
-    """Let SIGTERM end the block as an exception does, so that temporary folders go."""
+def _ended_by_signals() -> Generator[None]:
+    """Let SIGTERM and SIGHUP end the block as an exception does, so that temporary folders go."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -96,11 +105,12 @@ def _ended_by_sigterm() -> Generator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         raise SystemExit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, end)
+    before = {number: signal.signal(number, end) for number in _ending_signals()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run(app: object, sessions: Sessions, listening: socket.socket, started: Callable[[], None]) -> None:
@@ -118,6 +128,18 @@ def run(app: object, sessions: Sessions, listening: socket.socket, started: Call
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
             started()
+
+        @contextlib.contextmanager
+        def capture_signals(self) -> Generator[None]:
+            # uvicorn itself does not listen to SIGHUP, which comes when a terminal is closed.
+            with super().capture_signals():
+                main = threading.current_thread() is threading.main_thread()
+                before = {number: signal.signal(number, self.handle_exit) for number in _ending_signals() if main}
+                try:
+                    yield
+                finally:
+                    for number, handler in before.items():
+                        signal.signal(number, handler)
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             # Pages that watch a fit would otherwise hold the server up.

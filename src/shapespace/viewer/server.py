@@ -30,6 +30,7 @@ from shapespace.report import colours
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
 from shapespace.viewer.guard import Guard, cookie, refusal
+from shapespace.viewer.scratch import new_folder
 from shapespace.viewer.sessions import DroppedScan, Limits, Session, Sessions
 from shapespace.viewer.shown import Shown, shape_of
 
@@ -77,12 +78,12 @@ def make_app(
         cookie_name: of its cookies; browsers share cookies between ports, so it should name the port.
         worker: what fits a dropped scan, in a process of its own.
     """
-    root = Path(tempfile.mkdtemp(prefix="shapespace-view-"))
+    root, remove_root = new_folder()
     model_file = root / "model.h5"
     try:
         shown.model.save(model_file)
     except BaseException:
-        shutil.rmtree(root, ignore_errors=True)
+        remove_root()
         raise
     sessions = Sessions(
         root,
@@ -91,6 +92,7 @@ def make_app(
         with_landmarks=len(shown.model.landmarks) >= _FEWEST_LANDMARKS,
         limits=limits or Limits(),
         worker=worker,
+        remove_root=remove_root,
     )
     viewer = _Viewer(shown, sessions, f"{cookie_name}_session")
 
@@ -114,7 +116,7 @@ def make_app(
         lifespan=lifespan,
         exception_handlers={
             HTTPException: _told,
-            ShapespaceError: _sentence,
+            ShapespaceError: viewer.sentence,
             ClientDisconnect: _left,
             Exception: _broken,
         },
@@ -188,6 +190,8 @@ class _Viewer:
                 "scan_colour": colours.SCAN_COLOUR,
                 "model_colour": colours.MODEL_COLOUR,
                 "region_colours": dict(colours.REGION_COLOURS),
+                "unknown_colour": colours.UNKNOWN_COLOUR,
+                "signal_colour": colours.BEYOND_COLOUR,
             }
         )
 
@@ -217,7 +221,7 @@ class _Viewer:
 
     def _exported(self, kind: str, question: Mapping[str, Any], session: Session | None) -> bytes:
         mesh = self._asked_mesh(question, session)
-        with tempfile.TemporaryDirectory(prefix="shapespace-export-") as folder:
+        with tempfile.TemporaryDirectory(prefix="export-", dir=self._sessions.root) as folder:
             path = Path(folder) / f"shape.{kind}"
             write_mesh(path, mesh)
             return read_bytes(path)
@@ -343,6 +347,9 @@ class _Viewer:
             raise HTTPException(404, _NO_SCAN)
         return scan
 
+    async def sentence(self, request: Request, error: Exception) -> Response:
+        return refusal(422, self._shown.told(str(error)))
+
     async def packed_model(self) -> tuple[bytes, int]:
         async with self._packing:
             if self._packed is None:
@@ -418,10 +425,6 @@ async def _told(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     plain = "There is nothing at this address." if error.detail == "Not Found" else error.detail
     return refusal(error.status_code, plain)
-
-
-async def _sentence(_: Request, error: Exception) -> Response:
-    return refusal(422, str(error))
 
 
 async def _left(_: Request, error: Exception) -> Response:

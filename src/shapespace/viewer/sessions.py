@@ -138,6 +138,7 @@ class Sessions:
         with_landmarks: whether the model has any, so that placing them can help.
         limits: what a visitor may use.
         worker: what fits a scan, in a process of its own.
+        remove_root: removes `root`; called when all sessions have ended, perhaps twice.
     """
 
     def __init__(
@@ -149,6 +150,7 @@ class Sessions:
         with_landmarks: bool,
         limits: Limits,
         worker: Worker = fit_upload,
+        remove_root: Callable[[], None],
     ) -> None:
         self.limits = limits
         self.closing = False
@@ -157,6 +159,7 @@ class Sessions:
         self._model_name = model_name
         self._with_landmarks = with_landmarks
         self._worker = worker
+        self._remove_root = remove_root
         self._sessions: dict[str, Session] = {}
         self._waiting: list[DroppedScan] = []
         self._threads = ThreadPoolExecutor(limits.fits_at_once, thread_name_prefix="fit")
@@ -234,7 +237,7 @@ class Sessions:
         for session in list(self._sessions.values()):
             self._end(session)
         self._threads.shutdown(wait=True, cancel_futures=True)
-        shutil.rmtree(self.root, ignore_errors=True)
+        self._remove_root()
 
     def _end(self, session: Session) -> None:
         del self._sessions[session.key]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,7 @@ MODEL_BYTES = 48 * 2**20
 """Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
+_FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
 
 
 class Shown:
@@ -95,9 +97,21 @@ class Shown:
         return self._read[1]
 
     def fit_list(self) -> list[dict[str, Any]]:
-        """Return what the page lists: failed and doubtful fits first, then by distance, the largest first."""
+        """Return what the page lists: failed and doubtful fits first, then by the error they expect of themselves."""
         rows = [self._row(fit) for fit in self.fits().values()]
-        return sorted(rows, key=lambda row: (_rank(row["status"]), -(row["model_to_scan_mm"] or 0.0), row["name"]))
+
+        def concern(row: Mapping[str, Any]) -> tuple[int, float, str]:
+            error = row["scan_to_model_mm"] if row["expected_error_mm"] is None else row["expected_error_mm"]
+            return _rank(row["status"]), -(error or 0.0), row["name"]
+
+        return sorted(rows, key=concern)
+
+    def told(self, sentence: str) -> str:
+        """Return `sentence` as visitors may read it: with the names of files, not of the folders they lie in."""
+        for folder in () if self.folder is None else (self.folder.root, self.folder.root.resolve()):
+            if folder.is_absolute() and folder.name:
+                sentence = sentence.replace(str(folder), folder.name)
+        return without_folders(sentence)
 
     def packed_fit(self, name: str) -> bytes:
         """Return the pictures of the fit `name`.
@@ -143,22 +157,28 @@ class Shown:
             "name": fit.name,
             "label": fit.label,
             "status": fit.status,
-            "reason": fit.reason,
+            "reason": self.told(_by_name(fit)),
             "pictured": pictured,
             "why_not": why,
             "fitted": "fitted" in fit.entry and fit.status not in ("failed", "unreadable"),
             "z": None,
         }
         directions = {"model_to_scan_mm": "model_to_scan", "scan_to_model_mm": "scan_to_model"}
-        row |= dict.fromkeys(directions)
+        row |= dict.fromkeys((*directions, "expected_error_mm"))
         try:
             row |= {key: _number(fit.summary_mm("final", direction, "mean")) for key, direction in directions.items()}
+            row["expected_error_mm"] = _expected_error_mm(fit)
             if self._ours(fit) and "z" in fit.record:
                 row["z"] = _rounded(fit.numbers("z"))
         except (ShapespaceError, TypeError, ValueError):
             reason = f"The record of {fit.name} is damaged; fit the scan again."
             row |= {"status": "unreadable", "reason": reason, "pictured": False}
         return row
+
+
+def without_folders(sentence: str) -> str:
+    """Return `sentence` with the last part of each absolute path in place of the path."""
+    return _FOLDERS.sub("", sentence)
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
@@ -169,6 +189,22 @@ def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
     """
     given = np.asarray(z, dtype=np.float64)
     return model.mesh(given * model.stddev[: len(given)] if given.ndim == 1 and len(given) <= model.n_modes else given)
+
+
+def _by_name(fit: SavedFit) -> str:
+    """Return the reason of `fit` with its scan's name in place of an absolute path, which may hold spaces."""
+    scan: object = fit.record.get("scan")
+    name = str(cast(Mapping[str, Any], scan).get("name") or "") if isinstance(scan, dict) else ""
+    if not name:
+        return fit.reason
+    path = re.compile(rf"(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/][^\n]*?[\\/]{re.escape(name)}")
+    return path.sub(lambda _: name, fit.reason)
+
+
+def _expected_error_mm(fit: SavedFit) -> float | None:
+    evidence: object = fit.record.get("evidence")
+    value = cast(Mapping[str, Any], evidence).get("expected_error_mm") if isinstance(evidence, dict) else None
+    return None if value is None else _number(float(value))
 
 
 def _rank(status: str) -> int:

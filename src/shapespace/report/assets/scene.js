@@ -303,7 +303,7 @@
 
   const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160; // where the processor draws
   const FIELD = (20 * Math.PI) / 180;
-  const GREY = [0.62, 0.62, 0.62];
+  const GREY = [0.66, 0.66, 0.66];
   const SIGNAL = [0.8, 0.1, 0.45];
   const CLAY = [0.82, 0.76, 0.7];
 
@@ -557,7 +557,7 @@
       this.request();
     }
 
-    /** Write words at places: [{position, label}]. */
+    /** Write words at places: [{position, label, small, left}]; small ones give way to others; left: left of the place. */
     texts(id, texts) {
       this._texts.set(id, texts);
       this.request();
@@ -791,12 +791,18 @@
           if (mark.label && named && depth < 0.02 * Math.hypot(...this._camera.extent)) write(mark.label, x + 10, y);
         });
       }
-      for (const texts of this._texts.values()) {
-        for (const text of texts) {
-          const [x, y] = this.project(text.position);
-          write(text.label, x + 4, y);
-        }
+      const taken = [], font = context.font;
+      for (const { position, label, small, left } of Array.from(this._texts.values()).flat()) {
+        context.font = small ? font.replace(/^[\d.]+px/, `${10.5 * ratio}px`) : font;
+        const [x, y] = this.project(position), width = context.measureText(label).width / ratio;
+        const at = !small ? [x + 4, y] : left ? [x - width - 5, y] : [x - width / 2, y + 9];
+        const place = [at[0] - 3, at[1] - 6, at[0] + width + 3, at[1] + 6];
+        // Small ones give way where an axis is seen from its end.
+        if (small && taken.some((t) => t[0] < place[2] && place[0] < t[2] && t[1] < place[3] && place[1] < t[3])) continue;
+        taken.push(place);
+        write(label, ...at);
       }
+      context.font = font;
     }
 
     /** CSS pixels of a point in the canvas, and how far it lies behind the camera's target. */
@@ -1061,14 +1067,15 @@
 
   // Colour bar ------------------------------------------------------------------------------------------------------
 
-  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond. */
-  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false }) {
+  /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond; keys: [text, colour] below it. */
+  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false, keys = [] }) {
     const css = map.map((c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`);
     const middle = (range[0] + range[1]) / 2;
     element.replaceChildren();
     element.classList.add("shapespace-bar");
     element.setAttribute("role", "img");
-    element.setAttribute("aria-label", `${title}, from ${number(range[0])} to ${number(range[1])} ${unit}`);
+    const others = keys.map(([text]) => `; apart from the scale: ${text}`).join("");
+    element.setAttribute("aria-label", `${title}, from ${number(range[0])} to ${number(range[1])} ${unit}${others}`);
     const heading = document.createElement("span");
     heading.className = "shapespace-bar-title";
     heading.textContent = unit ? `${title} (${unit})` : title;
@@ -1084,6 +1091,14 @@
       ticks.appendChild(tick);
     }
     element.append(heading, bar, ticks);
+    for (const [text, colour] of keys) {
+      const key = document.createElement("span"), dot = document.createElement("span");
+      key.className = "shapespace-bar-key";
+      dot.className = "shapespace-bar-dot";
+      dot.style.background = `rgb(${colour.map((v) => Math.round(255 * v)).join(",")})`;
+      key.append(dot, text);
+      element.append(key);
+    }
   };
 
   function number(value) {
@@ -1091,4 +1106,22 @@
     return value.toFixed(digits).replace("-", "\u2212");
   }
   Shapespace.number = number;
+
+  /**
+   * What the colours of a fit's distances mean, for report and viewer: {title, range, map, keys} of `colourBar`.
+   * onModel: painted on the model, else on the scan; colours: {diverging, sequential, unknown}.
+   */
+  Shapespace.distanceScale = function (facts, values, onModel, colours) {
+    const top = facts.scale_mm > 0 ? facts.scale_mm : 1, signed = facts.signed !== false;
+    const unsigned = onModel ? "Distance to the points" : "Distance of the points to the model";
+    const grey = onModel ? "not shown by the scan" : "beyond the model\u2019s rim, not counted";
+    return {
+      title: signed ? "Scan inside (\u2212) or outside (+) of the model" : unsigned,
+      range: [signed ? -top : 0, top],
+      map: signed ? colours.diverging : colours.sequential,
+      keys: values.some(Number.isNaN) ? [[grey, colours.unknown]] : [],
+      unit: "mm",
+      open: true,
+    };
+  };
 })();

@@ -268,7 +268,7 @@
   const STAGES = { before: "Before", initial: "Phase 1", final: "Phase 2", dense: "Dense" };
   const REGIONS = ["followed", "rejected", "border", "unseen"];
   const REGION_WORDS = {
-    followed: "follows the scan", rejected: "does not match", border: "at the scan\u2019s border", unseen: "not seen by the scan",
+    followed: "follows the scan", rejected: "does not match", border: "at the scan\u2019s border", unseen: "not shown by the scan",
   };
 
   /** A scan and the model that was fitted to it: stages, opacity, distances, regions. */
@@ -286,12 +286,7 @@
       });
       view.frame(["model"], 1.12);
 
-      const last = arrays[`model_to_scan_${state.stage}`];
-      const top = niceCeiling(Math.min(Math.max(quantile(arrays.model_to_scan_final || last, 0.9) || 0, 1), 5));
       const bar = make("div", { class: "ss-bar" }), legend = make("div", { class: "ss-bar" });
-      Shapespace.colourBar(bar, {
-        map: colours().diverging, range: [-top, top], unit: "mm", title: "The scan lies behind the model (\u2212) or in front (+)", open: true,
-      });
       legend.append(swatches(REGIONS.map((name) => [REGION_WORDS[name], colours().regions[name]])));
       const said = make("p", { class: "ss-said", "aria-live": "polite" });
 
@@ -300,18 +295,24 @@
           : state.map === "scan" ? arrays[`scan_to_model_${state.stage}`] : null;
 
       function paint() {
-        const map = { map: colours().diverging, range: [-top, top], threshold: state.threshold, signal: colours().signal };
+        const distances = state.map === "model" || state.map === "scan";
+        const scale = distances ? Shapespace.distanceScale(facts, values(), state.map === "model", colours()) : {};
+        const { signal, unknown } = colours();
+        const map = { map: scale.map, range: scale.range, threshold: state.threshold, signal, unknown };
+        if (distances) {
+          const beyond = state.threshold === null ? [] : [[`beyond ${state.threshold.toFixed(1)} mm`, signal]];
+          Shapespace.colourBar(bar, { ...scale, keys: [...beyond, ...scale.keys] });
+        }
         view.paint("scan", state.map === "scan" ? values() : null, map);
         if (state.map === "regions") {
           view.paint("model", arrays.regions, { categories: REGIONS.map((name) => colours().regions[name]) });
         } else {
           view.paint("model", state.map === "model" ? values() : null, map);
         }
-        const distances = state.map === "model" || state.map === "scan";
-        bar.hidden = beyond.row.hidden = limit.hidden = !distances;
+        bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : "";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : "Where scan and model overlap, the nearer one is shown.";
         said.hidden = !said.textContent;
       }
 
@@ -331,7 +332,7 @@
       }
 
       const beyond = slider({
-        label: "Threshold", min: 0.2, max: 10, step: 0.1, value: Math.min(2, top),
+        label: "Threshold", min: 0.2, max: 10, step: 0.1, value: Math.min(2, facts.scale_mm),
         show: (value) => `${value.toFixed(1)} mm`,
         input: (value) => {
           state.threshold = value;
@@ -379,7 +380,7 @@
         ], state.map, (key) => {
           state.map = key;
           // The coloured surface is seen alone; the sliders bring the other one back.
-          scan.show(key === "scan" ? 100 : key === "none" ? 50 : 0);
+          scan.show(key === "scan" || key === "none" ? 100 : 0);
           model.show(key === "scan" ? 0 : 100);
           paint();
         }).row,
@@ -391,6 +392,12 @@
       paint();
       return { view, state };
     });
+
+  /** A round step of which two or three fit below `most`. */
+  function tickStep(most) {
+    const power = 10 ** Math.floor(Math.log10(most / 2));
+    return [5, 2, 1].map((factor) => factor * power).find((step) => 2 * step <= most * 1.0001) || power;
+  }
 
   // Scatter ---------------------------------------------------------------------------------------------------------
 
@@ -421,16 +428,26 @@
         view.setSurface("points", { positions, faces: null, size: 0.055 * size });
         view.paint("points", arrays.labels, { categories: [...new Set(arrays.labels)].length ? palette() : [] });
         const s = size, axisNames = axes.map((k) => facts.axes[k] || `b${k + 1}`);
-        view.lines("axes", [[-s, 0, 0], [s, 0, 0], [0, -s, 0], [0, s, 0], [0, 0, -s], [0, 0, s]], [0.55, 0.55, 0.55]);
-        view.texts("axes", [
-          { position: [s, 0, 0], label: axisNames[0] }, { position: [0, s, 0], label: axisNames[1] },
-          { position: [0, 0, s], label: axisNames[2] },
-        ]);
+        const on = (axis, at, aside = 0) => [0, 1, 2].map((k) => (k === axis ? at : k === (axis === 1 ? 0 : 1) ? aside : 0));
+        const step = tickStep(most), digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+        const segments = [], texts = axisNames.map((label, axis) => ({ position: on(axis, s), label }));
+        for (const axis of [0, 1, 2]) {
+          segments.push(on(axis, -s), on(axis, s));
+          for (let k = 1; k * step < 0.93 * s; k++) {
+            for (const at of [-k * step, k * step]) {
+              segments.push(on(axis, at, -0.018 * s), on(axis, at, 0.018 * s));
+              texts.push({ position: on(axis, at, -0.018 * s), label: signed(at, digits).replace("+", ""), small: true, left: axis === 1 });
+            }
+          }
+        }
+        view.lines("axes", segments, [0.55, 0.55, 0.55]);
+        view.texts("axes", texts);
+        ticks = texts.filter((text) => text.small).map((text) => text.label);
         if (!framed) view.frame(["axes"]), (view.camera = { yaw: 0.55, pitch: 0.35 });
         framed = true;
         show(null);
       }
-      let framed = false;
+      let framed = false, ticks = [];
       const palette = () => facts.labels.map((_, k) => colours().categories[k % colours().categories.length]);
 
       function show(v, at) {
@@ -482,6 +499,6 @@
         make("p", { class: "ss-hint", text: facts.unit ? `Axes in ${facts.unit}.` : "" })
       );
       place();
-      return { view, axes };
+      return { view, axes, ticks: () => ticks };
     });
 })();

@@ -23,7 +23,7 @@ from matplotlib.font_manager import FontProperties
 from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
-from shapespace.report.colours import SCAN_COLOUR, Colour
+from shapespace.report.colours import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
 from shapespace.types import FloatArray, Mesh
 
@@ -40,6 +40,11 @@ STAGE_WORDS = {
 }
 """The moments of a fit whose surfaces are kept, in order, and what they are called."""
 
+SIGNED = "distance (mm): scan inside (−) or outside (+) of the model"
+UNSIGNED = "distance to the points (mm), which have no inside or outside"
+NOT_SHOWN = "not shown by the scan"
+"""What all figures call the signs of distances, distances to a point cloud, and vertices without a distance."""
+
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
 FORWARD, BACKWARD = "#0072B2", "#D55E00"
 WIDTH, DPI = 960, 160
@@ -47,6 +52,7 @@ TITLE, TEXT, SMALL = 12.0, 11.0, 9.5
 MOST_PANELS = 48
 _GAP, _EDGE = 8, 4
 _MOST_LINES = 4
+_STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
 
 
@@ -87,8 +93,6 @@ class Scale:
         low: value of the first colour.
         high: value of the last one.
         open_ends: whether values beyond are drawn in the outermost colours: `low`, `high`, `both` or neither.
-        low_word: what the low end means.
-        high_word: what the high end means.
     """
 
     label: str
@@ -96,8 +100,6 @@ class Scale:
     low: float
     high: float
     open_ends: str = "neither"
-    low_word: str = ""
-    high_word: str = ""
 
 
 def view(points: FloatArray, columns: int, *, yaw_deg: float = 0.0, width: int = WIDTH, margin: float = 0.04) -> View:
@@ -239,11 +241,8 @@ def _colour_bar(figure: Figure, scale: Scale, top: float, total_w: int, total_h:
     bar.ax.tick_params(labelsize=SMALL, colors=INK, length=3, pad=2)
     bar.ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
     cast(Any, bar).outline.set_visible(False)
-    left, right = scale.low_word and f"← {scale.low_word}", scale.high_word and f"{scale.high_word} →"
-    label = "    ".join(word for word in (left, scale.label, right) if word)
-    size = SMALL + 0.5 if left or right else TEXT
     up = 1 - (top + 24 + 1.05 * line_height(SMALL) + baseline(0, TEXT)) / total_h
-    figure.text(0.5, up, escaped(label), ha="center", va="baseline", fontsize=size, color=INK)
+    figure.text(0.5, up, escaped(scale.label), ha="center", va="baseline", fontsize=TEXT, color=INK)
 
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
@@ -479,3 +478,36 @@ def scan_over(mesh: Mesh) -> Layer:
 def absolute(values: FloatArray) -> FloatArray:
     """Return the lengths of signed distances that were measured, (n,)."""
     return np.abs(values[np.isfinite(values)])
+
+
+def mean_mm(fit: StagedFit, stage: str = "final") -> float:
+    """Return the mean distance to the scan of the vertices that it shows; not-a-number where it shows none."""
+    values = absolute(fit.model_to_scan_mm[stage])
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def mean_words(fits: Sequence[StagedFit]) -> str:
+    """Return what the means below the pictures of `fits` are of."""
+    cloud = " That to a point cloud is to its points." if any(fit.scan.faces is None for fit in fits) else ""
+    return f"In mm: mean distance to the scan of the vertices that the scan shows.{cloud}"
+
+
+def unknown(values: FloatArray) -> float:
+    """Return the share of `values` that were not measured."""
+    return 1 - len(absolute(values)) / max(len(values), 1)
+
+
+def distance_scale(limit_mm: float, *, signed: bool) -> Scale:
+    """Return the scale of the layers that `distance_layer` makes."""
+    if signed:
+        return Scale(SIGNED, DIVERGING, -limit_mm, limit_mm, "both")
+    return Scale(UNSIGNED, SEQUENTIAL, 0.0, limit_mm, "high")
+
+
+def number_axis(axes: Axes, count: int, *, room: float = 0.7) -> None:
+    """Give a plot over the whole numbers 1 to `count` ticks at some of them, and at nothing else."""
+    # One bar as wide as the plot would look like a background.
+    aside = room + max(0.0, (5 - count) / 2)
+    axes.set_xlim(1 - aside, count + aside)
+    step = next((step for step in _STEPS if count <= _MOST_NUMBERS * step), count)
+    axes.set_xticks([1, *range(max(step, 2), count + 1, step)])

@@ -13,7 +13,6 @@ from shapespace.fit.regions import REGIONS
 from shapespace.report.colours import (
     BEYOND_COLOUR,
     DENSE_COLOUR,
-    DIVERGING,
     MODEL_COLOUR,
     REGION_COLOURS,
     SCAN_COLOUR,
@@ -26,25 +25,30 @@ from shapespace.report.figures.draw import (
     FORWARD,
     GREY,
     INK,
+    NOT_SHOWN,
     SMALL,
     STAGE_WORDS,
     TEXT,
     Row,
-    Scale,
     absolute,
     chart,
     charts,
+    distance_scale,
     finish,
     grid,
     legend,
+    mean_mm,
+    mean_words,
     mm,
+    number_axis,
     percent,
     scan_over,
     short,
     surroundings,
+    unknown,
     view,
 )
-from shapespace.report.render import Image, Layer, render_maps, render_series
+from shapespace.report.render import Image, Layer, distance_layer, render_maps, render_series
 from shapespace.report.staged import StagedFit, scale_end
 from shapespace.types import FloatArray, Mesh
 
@@ -58,10 +62,15 @@ _REGION_WORDS = {
     "followed": "followed",
     "rejected": "rejected: the scan shows something else",
     "border": "at the scan's border",
-    "unseen": "not seen in the scan",
+    "unseen": NOT_SHOWN,
 }
 _MOST_MODES = 30
+_NEAR_START = 0.35
+_TOWERS = 2.0
+"""Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
 _NEAREST_MM, _FARTHEST_MM = 0.01, 300.0
+_TEXT_ROOM = 1.42
+"""How much farther than the tallest bar a half of a histogram reaches, for the line of text above it."""
 
 
 def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
@@ -74,13 +83,13 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """
     stages = [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]
     layers = [[Layer(fit.scan, SCAN_COLOUR)], *([layer] for layer in stages)]
-    captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(_mean(fit, stage))}" for stage in fit.surfaces)]
+    captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces)]
     dense = ", and taken the rest of the way" if "dense" in fit.surfaces else ""
     return grid(
         _from_two_sides(fit, layers, captions),
         title=title
         or f"{short(fit.label)}: the scan, and the model before, after finding pose and after finding shape{dense}",
-        note="In mm: mean distance from the model's vertices to the scan.",
+        note=mean_words([fit]),
     )
 
 
@@ -88,7 +97,7 @@ def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """Draw scan and model over each other at each stage, from two sides (the paper's figures 4 to 7)."""
     scan = scan_over(fit.scan)
     layers = [[scan, Layer(mesh, _colour(stage))] for stage, mesh in fit.surfaces.items()]
-    captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(_mean(fit, stage))}" for stage in fit.surfaces]
+    captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces]
     keys: list[tuple[str, Colour]] = [("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)]
     if "dense" in fit.surfaces:
         keys.append(("dense surface", DENSE_COLOUR))
@@ -96,12 +105,12 @@ def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
         _from_two_sides(fit, layers, captions),
         title=title or f"{short(fit.label)}: scan and model over each other, the nearer one is seen",
         keys=keys,
-        note="In mm: mean distance from the model's vertices to the scan. Where both mix finely, the fit is close.",
+        note=f"{mean_words([fit])} Where both mix finely, the fit is close.",
     )
 
 
 def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None = None, title: str = "") -> Figure:
-    """Draw the signed distances both ways: on the model to the scan, and on the scan to the model.
+    """Draw the distances both ways: on the model to the scan, and on the scan to the model; signed but for points.
 
         result = ss.fit_scan(model, scan)
         figures.signed_maps(StagedFit.of(model, result))
@@ -109,7 +118,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
     Args:
         fit: with the stage.
         stage: `before`, `initial`, `final` or `dense`.
-        limit_mm: both ends of the scale; None takes one that nearly all distances keep within.
+        limit_mm: where the scale ends; None takes one that nearly all distances keep within.
         title: above the figure.
 
     Raises:
@@ -121,8 +130,9 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         limit_mm = fit.scale_mm if stage == "final" else scale_end(np.concatenate([forward, backward]))
     if not limit_mm > 0:
         raise InputError(f"The limit of a scale must be positive, not {limit_mm!r} mm.")
+    signed = fit.scan.faces is not None
     on_model, on_scan = (
-        Layer(mesh, scalars=values, colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
+        distance_layer(mesh, values, limit_mm, signed=signed)
         for mesh, values in ((surface, forward), (fit.scan, backward))
     )
     panels: tuple[list[Image], list[Image]] = ([], [])
@@ -131,7 +141,12 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         first = view(surroundings(fit), len(_SIDES))
         for row, layer in zip(panels, (on_model, on_scan), strict=True):
             row += render_series([[layer]], camera=seen.camera, size=first.size)
-    beyond = 1 - len(absolute(backward)) / max(len(backward), 1)
+    unseen, beyond = unknown(forward), unknown(backward)
+    keys: list[tuple[str, Colour]] = []
+    if unseen:
+        keys.append((f"on the model: {NOT_SHOWN} ({percent(unseen)})", UNKNOWN_COLOUR))
+    if beyond:
+        keys.append((f"on the scan: beyond the model's rim, not counted ({percent(beyond)})", UNKNOWN_COLOUR))
     rows = [
         Row(panels[0], [side for side, _ in _SIDES], f"From the model to the scan: {_summary(forward)}"),
         Row(panels[1], [], f"From the scan to the model: {_summary(backward)}"),
@@ -143,18 +158,8 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         rows,
         title=title
         or f"{short(fit.label)}: how far scan and {what.removeprefix('the ')} lie from each other, both ways",
-        scale=Scale(
-            "signed distance (mm)",
-            DIVERGING,
-            -limit_mm,
-            limit_mm,
-            "both",
-            "scan behind the model",
-            "scan in front of it",
-        ),
-        keys=[(f"beyond the model's rim, not counted ({percent(beyond)} of the scan)", UNKNOWN_COLOUR)]
-        if beyond
-        else (),
+        scale=distance_scale(limit_mm, signed=signed),
+        keys=keys,
     )
 
 
@@ -172,22 +177,25 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
         far = np.abs(fit.model_to_scan_mm["final"])
         seen = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
         panels = render_maps(fit.surfaces["final"], far, ranges, colormap=table, camera=seen.camera, size=seen.size)
-        within = [percent(float((far <= limit).mean())) for limit in THRESHOLDS_MM]
+        known = absolute(far)
+        within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
         captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
         rows.append(Row(panels, captions, short(fit.label, 60) if len(several) > 1 else ""))
+    unseen = [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in several) else []
     whose = f"{short(several[0].label)}: where" if len(several) == 1 else "Where"
     return grid(
         rows,
         title=title or f"{whose} the model lies within 2 to 10 mm of the scan",
-        keys=[("within the limit", WITHIN_COLOUR), ("farther away", BEYOND_COLOUR)],
-        note="In %: share of the model's vertices within the limit.",
+        keys=[("within the limit", WITHIN_COLOUR), ("farther away", BEYOND_COLOUR), *unseen],
+        note="In %: share of the vertices that the scan shows that lie within the limit.",
     )
 
 
 def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> Figure:
     """Draw how the closest distances of both directions are spread, stage by stage on one scale.
 
-    Distances from the model to the scan stand above each line, those from the scan to the model hang below it.
+    Distances from the model to the scan stand above each line, those from the scan to the model hang below it. Only
+    vertices that the scan shows count, and scan points within the model's rim.
     """
     both = {
         stage: (absolute(fit.model_to_scan_mm[stage]), absolute(fit.scan_to_model_mm[stage])) for stage in fit.surfaces
@@ -195,12 +203,15 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
     every = np.concatenate([values for pair in both.values() for values in pair])
     low, high = _decades(every)
     edges = np.geomspace(low, high, bins + 1)
-    figure, plots = charts(
-        title or f"{short(fit.label)}: closest distances both ways, stage by stage",
-        [1.45] * len(both),
-    )
     heights = {stage: [100 * _histogram(values, edges) for values in pair] for stage, pair in both.items()}
-    most = 1.3 * max(float(height.max()) for pair in heights.values() for height in pair)
+    tallest = max(float(height.max()) for pair in heights.values() for height in pair) or 1.0
+    most = _TEXT_ROOM * tallest
+    note = "Counted: the vertices that the scan shows, and scan points within the model's rim."
+    if any(height[0] > max(_TOWERS * height[1], _TOWERS) for pair in heights.values() for height in pair):
+        note += f" The first bar holds all distances below {mm(float(edges[1]))}, 0 among them."
+    figure, plots = charts(
+        title or f"{short(fit.label)}: closest distances both ways, stage by stage", [1.6] * len(both), note=note
+    )
     for k, (axes, (stage, pair)) in enumerate(zip(plots, heights.items(), strict=True)):
         for height, values, sign, colour, name in zip(
             pair, both[stage], (1, -1), (FORWARD, BACKWARD), ("model to scan", "scan to model"), strict=True
@@ -211,10 +222,10 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
             if len(values):
                 mean = float(values.mean())
                 told = f"mean {mm(mean)}, largest {mm(float(values.max()))}"
-                axes.plot([min(max(mean, low), high)] * 2, [0, sign * most], color=colour, lw=1.6, ls=(0, (3, 1.5)))
+                axes.plot([min(max(mean, low), high)] * 2, [0, sign * tallest], color=colour, lw=1.6, ls=(0, (3, 1.5)))
             axes.text(
                 0.012, 0.5 + 0.47 * sign, f"{name}: {told}", transform=axes.transAxes, color=colour, fontsize=SMALL - 1,
-                va="top" if sign > 0 else "bottom",
+                va="top" if sign > 0 else "bottom", bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
             )  # fmt: skip
         axes.axhline(0, color=GREY, lw=0.8)
         axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=TEXT, color=INK, loc="left", pad=4)
@@ -224,8 +235,10 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
         axes.xaxis.set_major_formatter("{x:g}")
         if k < len(both) - 1:
             axes.tick_params(labelbottom=False)
-    plots[-1].set_xlabel("closest distance (mm); dashed: mean")
-    plots[len(plots) // 2].set_ylabel("share of the points (%)")
+    to_points = " to the points" if fit.scan.faces is None else ""
+    plots[-1].set_xlabel(f"closest distance{to_points} (mm, log scale); dashed: mean")
+    # In the middle of all: of an even number, that is between two.
+    plots[len(plots) // 2].set_ylabel("share of the points (%)", y=0.5 if len(plots) % 2 else 1.1)
     return finish(figure, h_pad=0.3)
 
 
@@ -243,24 +256,22 @@ def history_figure(fit: StagedFit, *, title: str = "") -> Figure:
     for number, colour, name in ((1, BACKWARD, "phase 1: pose"), (2, FORWARD, "phase 2: pose and shape")):
         at = np.flatnonzero((phase == number) & usable)
         if len(at):
-            axes.plot(at, rms[at], color=colour, lw=2, marker="o", ms=4 if len(rms) < 80 else 2, label=name)
-            axes.annotate(
-                mm(float(rms[at[-1]])), (at[-1], rms[at[-1]]), xytext=(0, 8), textcoords="offset points",
-                ha="right" if at[-1] > 0.1 * len(rms) else "left", fontsize=SMALL, color=colour,
-            )  # fmt: skip
+            ends = f"{name}, ends at {mm(float(rms[at[-1]]))}"
+            axes.plot(at, rms[at], color=colour, lw=2, marker="o", ms=4 if len(rms) < 80 else 2, label=ends)
     change = np.flatnonzero(np.diff(phase) > 0)
     if len(change):
         axes.axvline(float(change[0]) + 0.5, color="#c4c7cc", lw=1, ls=(0, (4, 3)))
-    if rms[usable].min() > 0 and rms[usable].max() > 4 * rms[usable].min():
+    log = bool(rms[usable].min() > 0 and rms[usable].max() > 4 * rms[usable].min())
+    if log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.1e}"[0] in "25" else "")
     else:
-        axes.set_ylim(0, 1.25 * float(rms[usable].max()) or 1.0)
-    axes.margins(y=0.14)
-    axes.set(xlabel="iteration", ylabel="RMS distance (mm)")
+        axes.set_ylim(0, 1.1 * float(rms[usable].max()) or 1.0)
+    axes.set(xlabel="iteration", ylabel=f"RMS distance (mm, {'log' if log else 'linear'} scale)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend(axes, loc="upper right")
+    # Above the plot, where it hides nothing.
+    legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.2)
     finish(figure)
     axes.tick_params(axis="y", which="minor", labelsize=SMALL - 1)
     return figure
@@ -282,7 +293,10 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     at = np.arange(1, shown + 1)
     z = fit.z[:shown]
     figure, axes = chart(
-        title or f"{short(fit.label)}: its coefficients, how sure they are, and what is usual", height=3.2
+        title
+        or f"{short(fit.label)}: its coefficient{'s, how sure they are' if count > 1 else ', how sure it is'}, "
+        "and what is usual",
+        height=3.2,
     )
     if population is None:
         axes.axhspan(-1.96, 1.96, color="#ebecee", lw=0, label="95 % of a normal population")
@@ -307,9 +321,9 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     axes.axhline(0, color=INK, lw=0.8)
     reach = np.abs(z) + np.where(known, 1.96 * np.nan_to_num(deviation), 0)
     limit = max(3.0, 1.1 * float(reach.max()))
-    axes.set(xlim=(0.3, max(shown, 5) + 0.7), ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
+    axes.set(ylim=(-limit, 1.45 * limit), ylabel="z = b / sd")
     axes.set_xlabel("mode" if shown == count else f"mode (first {shown} of {count})")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=12))
+    number_axis(axes, shown)
     legend(axes, loc="upper center", ncols=2)
     return finish(figure)
 
@@ -352,6 +366,10 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
     points = surroundings(fit)
+    before, final = fit.surfaces["before"].vertices, fit.surfaces["final"].vertices
+    # Of a start that was near, all is shown; one that was far away would make the rest small.
+    if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
+        points = np.concatenate([points, before])
     size = view(points, len(layers)).size
     rows: list[Row] = []
     for k, yaw in enumerate(_FRONT_AND_SIDE):
@@ -368,11 +386,6 @@ def _surface(fit: StagedFit, stage: str) -> Mesh:
     if stage not in fit.surfaces:
         raise InputError(f"{short(fit.label)} has no stage {stage!r}; choose one of {', '.join(fit.surfaces)}.")
     return fit.surfaces[stage]
-
-
-def _mean(fit: StagedFit, stage: str) -> float:
-    values = absolute(fit.model_to_scan_mm[stage])
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def _summary(values: FloatArray) -> str:

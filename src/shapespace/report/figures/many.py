@@ -11,11 +11,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from shapespace.errors import InputError
-from shapespace.report.colours import CATEGORIES, CLAY, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour, as_hex
+from shapespace.report.colours import (
+    CATEGORIES,
+    CLAY,
+    MODEL_COLOUR,
+    SCAN_COLOUR,
+    SEQUENTIAL,
+    UNKNOWN_COLOUR,
+    Colour,
+    as_hex,
+)
 from shapespace.report.figures.draw import (
+    DPI,
     GREY,
     INK,
+    NOT_SHOWN,
     SMALL,
+    TEXT,
     WIDTH,
     Row,
     Scale,
@@ -23,19 +35,25 @@ from shapespace.report.figures.draw import (
     chart,
     charts,
     counted,
+    distance_scale,
     escaped,
     finish,
     grid,
     in_rows,
     legend,
+    line_height,
+    mean_mm,
+    mean_words,
+    measured,
     mm,
     plain,
     scan_over,
     short,
     surroundings,
+    unknown,
     view,
 )
-from shapespace.report.render import Camera, Image, Layer, render, render_series
+from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
 from shapespace.report.staged import StagedFit, nice_ceiling, scale_end
 from shapespace.types import FloatArray, Mesh
 
@@ -58,6 +76,8 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _MOST_IN_LEGEND = 16
 _MOST_DOTS_BIG = 60
 _NO_PICTURE = 0.945
+_LEGEND_MARK, _LEGEND_LINE = 3.6 * SMALL * DPI / 72, 1.1
+_SPACE_INCHES = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +122,7 @@ class Entry:
     @staticmethod
     def of(fit: StagedFit) -> Entry:
         """Return the entry of a fit with its surfaces."""
-        return Entry(fit.label, fit.status, fit.reason, float(absolute(fit.model_to_scan_mm["final"]).mean()), fit)
+        return Entry(fit.label, fit.status, fit.reason, mean_mm(fit), fit)
 
 
 def worst_first(entries: Sequence[Entry]) -> list[Entry]:
@@ -150,7 +170,8 @@ def gallery(fits: Sequence[StagedFit | Entry], *, columns: int = 3, most: int = 
         rows,
         title=title or f"{counted(len(entries), 'fit')}, the worst first: {told or 'none is in doubt'}",
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
-        note=f"{counted(left, 'more fit')} with smaller distances not shown." if left else "",
+        note=mean_words([entry.fit for entry in shown if entry.fit is not None])
+        + (f" {counted(left, 'more fit')} with smaller distances not shown." if left else ""),
     )
 
 
@@ -208,6 +229,10 @@ def error_curves(
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
     far = [np.sort(absolute(fit.model_to_scan_mm[stage])) for fit in fits]
+    fits = [fit for fit, values in zip(fits, far, strict=True) if len(values)]
+    far = [values for values in far if len(values)]
+    if not far:
+        return _nothing_shown(title)
     pooled = np.sort(np.concatenate(far))
     figure, axes = chart(
         title or f"How close the model comes to the scan, over {counted(len(fits), 'fit')}", height=3.5
@@ -229,9 +254,19 @@ def error_curves(
             f"{100 * share:.0f} % within {mm(at)}", (at, 100 * share), xytext=(10, -5), textcoords="offset points",
             fontsize=SMALL, color=INK, va="top",
         )  # fmt: skip
-    axes.set(xlabel="distance from the model to the scan (mm)", ylabel="share of the vertices seen (%)")
+    axes.set(xlabel="distance from the model to the scan (mm)", ylabel="vertices that the scan shows (%)")
     axes.set(xlim=(0, nice_ceiling(1.15 * float(np.quantile(pooled, 0.985)))), ylim=(0, 102))
     legend(axes, loc="lower right")
+    return finish(figure)
+
+
+def _nothing_shown(title: str) -> Figure:
+    figure, axes = chart(title or "How close the model comes to the scan", height=1.2)
+    axes.text(
+        0.5, 0.5, "No vertex of a model is shown by its scan.", transform=axes.transAxes, ha="center", va="center",
+        fontsize=TEXT, color=GREY,
+    )  # fmt: skip
+    axes.set_axis_off()
     return finish(figure)
 
 
@@ -393,15 +428,22 @@ def _space(
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
     groups = _groups(scans)
+    handles = _handles(groups) if any(name for name, _, _ in groups) else []
+    if neutral_b is not None:
+        handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.4))
+    columns = _legend_columns([str(handle.get_label()) for handle in handles])
+    lines = int(np.ceil(len(handles) / columns))
     # Panels are placed by hand, since matplotlib leaves half of a 3-D plot empty.
-    figure, plots = charts(title, [3.35])
+    foot_px = lines * _LEGEND_LINE * line_height(SMALL)
+    figure, plots = charts(title, [_SPACE_INCHES + foot_px / DPI])
     figure.delaxes(plots[0])
     within = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
-    foot = 0.13 if len(groups) <= 6 else 0.2
+    total = figure.get_figheight()
+    foot = within[1] + foot_px / DPI / total
     size = _dot_size(len(scans))
     for k, azimuth in enumerate((-62, 24)):
         # matplotlib's 3-D axes have no usable types.
-        place = (0.53 * k, within[1] + foot - 0.04, 0.46, within[3] - within[1] - foot + 0.16)
+        place = (0.54 * k, foot + 0.06 / total, 0.44, within[3] - foot + 0.5 / total)
         axes = cast(Any, figure.add_axes(place, projection="3d"))
         for _, look, at in groups:
             own = [scans[i] for i in at]
@@ -424,17 +466,38 @@ def _space(
         axes.zaxis.set_rotate_label(False)
         axes.zaxis.label.set_rotation(90)
         axes.tick_params(labelsize=SMALL - 2, colors=GREY, pad=-1)
+        # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
+        wider = _wider_than_three(axes.zaxis)
+        axes.tick_params(axis="z", pad=wider / 2 - 1)
+        axes.zaxis.labelpad = 2 + 0.6 * wider
+        aside = wider / 72 * DPI / WIDTH
+        axes.set_position((place[0] + k * aside, place[1], place[2] - aside, place[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
-    if any(name for name, _, _ in groups) or neutral_b is not None:
-        handles = _handles(groups)
-        if neutral_b is not None:
-            handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.4))
+    if handles:
         figure.legend(
-            handles=handles, loc="lower center", ncols=min(5, len(handles)), fontsize=SMALL, frameon=False,
+            handles=handles, loc="lower center", ncols=columns, fontsize=SMALL, frameon=False,
             labelcolor=INK, handletextpad=0.2, columnspacing=1.2, bbox_to_anchor=(0.5, within[1]), borderpad=0.1,
         )  # fmt: skip
     return figure
+
+
+def _wider_than_three(axis: Any) -> float:
+    """Return by how many points the widest number of an axis is wider than three digits."""
+    formatter = axis.get_major_formatter()
+    low, high = axis.get_view_interval()
+    told = formatter.format_ticks([at for at in axis.get_majorticklocs() if low <= at <= high])
+    widest = max((measured(text, SMALL - 2) for text in told), default=0.0)
+    return max(0.0, widest - measured("000", SMALL - 2)) * 72 / DPI
+
+
+def _legend_columns(names: Sequence[str]) -> int:
+    """Return into how many columns the entries of a legend below a figure go, so that none is cut."""
+    for columns in range(min(len(names), 5), 1, -1):
+        parts = np.array_split(np.array([measured(name, SMALL) for name in names]), columns)
+        if sum(float(part.max()) + _LEGEND_MARK for part in parts) < WIDTH:
+            return columns
+    return 1
 
 
 def faces_grid(
@@ -467,20 +530,24 @@ def portrait_figure(
     if not fits:
         raise InputError(f"{plain(title)}: there is no fit to draw.")
     top = scale_end(np.concatenate([f.model_to_scan_mm["final"] for f in fits]))
+    # One scale for all rows: where one has no sign, none is shown.
+    signed = all(fit.scan.faces is not None for fit in fits)
     rows: list[Row] = []
     for k, fit in enumerate(fits):
         seen = view(surroundings(fit), 4, yaw_deg=yaw_deg)
         final, far = fit.surfaces["final"], fit.model_to_scan_mm["final"]
         scan, over, model = Layer(fit.scan, SCAN_COLOUR), scan_over(fit.scan), Layer(final, MODEL_COLOUR)
-        mapped = Layer(final, scalars=far, colormap=DIVERGING, vmin=-top, vmax=top)
+        mapped = distance_layer(final, far, top, signed=signed)
         panels = render_series([[scan], [model], [over, model], [mapped]], camera=seen.camera, size=seen.size)
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
-        rows.append(Row(panels, captions, f"{name}: {mm(float(absolute(far).mean()))} on average where seen"))
+        rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(fit))}"))
     return grid(
         rows,
         title=title,
-        scale=Scale("distance from the model to the scan (mm)", DIVERGING, -top, top, "both", "behind", "in front"),
+        scale=distance_scale(top, signed=signed) if signed else _unsigned(fits, top),
+        keys=_grey(fits),
+        note=mean_words(fits),
     )
 
 
@@ -491,7 +558,12 @@ def aligned_grid(
     images, _ = _equal_views(
         fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]
     )
-    return grid(_captioned(images, fits, columns), title=title, keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)])
+    return grid(
+        _captioned(images, fits, columns),
+        title=title,
+        keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
+        note=mean_words(fits),
+    )
 
 
 def distance_maps(
@@ -500,7 +572,8 @@ def distance_maps(
     """Draw the distance from each fitted model to its scan, on one scale up to the 99th percentile of all."""
     if not fits:
         raise InputError(f"{plain(title)}: there is no fit to draw.")
-    top = nice_ceiling(float(np.percentile(np.concatenate([absolute(f.model_to_scan_mm["final"]) for f in fits]), 99)))
+    known = np.concatenate([absolute(f.model_to_scan_mm["final"]) for f in fits])
+    top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
     images, _ = _equal_views(
         fits,
         columns,
@@ -511,8 +584,21 @@ def distance_maps(
     return grid(
         _captioned(images, fits, columns),
         title=title,
-        scale=Scale("distance from the model to the scan (mm)", SEQUENTIAL, 0.0, top, "high"),
+        scale=_unsigned(fits, top),
+        keys=_grey(fits),
+        note=mean_words(fits),
     )
+
+
+def _unsigned(fits: Sequence[StagedFit], top: float) -> Scale:
+    if all(fit.scan.faces is None for fit in fits):
+        return distance_scale(top, signed=False)
+    return Scale("distance from the model to the scan (mm)", SEQUENTIAL, 0.0, top, "high")
+
+
+def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
+    """Return the key of what the maps of some of these fits leave grey."""
+    return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
 def _equal_views(
@@ -537,7 +623,7 @@ def _equal_views(
 
 def _captioned(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
     columns = min(columns, max(len(fits), 3))
-    names = [f"{short(f.label, 30)}\n{mm(float(absolute(f.model_to_scan_mm['final']).mean()))}" for f in fits]
+    names = [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits]
     return [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(names, columns), strict=True)]
 
 

@@ -10,7 +10,6 @@ from typing import Any, cast
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
@@ -30,6 +29,7 @@ from shapespace.report.figures.draw import (
     grid,
     legend,
     mm,
+    number_axis,
     percent,
     view,
 )
@@ -120,9 +120,17 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
         )
     return grid(
         rows,
-        title=title or ("What the one mode does to the mean" if shown == 1 else "What each mode does to the mean"),
+        title=title or f"What {_which(shown, model.n_modes)} to the mean",
         scale=Scale(f"how far a point moves at {deviations:g} standard deviations (mm)", SEQUENTIAL, 0.0, top),
     )
+
+
+def _which(shown: int, count: int) -> str:
+    if count == 1:
+        return "the one mode does"
+    if shown == count:
+        return f"each of the {count} modes does"
+    return f"the first of {count} modes does" if shown == 1 else f"the first {shown} of {count} modes do"
 
 
 def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
@@ -224,8 +232,15 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
     reached = [count for count in needed.values() if count is not None]
     shown = min(len(cumulative), max(8, (max(reached) if len(reached) == len(needed) else len(cumulative)) + 3), 120)
     count = np.arange(1, shown + 1)
+    shapes = counted(model.n_training, "shape")
     figure, axes = chart(
-        title or f"How many modes the variance of {counted(model.n_training, 'shape')} needs", height=3.3
+        title
+        or (
+            f"How many modes the variance of {shapes} needs"
+            if len(cumulative) > 1
+            else f"How much of the variance of {shapes} the one mode holds"
+        ),
+        height=3.3,
     )
     axes.bar(count, 100 * np.diff(cumulative[:shown], prepend=0.0), color=_BARS, label="each mode")
     axes.plot(
@@ -240,29 +255,25 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
     lines: list[str] = []
     for share, modes in needed.items():
         if modes is None:
-            lines.append(f"{100 * share:g} %: more than {len(cumulative)}")
+            lines.append(f"{100 * share:g} %: more than {counted(len(cumulative), 'mode')}")
             continue
         lines.append(f"{100 * share:g} %: {counted(modes, 'mode')}")
         if modes <= shown:
             axes.plot([modes], [100 * cumulative[modes - 1]], "o", ms=9, mfc="none", mec=INK, mew=1.4, zorder=5)
     axes.plot([], [], "o", ms=9, mfc="none", mec=INK, mew=1.4, ls="", label="\n".join(lines))
-    axes.set(
-        xlabel="number of modes", ylabel="share of the variance (%)", ylim=(0, 104), xlim=(0.2, max(shown, 4) + 0.8)
-    )
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="number of modes", ylabel="share of the variance (%)", ylim=(0, 104))
+    number_axis(axes, shown)
     legend(axes, loc="center right", bbox_to_anchor=(1.0, 0.42), labelspacing=0.6)
     return finish(figure)
 
 
-def quality_figure(
-    quality: Mapping[str, Any], *, title: str = "How good the shape space is, by its number of modes"
-) -> Figure:
+def quality_figure(quality: Mapping[str, Any], *, title: str = "") -> Figure:
     """Draw compactness, generalisation and specificity, those of them that are there, over the number of modes.
 
     Args:
         quality: from `compactness` (shares of the variance, 0 to 1), `generalisation` and `specificity` (mm) to a list
             with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`, `mean` and, if known, `stddev`.
-        title: above the figure.
+        title: above the figure; by default it says what is drawn.
 
     Raises:
         InputError: none of the three is there, or one is no such list.
@@ -270,7 +281,9 @@ def quality_figure(
     parts = {key: _measured(key, quality[key]) for key in _QUALITY if quality.get(key) is not None}
     if not parts:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
-    figure, plots = charts(title, [2.5] * len(parts))
+    most = int(max(modes.max() for modes, _, _ in parts.values()))
+    by_default = f"How good the shape space is, {'by its number of modes' if most > 1 else 'with its one mode'}"
+    figure, plots = charts(title or by_default, [2.5] * len(parts))
     for axes, (key, (modes, mean, spread)) in zip(plots, parts.items(), strict=True):
         scale = 100.0 if key == "compactness" else 1.0
         dots = "o" if len(modes) < 40 else ""
@@ -284,7 +297,7 @@ def quality_figure(
         axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
         axes.set_ylabel(unit)
         axes.set_ylim(0, 104 if key == "compactness" else None)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        number_axis(axes, most)
     plots[-1].set_xlabel("number of modes")
     return finish(figure, h_pad=1.2)
 

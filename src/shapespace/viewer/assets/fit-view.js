@@ -45,12 +45,13 @@
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
 
-  const STAGES = { before: "Before", initial: "Pose", final: "Fit", dense: "Dense" };
+  const STAGES = { before: "Before", initial: "Phase 1", final: "Phase 2", dense: "Dense" };
   const STAGE_TITLES = {
     before: "Before: centroids together", initial: "After phase 1: the pose", final: "After phase 2: pose and shape",
     dense: "Dense: the rest of the way to the scan",
   };
-  const REGIONS = { followed: "followed", rejected: "rejected as not matching", border: "at the scan's border", unseen: "not seen by the scan" };
+  const NEARER = (Viewer.NEARER = "the nearer one is shown");
+  const REGIONS = { followed: "followed", rejected: "rejected as not matching", border: "at the scan's border", unseen: "not shown by the scan" };
   const REGION_CODES = ["followed", "rejected", "border", "unseen"];
 
   function segments(choices, label, id, choose) {
@@ -88,13 +89,11 @@
       this.n = arrays.history_phase ? arrays.history_phase.length : 0;
       this.K = arrays.b.length;
       this.stddev = this.context.about.stddev;
-      // A scale on which most of the surface can be told apart, however far hair or a collar lies.
-      const far = (q) => Viewer.quantile(arrays.model_to_scan_final, q);
-      this.limit = Viewer.nice(Math.max(1, Math.min(3 * far(0.5), far(0.95))));
+      this.limit = facts.scale_mm > 0 ? facts.scale_mm : 1;
       const keep = this.view || {};
       this.view = {
         stage: "final", moment: null, layout: keep.layout || "overlay", colour: keep.colour || "plain",
-        scanOpacity: 1, modelOpacity: 0.8, marked: false, threshold: Math.min(this.limit / 2, 2),
+        scanOpacity: 1, modelOpacity: 1, marked: false, threshold: Math.min(this.limit / 2, 2),
       };
       this._build();
       this._fill();
@@ -175,7 +174,7 @@
       const { facts, arrays } = this.payload;
       const b = this.source.b || Array.from(arrays.b), sd = this.source.b_stddev || Array.from(arrays.b_stddev);
       const name = facts.name.replace(/\.[^.]*$/, "");
-      Viewer.save(Viewer.coefficientsCsv([{ name, status: facts.status, b, z: this._z(), sd }]), `${name}.coefficients.csv`);
+      Viewer.save(Viewer.coefficientsCsv([{ name, status: facts.status, b, z: this._z(), sd }], this.context.about.modes), `${name}.coefficients.csv`);
     }
 
     /** Put the surfaces of the payload into the views. */
@@ -191,7 +190,7 @@
       const overlay = view.layout === "overlay";
       const only = { plain: null, model: "model", regions: "model", scan: "scan" }[view.colour];
       view.scanOpacity = overlay && only === "model" ? 0 : 1;
-      view.modelOpacity = !overlay ? 1 : only === "scan" ? 0 : only === "model" ? 1 : 0.8;
+      view.modelOpacity = overlay && only === "scan" ? 0 : 1;
     }
 
     /** Go to a saved iteration. */
@@ -285,7 +284,9 @@
       stage.legend(null);
       this.shared = null;
       if (view.moment !== null || view.colour === "plain") {
-        stage.legend(this.view.layout === "overlay" ? [["scan", about.scan_colour], ["model", about.model_colour]] : null);
+        const both = [["scan", about.scan_colour], ["model", about.model_colour]];
+        const opaque = view.scanOpacity > 0.99 && view.modelOpacity > 0.99;
+        stage.legend(view.layout === "overlay" ? both : null, opaque ? NEARER : "");
         return;
       }
       if (view.colour === "regions") {
@@ -295,11 +296,13 @@
       }
       const onModel = view.colour === "model";
       const values = arrays[onModel ? `model_to_scan_${view.stage}` : `scan_to_model_${view.stage}`];
-      const range = [-this.limit, this.limit];
-      const options = { map: about.diverging, range, threshold: view.marked ? view.threshold : null };
+      const { diverging, sequential, unknown_colour: unknown, signal_colour: signal } = about;
+      const scale = Shapespace.distanceScale(this.payload.facts, values, onModel, { diverging, sequential, unknown });
+      const options = { map: scale.map, range: scale.range, threshold: view.marked ? view.threshold : null, signal, unknown };
       if (onModel) model.paint("model", values, options);
       else stage.a.paint("scan", values, options);
-      stage.bar({ map: about.diverging, range, unit: "mm", title: "Scan inside (\u2212) or outside (+)" });
+      const beyond = view.marked ? [["beyond the threshold", signal]] : [];
+      stage.bar({ ...scale, keys: [...beyond, ...scale.keys] });
       this.shared = { values, onModel };
     }
 
@@ -326,7 +329,7 @@
           if (Math.abs(value) > view.threshold) beyond += 1;
         }
         const share = known ? ((100 * beyond) / known).toFixed(1) : "0.0";
-        const what = this.shared.onModel ? "the model's vertices lie" : "the scan's points that the model covers lie";
+        const what = this.shared.onModel ? "the model's vertices that the scan shows lie" : "the scan's points that the model covers lie";
         this.share.textContent = `${share} % of ${what} beyond ${view.threshold.toFixed(this.limit > 5 ? 1 : 2)} mm.`;
       }
       if (this.steps) {
@@ -339,15 +342,15 @@
     }
   };
 
-  /** Coefficients as CSV in the columns of coefficients.csv: rows of {name, status, b, z, sd}. */
-  Viewer.coefficientsCsv = function (rows) {
-    const K = Math.max(...rows.map((row) => row.b.length));
+  /** Coefficients of a model of K modes as CSV in the columns of coefficients.csv: rows of {name, status, b, z, sd}. */
+  Viewer.coefficientsCsv = function (rows, K) {
+    const whole = (values) => Array.from({ length: K }, (_, k) => (k < values.length ? values[k] : ""));
     const each = (letter, end = "") => Array.from({ length: K }, (_, k) => `${letter}${k + 1}${end}`);
     const withError = rows.some((row) => row.sd);
     const lines = [["scan", "status", ...each("b"), ...each("z"), ...(withError ? each("b", "_stddev") : [])].join(",")];
     // A spreadsheet would run a name that starts like a formula.
     const cell = (text) => `"${(/^[=+\-@\t\r]/.test(text) ? "'" : "") + String(text).replace(/"/g, '""')}"`;
-    for (const row of rows) lines.push([cell(row.name), cell(row.status || ""), ...row.b, ...row.z, ...(row.sd || [])].join(","));
+    for (const row of rows) lines.push([cell(row.name), cell(row.status || ""), ...whole(row.b), ...whole(row.z), ...(row.sd ? whole(row.sd) : [])].join(","));
     return new Blob([lines.join("\n") + "\n"], { type: "text/csv" });
   };
 })();

@@ -6,6 +6,7 @@
   const { h, sign, paintTrack, nice, quantile, save } = Viewer;
   const $ = (id) => document.getElementById(id);
   const SHOWN_AT_FIRST = 12;
+  const FILTERED_FROM = 12;
   const STATUS = {
     converged: "Nothing speaks against this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
     failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
@@ -23,10 +24,30 @@
 
   // Messages --------------------------------------------------------------------------------------------------------
 
+  let alerts = 0; // told so far
+  let running = 0; // actions that may still fail
+
   function alertUser(sentence) {
-    const close = h("button", { type: "button", class: "small quiet", onclick: () => { $("message").hidden = true; } }, "Close");
+    alerts += 1;
+    const close = h("button", { type: "button", class: "small quiet", "data-testid": "message-close", onclick: quiet }, "Close");
     $("message").replaceChildren(h("span", {}, sentence), close);
     $("message").hidden = false;
+  }
+
+  function quiet() {
+    $("message").hidden = true;
+  }
+
+  /** An older message goes when what was done after it went well; what the server is asked for decides by itself. */
+  function startMessages() {
+    const control = "button, input, select, [role=option]";
+    for (const kind of ["click", "input", "change"]) {
+      addEventListener(kind, (event) => {
+        const before = alerts;
+        if (event.target.closest && event.target.closest(control)) setTimeout(() => { if (alerts === before && !running) quiet(); }, 0);
+      }, true);
+    }
+    addEventListener("keydown", (event) => { if (event.key === "Escape") quiet(); });
   }
 
   const UNREACHABLE = "The viewer's server does not answer; see whether shapespace view still runs, then reload the page.";
@@ -45,12 +66,25 @@
     throw new Error(told || `The server answered with the error ${answer.status}; reload the page.`);
   }
 
-  const guarded = (action) => async (...given) => {
+  /** `action` with what goes wrong told to the user. */
+  const telling = (action) => async (...given) => {
     try {
       return await action(...given);
     } catch (error) {
       alertUser(error.message);
       return undefined;
+    }
+  };
+
+  /** The same of what the user does, where success ends an older message. */
+  const guarded = (action) => async (...given) => {
+    const before = alerts;
+    running += 1;
+    try {
+      return await telling(action)(...given);
+    } finally {
+      running -= 1;
+      if (alerts === before) quiet();
     }
   };
 
@@ -101,12 +135,12 @@
 
     bar(options) {
       $("bar").hidden = !options;
-      const wanted = options ? `${options.title} ${options.range}` : "";
+      const wanted = options ? [options.title, ...options.range, ...(options.keys || []).map(([text]) => text)].join(" ") : "";
       if (options && this._bar !== wanted) Shapespace.colourBar($("bar"), options);
       this._bar = wanted;
     }
 
-    legend(items) {
+    legend(items, note) {
       $("legend").hidden = !items;
       if (!items) return;
       const rgb = (c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`;
@@ -117,7 +151,7 @@
         svg.setAttribute("viewBox", "0 0 12 12");
         svg.append(spot);
         return h("li", {}, svg, text);
-      }));
+      }), ...(note ? [h("li", {}, note)] : []));
     }
 
     clear() {
@@ -294,7 +328,7 @@
     }
     $("export-shape").append(h("button", { type: "button", "data-testid": "export-csv", onclick: () => {
       const b = Array.from(z, (value, k) => value * (k < stddev.length ? stddev[k] : 0));
-      save(Viewer.coefficientsCsv([{ name: "shape", b, z: Array.from(z) }]), "shape.coefficients.csv");
+      save(Viewer.coefficientsCsv([{ name: "shape", b, z: Array.from(z) }], about.modes), "shape.coefficients.csv");
     } }, "Coefficients CSV"));
   }
 
@@ -425,18 +459,28 @@
     if (file.size > 64 * 2 ** 20) throw new Error(`${file.name} is larger than any table of coefficients; give a coefficients.csv.`);
     const table = csvRows(await file.text());
     const head = table[0] || [];
-    const columns = (letter) => Array.from({ length: about.modes }, (_, k) => head.indexOf(`${letter}${k + 1}`));
-    const inZ = columns("z"), inB = columns("b");
-    const letter = inZ[0] >= 0 ? "z" : inB[0] >= 0 ? "b" : null;
+    const named = (letter) => head.filter((name) => new RegExp(`^${letter}[1-9][0-9]*$`).test(name)).length;
+    const letter = named("z") ? "z" : named("b") ? "b" : null;
     if (!letter) throw new Error(`${file.name} has no columns z1, z2, ... or b1, b2, ...; give a coefficients.csv of shapespace fit.`);
+    const columns = (of) => Array.from({ length: about.modes }, (_, k) => head.indexOf(`${of}${k + 1}`));
+    const at = columns(letter), other = columns(letter === "z" ? "b" : "z");
+    if (named(letter) !== about.modes || at.includes(-1)) {
+      throw new Error(`${file.name} holds ${named(letter)} coefficients and ${about.model} has ${about.modes}; give a table of fits by this model.`);
+    }
     let added = 0;
     for (const line of table.slice(1)) {
-      const values = (letter === "z" ? inZ : inB).map((at, k) => {
-        const value = at >= 0 && line[at] ? Number(line[at]) : 0;
-        return letter === "z" ? value : value / (k < stddev.length ? stddev[k] : Infinity);
+      const given = at.map((column) => line[column] || "");
+      while (given.length > 1 && given[given.length - 1] === "") given.pop(); // modes that were not fitted
+      if (given.includes("")) continue;
+      const numbers = given.map(Number);
+      const values = letter === "z" ? numbers : numbers.map((value, k) => value / stddev[k]);
+      if (!values.every(Number.isFinite)) continue;
+      // Tables with b and z tell the standard deviations of their model.
+      const differs = letter === "z" && values.some((value, k) => {
+        const b = line[other[k]] ? Number(line[other[k]]) : NaN, ours = value * stddev[k];
+        return Math.abs(b - ours) > 1e-3 * Math.max(Math.abs(b), Math.abs(ours)) + 1e-6;
       });
-      const first = (letter === "z" ? inZ : inB)[0];
-      if (!line[first] || !values.every(Number.isFinite)) continue;
+      if (differs) throw new Error(`${file.name} was made by another model than ${about.model}, for its modes have other standard deviations; give a table of fits by this model.`);
       const name = line[Math.max(head.indexOf("scan"), 0)] || `row ${added + 1}`;
       shapes.set(`csv ${file.name} ${name}`, { name: `${name} (${file.name})`, z: values });
       added += 1;
@@ -477,16 +521,22 @@
 
   /** A reason without what the heading says already. */
   function plainReason(reason) {
-    const rest = reason.replace(/^Do not trust this fit: /, "");
+    const said = "Do not trust this fit: ";
+    if (!reason.startsWith(said)) return reason; // it may begin with the name of a file
+    const rest = reason.slice(said.length);
     return rest.charAt(0).toUpperCase() + rest.slice(1);
   }
 
-  function distanceFacts(distances) {
+  /** Distances of the verdict; of the model's where the scan shows it, once the surfaces (`payload`) tell where. */
+  function distanceFacts(distances, payload) {
     const final = distances && distances.final;
     if (!final) return null;
     const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
+    const seen = payload && payload.arrays.model_to_scan_final;
+    const forward = seen ? `${mm(payload.facts.mean_mm.final.model)} mean where the scan shows it, 95 % within ${mm(quantile(seen, 0.95))}`
+      : `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`;
     const told = [
-      ["Model to scan", `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`],
+      ["Model to scan", forward],
       ["Scan to model", `${mm(final.scan_to_model.mean)} mean over ${Math.round(100 * final.scan_to_model.fraction)} % of the scan`],
     ];
     return h("dl", { class: "facts" }, ...told.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
@@ -498,16 +548,20 @@
     if (!about.has_fits) return;
     listed = await json("/api/fits");
     fillChoices();
+    $("fit-filter-label").hidden = listed.length <= FILTERED_FROM;
+    $("fit-filter").addEventListener("input", filterFits);
     $("fit-list").replaceChildren(...listed.map((row, i) => h("div", {
       role: "option", id: `fit-${i}`, class: row.status, "aria-selected": "false", "data-testid": "fit", "data-name": row.name,
       title: row.reason, onclick: () => selectFit(i),
     }, h("i", { class: "dot" }), h("span", {}, row.label, h("b", { hidden: true }, ` ${row.status}`)),
-    h("small", {}, row.model_to_scan_mm === null ? row.status : `${row.model_to_scan_mm.toFixed(2)} mm`))));
+    h("small", {}, row.scan_to_model_mm === null ? row.status : `${row.scan_to_model_mm.toFixed(2)} mm`))));
     $("fit-list").addEventListener("keydown", (event) => {
       const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
       if (!step) return;
       event.preventDefault();
-      selectFit(Math.max(0, Math.min(listed.length - 1, selected + step)));
+      for (let i = selected + step; i >= 0 && i < listed.length; i += step) {
+        if (!$(`fit-${i}`).hidden) { selectFit(i); return; }
+      }
     });
     const isDoubtful = (row) => row.status !== "converged";
     const go = (step) => {
@@ -521,6 +575,18 @@
     const count = listed.filter(isDoubtful).length;
     $("fit-next").disabled = $("fit-previous").disabled = count === 0;
     if (!count) $("fit-next").title = $("fit-previous").title = "No fit is doubtful";
+  }
+
+  /** Show the fits whose name, label or status holds what is typed. */
+  function filterFits() {
+    const wanted = $("fit-filter").value.trim().toLowerCase();
+    let left = 0;
+    listed.forEach((row, i) => {
+      const fits = `${row.label}\n${row.name}\n${row.status}`.toLowerCase().includes(wanted);
+      $(`fit-${i}`).hidden = !fits;
+      left += fits ? 1 : 0;
+    });
+    $("fit-filter-said").textContent = wanted ? `${left} of ${listed.length} fits` : "";
   }
 
   const selectFit = guarded(async (index) => {
@@ -574,7 +640,6 @@
     if (file.size > about.upload_bytes) {
       throw new Error(`${file.name} is larger than the ${Math.round(about.upload_bytes / 2 ** 20)} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
     }
-    $("message").hidden = true;
     beginScan({ id: null, name: file.name });
     progress(`Sending ${file.name}`, 0);
     try {
@@ -631,7 +696,7 @@
     stream = new EventSource(`/api/scans/${mine.id}/events`);
     const source = stream;
     let scheduled = 0;
-    source.onmessage = guarded(async (event) => {
+    source.onmessage = telling(async (event) => {
       if (own !== mine) { source.close(); return; }
       const told = JSON.parse(event.data);
       if (told.event === "queue") progress(told.position > 1 ? `Waiting: ${told.position - 1} before it` : "Waiting for a free place", null);
@@ -656,7 +721,7 @@
     });
     source.onerror = () => {
       // The browser tries again by itself; what matters is whether there is still a server, and still this scan.
-      setTimeout(guarded(async () => {
+      setTimeout(telling(async () => {
         if (own !== mine || mine.verdict) return;
         let known = null;
         try {
@@ -719,9 +784,9 @@
       const there = new Float32Array(positions.length);
       mapping(first, true)(mapping(last, false)(positions, there), there);
       if (stage.a.has("model")) stage.a.move("model", there);
-      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour, opacity: 0.8 });
+      else stage.a.setSurface("model", { positions: there, faces: model.faces, colour: about.model_colour });
       stage.captions(`${own.name}: the model moves onto the scan`);
-      stage.legend([["scan", about.scan_colour], ["model", about.model_colour]]);
+      stage.legend([["scan", about.scan_colour], ["model", about.model_colour]], Viewer.NEARER);
     } else {
       stage.captions(own.name);
     }
@@ -747,6 +812,8 @@
     if (!told.pictured) return;
     const payload = await binary(`/api/scans/${mine.id}/picture`);
     if (own !== mine || mine.placing) return;
+    const first = $("verdict").querySelector(".facts");
+    if (first) first.replaceWith(distanceFacts(told.distances_mm, payload));
     scanView.show(payload, { scan: mine.id, b: told.b, z: told.z, b_stddev: told.b_stddev });
     $("scan-detail").append(h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {
@@ -1010,6 +1077,7 @@
     startModel();
     startCompare();
     startTabs();
+    startMessages();
     drawModel();
     stage.a.frame(["model"]);
     $("loading").hidden = true;
