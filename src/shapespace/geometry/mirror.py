@@ -22,9 +22,9 @@ def mirror_vertices(vertices: FloatArray) -> IntArray:
         InputError: the surface is not its own mirror image, or its vertices do not pair up.
     """
     centred = vertices - vertices.mean(axis=0) * [0.0, 1.0, 1.0]
-    distance, other = cKDTree(centred).query(centred * [-1.0, 1.0, 1.0])
+    found = cKDTree(centred).query(centred * [-1.0, 1.0, 1.0])
+    distance, other = np.asarray(found[0]), np.asarray(found[1], dtype=np.int32)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))
-    other = np.asarray(other, dtype=np.int32)
     if distance.max() > _OFF * size or (other[other] != np.arange(len(other))).any():
         raise InputError("This surface is not its own mirror image about x = 0; train without mirror images.")
     return other

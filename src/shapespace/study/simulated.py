@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -161,7 +161,7 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
         FitError: a worker was stopped from outside.
         FileError: the folder cannot be written.
     """
-    told = on_progress or (lambda what, done, total: None)
+    told: Progress = on_progress or _untold
     load_ict()
     models = [(_make_model, (folder, config, fold)) for fold in range(config.folds)]
     people = [(_fit_person, (folder, config, person)) for person in range(config.people.people)]
@@ -182,6 +182,10 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
             for _ in _run(pool, todo):
                 done += 1
                 told(what, done, len(jobs))
+
+
+def _untold(what: str, done: int, total: int) -> None:
+    pass
 
 
 def _pool(workers: int) -> Executor:
@@ -391,4 +395,4 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
 
 
 def _joined(parts: Sequence[dict[str, npt.NDArray[Any]]], key: str, axis: int) -> FloatArray:
-    return cast(FloatArray, np.concatenate([part[key] for part in parts], axis=axis).astype(np.float64))
+    return np.concatenate([part[key] for part in parts], axis=axis).astype(np.float64)

@@ -1,0 +1,139 @@
+"""The paper's next step: first the type of face, then an expression model for that type (section 5).
+
+Types are the components of a Gaussian mixture of identity coefficients, as many as the Bayesian information criterion
+asks for. The hard form takes the likeliest type; the soft one weighs the answers of all by how likely each type is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from scipy.special import logsumexp
+
+from shapespace.errors import InputError
+from shapespace.recognise.classifiers import ShrinkageLDA
+from shapespace.types import FloatArray
+
+_LEAST_VARIANCE = 1e-3
+_KEPT = 0.995
+
+
+@dataclass(frozen=True, eq=False)
+class FaceTypes:
+    """A mixture of T normal distributions of the leading identity coefficients.
+
+    Args:
+        share: (T,) of the people.
+        mean: (T, D).
+        variance: (T, D).
+        bic: by number of types, from 1; the least is best.
+    """
+
+    share: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    bic: tuple[float, ...]
+
+    @classmethod
+    def fit(
+        cls, a: FloatArray, *, types: int | None = None, most: int = 6, leading: int = 10, seed: int = 0
+    ) -> FaceTypes:
+        """Fit to identity coefficients, one row a person.
+
+        Args:
+            a: (S, Ka) in standard deviations.
+            types: how many; None for the number with the least BIC.
+            most: numbers tried then.
+            leading: coefficients that count.
+            seed: of the mixture's starts.
+
+        Raises:
+            InputError: fewer people than types.
+        """
+        from sklearn.mixture import GaussianMixture
+
+        people = np.asarray(a, dtype=np.float64)[:, :leading]
+        tried = range(1, min(most, len(people) // 4) + 1)
+        if not tried or (types is not None and not 1 <= types <= len(people)):
+            raise InputError(f"{len(people)} people are too few for {types or 'any'} types of face.")
+        found: dict[int, Any] = {}
+        for number in {*tried} if types is None else {*tried, types}:
+            mixture = cast(Any, GaussianMixture)(
+                number, covariance_type="diag", n_init=4, random_state=seed, reg_covar=_LEAST_VARIANCE
+            )
+            found[number] = mixture.fit(people)
+        bic = {number: float(found[number].bic(people)) for number in found}
+        best = found[min(tried, key=lambda number: bic[number]) if types is None else types]
+        return cls(
+            np.asarray(best.weights_), np.asarray(best.means_), np.asarray(best.covariances_),
+            tuple(bic[number] for number in tried),
+        )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """T."""
+        return len(self.share)
+
+    def posterior(self, a: FloatArray) -> FloatArray:
+        """Return (n, T) how likely each type is for identities a (n, Ka)."""
+        leading = np.asarray(a, dtype=np.float64)[:, None, : self.mean.shape[1]]
+        log = np.log(self.share) - 0.5 * (
+            (leading - self.mean) ** 2 / self.variance + np.log(2 * np.pi * self.variance)
+        ).sum(axis=2)
+        return np.exp(log - logsumexp(log, axis=1, keepdims=True))
+
+
+class ExpressionByType:
+    """An expression model and a linear classifier for each type of face.
+
+    Args:
+        types: of face, from identity coefficients.
+        soft: weighs the answers by how likely each type is; else the likeliest type answers alone.
+    """
+
+    def __init__(self, types: FaceTypes, *, soft: bool) -> None:
+        self.types = types
+        self.soft = soft
+        self.classes: tuple[str, ...] = ()
+        self._models: list[tuple[FloatArray, Any]] = []
+
+    def fit(self, a: FloatArray, e: FloatArray, labels: Sequence[str]) -> ExpressionByType:
+        """Fit to identity a (n, Ka), expression e (n, Ke) and classes.
+
+        Every sample trains its likeliest type.
+
+        Raises:
+            InputError: a type that too few samples or classes belong to.
+        """
+        names = np.asarray(labels, dtype=str)
+        self.classes = tuple(np.unique(names).tolist())
+        own = self.types.posterior(a).argmax(axis=1)
+        self._models = []
+        for number in range(self.types.count):
+            mine = own == number
+            if set(names[mine]) != set(self.classes):
+                raise InputError(
+                    f"Type {number + 1} of {self.types.count} has too few faces for a classifier of its own; "
+                    "ask for fewer types."
+                )
+            modes = _modes(e[mine])
+            self._models.append((modes, ShrinkageLDA().fit(e[mine] @ modes, names[mine])))
+        return self
+
+    def predict_proba(self, a: FloatArray, e: FloatArray) -> FloatArray:
+        """Return (n, C) how likely each class is."""
+        weight = self.types.posterior(a)
+        if not self.soft:
+            weight = np.eye(self.types.count)[weight.argmax(axis=1)]
+        answers = [np.asarray(model.predict_proba(e @ modes)) for modes, model in self._models]
+        return np.einsum("nt,tnc->nc", weight, np.stack(answers))
+
+
+def _modes(e: FloatArray) -> FloatArray:
+    """Return (Ke, k) the type's own modes of expression, through neutral."""
+    _, size, rows = np.linalg.svd(e, full_matrices=False)
+    kept = int(np.searchsorted(np.cumsum(size**2) / (size**2).sum(), _KEPT)) + 1
+    return rows[: min(kept, len(rows))].T
