@@ -21,12 +21,12 @@ def sheet(count: int = 900, seed: int = 0) -> Mesh:
 
 
 def pocketed() -> Mesh:
-    """The sheet with a pocket 60 mm deep and 30 mm wide, wider inside than at its mouth, and two holes."""
+    """The sheet with a pocket 200 mm deep and 30 mm wide, wider inside than at its mouth, and two holes."""
     flat = sheet()
     x = np.array(flat.vertices)
     r = np.linalg.norm(x[:, :2] - [50.0, 90.0], axis=1)
     inside = np.clip(1 - r / 25.0, 0, 1)
-    x[:, 2] -= 60.0 * inside
+    x[:, 2] -= 200.0 * inside
     x[:, :2] += (x[:, :2] - [50.0, 90.0]) * np.where(r < 25, 1.5 * inside, 0.0)[:, None]
     return cut(flat.with_vertices(x), [(25.0, 40.0, 10.0), (75.0, 40.0, 10.0)])
 
@@ -73,16 +73,21 @@ def test_the_counter_of_overlaps_sees_the_pocket_from_above() -> None:
     assert covered_twice(from_above, mesh.faces) > folded.sum()
 
 
-def test_equal_areas_get_about_equal_room() -> None:
+def test_a_deep_pocket_gets_room_half_by_its_area_and_half_by_its_triangles() -> None:
     mesh = pocketed()
     uv = disc_map(mesh)
     p, q = (uv[mesh.faces[:, k]] - uv[mesh.faces[:, 0]] for k in (1, 2))
     room = np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
-    area = face_areas(mesh)
-    ratio = (room / room.sum()) / (area / area.sum())
+    wanted = np.sqrt(face_areas(mesh))
     deep = mesh.vertices[mesh.faces].mean(axis=1)[:, 2] < -20
     assert deep.sum() > 30
-    assert area[deep & (ratio > 0.3)].sum() > 0.95 * area[deep].sum()
+    share, wanted_share = room[deep].sum() / room.sum(), wanted[deep].sum() / wanted.sum()
+    assert 0.5 < share / wanted_share < 2.0
+    # Averages of neighbours alone squeeze it.
+    plain = disc_map(mesh, most_rounds=1)
+    p, q = (plain[mesh.faces[:, k]] - plain[mesh.faces[:, 0]] for k in (1, 2))
+    squeezed = np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    assert squeezed[deep].sum() / squeezed.sum() < 0.7 * share
 
 
 def test_the_map_does_not_depend_on_pose_scale_or_unit() -> None:
