@@ -9,9 +9,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import csr_matrix, kron
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
@@ -88,6 +86,9 @@ def _knots(count: int) -> FloatArray:
 
 def _design_matrix(uv: FloatArray, counts: tuple[int, int]) -> Any:
     """Return the sparse (V, mn) values of each control point's weight at each place; rows sum to one."""
+    from scipy.interpolate import BSpline  # takes 0.2 s, which models of vertices need not wait for
+    from scipy.sparse import csr_matrix
+
     along = [BSpline.design_matrix(uv[:, k], _knots(counts[k]), DEGREE).toarray() for k in range(2)]
     first, second = ((side != 0).argmax(axis=1) for side in along)
     # A place at a knot has one weight of zero: the window of four is moved inside the row.
@@ -103,6 +104,8 @@ def _design_matrix(uv: FloatArray, counts: tuple[int, int]) -> Any:
 
 def thin_plate_energy(counts: tuple[int, int]) -> FloatArray:
     """Return E (mn, mn) with c^T E c the integral of f_uu^2 + 2 f_uv^2 + f_vv^2 over the square, exact."""
+    from scipy.sparse import kron
+
     gram = [[_gram(count, order) for order in range(3)] for count in counts]
     u, v = gram
     energy = kron(u[2], v[0]) + 2 * kron(u[1], v[1]) + kron(u[0], v[2])
@@ -111,6 +114,8 @@ def thin_plate_energy(counts: tuple[int, int]) -> FloatArray:
 
 def _gram(count: int, order: int) -> FloatArray:
     """Return (count, count) integrals of products of the derivatives of that order of the basis splines."""
+    from scipy.interpolate import BSpline
+
     knots = _knots(count)
     nodes, weights = np.polynomial.legendre.leggauss(DEGREE + 1)
     edges = np.unique(knots)

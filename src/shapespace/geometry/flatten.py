@@ -12,9 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from shapespace.errors import MeshError
 from shapespace.geometry.surface import faces_of
@@ -125,6 +122,9 @@ def _squared_stretch(vertices: FloatArray, uv: FloatArray, faces: IntArray) -> F
 
 def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
     """Return vertices and triangles with every hole closed by a fan about a vertex of its own, and the rim (R,)."""
+    from scipy.sparse import coo_matrix  # takes a moment, which models of vertices need not wait for
+    from scipy.sparse.csgraph import connected_components
+
     name, count = mesh.name, len(mesh.vertices)
     if not np.isfinite(mesh.vertices).all():
         raise MeshError(f"{name}: vertices that are not finite have no place on a square; fill or remove them.")
@@ -205,6 +205,8 @@ def _rim_curve(angle: FloatArray) -> FloatArray:
 
 def _mean_value_weights(vertices: FloatArray, faces: IntArray) -> Any:
     """Return the sparse (V, V) weights that each row's vertex gives its neighbours, positive everywhere."""
+    from scipy.sparse import coo_matrix
+
     rows: list[IntArray] = []
     columns: list[IntArray] = []
     values: list[FloatArray] = []
@@ -225,6 +227,8 @@ def _mean_value_weights(vertices: FloatArray, faces: IntArray) -> Any:
 
 def _averaged(weights: Any, rim: IntArray, pinned: FloatArray) -> FloatArray:
     """Return (V, 2): the rim at `pinned`, every other vertex the weighted average of its neighbours."""
+    from scipy.sparse.linalg import splu
+
     count = weights.shape[0]
     free = np.ones(count, dtype=np.bool_)
     free[rim] = False
