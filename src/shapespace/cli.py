@@ -74,6 +74,7 @@ def parser() -> argparse.ArgumentParser:
     _add_fit(commands)
     _add_report(commands)
     _add_view(commands)
+    _add_recognise(commands)
     return top
 
 
@@ -216,6 +217,45 @@ def _add_report(commands: Any) -> None:
                      help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=_report)
+
+
+def _add_recognise(commands: Any) -> None:
+    sub = commands.add_parser("recognise", help="tell expressions or other classes apart by fitted coefficients")
+    sub = sub.add_subparsers(required=True, metavar="train|predict")
+    _add_recognise_train(sub)
+    _add_recognise_predict(sub)
+
+
+def _add_recognise_train(commands: Any) -> None:
+    sub = _add(commands, "train", "train a classifier on fitted scans with labels",
+               "shapespace recognise train out --labels labels.csv -o expressions.skops\n"
+               "         shapespace recognise train out --labels labels.csv -o expressions.skops --relative "
+               "--classifier mean-direction")  # fmt: skip
+    sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
+    sub.add_argument("--labels", type=Path, required=True, metavar="FILE",
+                     help="CSV of file and label, and of subject if known")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.skops")
+    sub.add_argument("--classifier", default="lda", metavar="NAME",
+                     help="mean-direction, knn, lda (default), qda, logistic or svm")  # fmt: skip
+    sub.add_argument("--relative", action="store_true", help="compare each scan with its subject's neutral face")
+    sub.add_argument("--neutral", default="neutral", metavar="LABEL", help="label of neutral faces (default neutral)")
+    sub.add_argument("--confidence", type=_probability, default=0.5, metavar="P",
+                     help="answer unsure below this probability (default 0.5)")  # fmt: skip
+    sub.add_argument("--modes", type=_positive, metavar="K", help="leading modes to see (default: all)")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=_recognise_train)
+
+
+def _add_recognise_predict(commands: Any) -> None:
+    sub = _add(commands, "predict", "answer for fitted scans by a trained classifier, as a CSV table",
+               "shapespace recognise predict expressions.skops out -o predictions.csv")  # fmt: skip
+    sub.add_argument("classifier", type=Path, metavar="FILE.skops")
+    sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
+    sub.add_argument("--labels", type=Path, metavar="FILE",
+                     help="CSV of file, label and subject: says which scans are neutral faces, and whose")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.csv")
+    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful or an answer unsure")
+    sub.set_defaults(run=_recognise_predict)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -422,6 +462,63 @@ def _fit(arguments: argparse.Namespace) -> int:
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
 
 
+def _recognise_train(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    facts, notes = commands.recognise_train(
+        arguments.results,
+        arguments.labels,
+        arguments.output,
+        classifier=arguments.classifier,
+        relative=arguments.relative,
+        neutral=arguments.neutral,
+        confidence=arguments.confidence,
+        modes=arguments.modes,
+        seed=arguments.seed,
+    )
+    for note in notes:
+        _say(note)
+    if arguments.json:
+        _print_json({"file": str(arguments.output), **facts})
+        return 0
+    training, checked = facts["training"], facts["cross_validation"]
+    _print(
+        f"{arguments.output}: {facts['classifier']} of {len(facts['classes'])} classes from {training['scans']} scans"
+        + (f" of {training['subjects']} people" if training["subjects"] else "")
+        + f", {facts['modes']} modes"
+        + (", relative to neutral" if facts["relative_to_neutral"] else "")
+    )
+    if checked["macro_accuracy"] is not None:
+        left_out = "people" if checked["by"] == "subject" else "scans"
+        _print(f"macro accuracy on {left_out} left out: {100 * checked['macro_accuracy']:.1f} %")
+    return 0
+
+
+def _recognise_predict(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    rows, counts = commands.recognise_predict(
+        arguments.classifier, arguments.results, arguments.output, labels=arguments.labels
+    )
+    if arguments.json:
+        _print_json({"file": str(arguments.output), **counts, "answers": rows})
+    else:
+        for row in rows[:10]:
+            p = max(row["probabilities"].values(), default=None)
+            _print(
+                f"{row['scan']}: {row['prediction'] or 'no answer'}"
+                + (f" ({p:.2f})" if p is not None and not row["reason"] else "")
+                + (f"; {row['reason']}" if row["reason"] else "")
+            )
+        told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        _print(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {told}; answers in {arguments.output}")
+    asked = len(rows) - counts["neutral"]
+    if counts["failed"] == asked:
+        _say("shapespace: no scan could be answered for; the reasons stand in the table.")
+        return 2
+    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"] + counts["unsure"]) else 0
+
+
 def _view(arguments: argparse.Namespace) -> int:
     from shapespace.viewer.serve import serve
 
@@ -517,12 +614,19 @@ def _natural(text: str) -> int:
 
 
 def _share(text: str) -> float:
+    value = _probability(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
+    return value
+
+
+def _probability(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError("must lie from 0 to 1")
     return value
 
 

@@ -23,14 +23,18 @@ from shapespace.fit.state import IcpState
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_bytes, read_error, remove_file, write_bytes, write_text
+from shapespace.io.labels import read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_ENDINGS, read_mesh
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
+from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, read_coefficients
 from shapespace.types import MM_PER_UNIT, Mesh
 
 ABOUT = "about.json"
 """Beside simulated faces: their provenance and licence, for the models made of them."""
+
+_RECORD = ".fit.json"
 
 
 def progress_bar(total: int | None, what: str, unit: str, *, quiet: bool) -> tqdm[Any]:
@@ -355,6 +359,104 @@ def report(folder: Path, output: Path | None, *, model: Path | None, labels: Pat
             bar.update()
 
         return write_report(folder, output, model=model, labels=labels, on_step=step)
+
+
+def read_scans(path: Path) -> list[ScanCoefficients]:
+    """Return the fits in a folder that `fit` wrote, or in a coefficients.csv, in the order of their names or rows.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: a record or the table is damaged.
+        InputError: the folder holds no records of fits.
+    """
+    if not path.is_dir():
+        return read_coefficients(path)
+    try:
+        files = sorted(p for p in path.iterdir() if p.name.endswith(_RECORD) and p.is_file())
+    except OSError as error:
+        raise read_error(path, error) from error
+    if not files:
+        raise InputError(f"{path} holds no results of fits; give a folder that shapespace fit wrote.")
+    return [from_record(file.name.removesuffix(_RECORD), read_record(file)) for file in files]
+
+
+def recognise_train(
+    results: Path,
+    labels: Path,
+    output: Path,
+    *,
+    classifier: str,
+    relative: bool,
+    neutral: str,
+    confidence: float,
+    modes: int | None,
+    seed: int,
+) -> tuple[dict[str, Any], list[str]]:
+    """Train a classifier on the fits in `results` and save it; return its facts and what the user should know.
+
+    Raises:
+        FileError: something cannot be read, or the classifier not written.
+        FileFormatError: results or labels are damaged.
+        InputError: what `train_classifier` refuses, or a name that does not end in .skops.
+        ShapespaceError: the extra `recognise` is not installed.
+    """
+    from shapespace.recognise.predict import train_classifier
+
+    scans = labelled(read_scans(results), read_labels(labels))
+    saved, notes = train_classifier(
+        scans, classifier=classifier, relative=relative, neutral=neutral, confidence=confidence, modes=modes, seed=seed
+    )
+    make_folder(output.absolute().parent)
+    saved.save(output)
+    return saved.facts(), notes
+
+
+def recognise_predict(
+    classifier: Path, results: Path, output: Path, *, labels: Path | None
+) -> tuple[list[dict[str, Any]], dict[str, int]]:
+    """Write the classifier's answer for each fit in `results`; return the rows, and counts of what came out.
+
+    The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
+    neutral face is missing) and `neutral` (faces that others are compared with).
+
+    Raises:
+        FileError: something cannot be read, or the answers not written.
+        FileFormatError: the classifier, results or labels are damaged.
+        InputError: the fits are of another model than the classifier, or labels are needed.
+        ShapespaceError: the extra `recognise` is not installed.
+    """
+    from shapespace.recognise.predict import UNSURE, predict_scans, write_answers
+    from shapespace.recognise.saved import load_classifier
+
+    saved = load_classifier(classifier)
+    if saved.relative_to_neutral and labels is None:
+        raise InputError(
+            f"{classifier} compares with each subject's neutral face; give --labels with the columns file, label and "
+            "subject."
+        )
+    scans = read_scans(results)
+    answers = predict_scans(saved, labelled(scans, read_labels(labels)) if labels is not None else scans)
+    make_folder(output.absolute().parent)
+    write_answers(output, answers, saved.classes)
+    counts: dict[str, int] = dict.fromkeys(("answered", "unsure", "doubtful", "failed", "neutral"), 0)
+    rows: list[dict[str, Any]] = []
+    for answer in answers:
+        if answer.neutral:
+            kind = "neutral"
+        elif answer.probabilities is None:
+            kind = "doubtful" if answer.status == "doubtful" else "failed"
+        else:
+            kind = "unsure" if answer.prediction == UNSURE else "answered"
+        counts[kind] += 1
+        p = answer.probabilities
+        rows.append({
+            "scan": answer.scan,
+            "status": answer.status,
+            "prediction": answer.prediction,
+            "probabilities": {} if p is None else dict(zip(saved.classes, p.tolist(), strict=True)),
+            "reason": answer.reason,
+        })  # fmt: skip
+    return rows, counts
 
 
 def data_list() -> list[dict[str, object]]:

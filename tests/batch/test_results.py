@@ -98,7 +98,9 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
     assert float(rows[0]["z3"]) == result.z[2]
     assert float(rows[0]["model_to_scan_mean_mm"]) == result.distances.model_to_scan.mean
     assert (rows[1]["status"], rows[1]["reason"]) == ("failed", "two.ply is empty, so re-export it.")
-    assert all(not rows[1][name] for name in header[3:])
+    assert header[-1] == "model_hash"
+    assert {row["model_hash"] for row in rows} == {MODEL.content_hash}
+    assert all(not rows[1][name] for name in header[3:-1])
 
 
 def test_names_that_look_like_formulas_are_made_harmless(tmp_path: Path) -> None:

@@ -155,6 +155,7 @@ def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
 def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the row of coefficients.csv for `record`; a failed scan has its reason and no numbers."""
     row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
+    row["model_hash"] = record["model"]["hash"]
     if "b" not in record:
         return row
     for letter in ("b", "z"):
@@ -184,7 +185,7 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
     lead = ["model_to_scan_mean_mm", "scan_to_model_mean_mm"]
     start = 3 + 2 * n_modes
     columns = columns[:start] + lead + [c for c in columns[start:] if c not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes)]
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), "model_hash"]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
     writer.writeheader()

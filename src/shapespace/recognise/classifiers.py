@@ -246,7 +246,8 @@ def _mean_direction(seed: int) -> Pipeline:
 
 
 def _knn(seed: int) -> Pipeline:
-    return _pipeline(StandardScaler(), KNeighborsClassifier(n_neighbors=5, weights="distance"))
+    # By brute force, since a search tree's saved state could not be checked when it is read.
+    return _pipeline(StandardScaler(), KNeighborsClassifier(n_neighbors=5, weights="distance", algorithm="brute"))
 
 
 def _lda(seed: int) -> Pipeline:

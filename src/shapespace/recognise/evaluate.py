@@ -669,17 +669,21 @@ def calibration(
 def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> float:
     """Return the temperature at which probabilities (n, C) of samples left out are most likely (Guo et al., ICML 2017).
 
+    The true class counts for 1 - 1 / (n + 2), as in Platt's calibration (1999): few samples that all are right do not
+    show that the next is.
+
     Raises:
         InputError: arrays that do not belong together, or no row with probabilities.
     """
     truth, p = _with_probabilities(labels, probabilities, classes)
     logits = np.log(np.maximum(p, _LEAST_PROBABILITY))
-    rows = np.arange(len(p))
+    doubt = 1 / (len(p) + 2)
+    target = (1 - doubt) * np.eye(len(classes))[truth] + doubt / len(classes)
 
     def surprise(log_temperature: float) -> float:
-        return -float(log_softmax(logits / np.exp(log_temperature), axis=1)[rows, truth].mean())
+        return -float((target * log_softmax(logits / np.exp(log_temperature), axis=1)).sum(axis=1).mean())
 
-    found: Any = minimize_scalar(surprise, bounds=(np.log(0.1), np.log(10.0)), method="bounded")
+    found: Any = minimize_scalar(surprise, bounds=(np.log(0.1), np.log(100.0)), method="bounded")
     return float(np.exp(found.x))
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from shapespace import __version__
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import sha256_of_file
+from shapespace.io.labels import Label
 from shapespace.io.meshes import read_mesh
 from shapespace.report import sections
-from shapespace.report.labels import Label, find_labels, labelled
+from shapespace.report.labels import find_labels, labelled
 from shapespace.report.markup import (
     Cell,
     Column,

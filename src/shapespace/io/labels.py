@@ -1,0 +1,78 @@
+"""Labels of scans from a table such as `shapespace data faces` writes, matched by the names of the scans."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+from shapespace.errors import FileFormatError
+from shapespace.io.files import read_bytes
+
+LABELS_FILE = "labels.csv"
+_NAMES = ("file", "scan", "name")
+_LABELS = ("label", "expression", "class", "group", "subject")
+_LARGEST_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is known of one scan.
+
+    Args:
+        text: its class, such as an expression; empty where the table has only its subject.
+        intensity: from 0 to 1, or None where the table does not say.
+        subject: whom it shows, or empty.
+    """
+
+    text: str
+    intensity: float | None = None
+    subject: str = ""
+
+
+def read_labels(path: Path) -> dict[str, Label]:
+    """Return the labels in a CSV table by the name of the scan, without folder and ending.
+
+    The scan stands in the column `file`, `scan` or `name`; its class in `label`, `expression`, `class`, `group` or
+    `subject`, the first that is there; `intensity` and `subject` may stand beside it.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is not such a table.
+    """
+    content = read_bytes(path)
+    if len(content) > _LARGEST_BYTES:
+        raise FileFormatError(f"{path} is too large for a table of labels ({len(content) / 2**20:.0f} MiB).")
+    try:
+        rows = list(csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FileFormatError(f"{path} is not a CSV table in UTF-8 ({error}).") from error
+    heads = list(rows[0]) if rows else []
+    name = next((head for head in _NAMES if head in heads), None)
+    label = next((head for head in _LABELS if head in heads), None)
+    if name is None or label is None:
+        raise FileFormatError(
+            f"{path} is no table of labels; it needs rows, a column {_NAMES[0]} and a column {_LABELS[0]} or "
+            f"{_LABELS[1]}."
+        )
+    found: dict[str, Label] = {}
+    for row in rows:
+        text = _printable(row[label] or "")
+        subject = _printable(row.get("subject") or "")
+        if row[name] and (text or subject):
+            found[PurePath(row[name]).stem] = Label(text, _intensity(row.get("intensity")), subject)
+    return found
+
+
+def _intensity(text: str | None) -> float | None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text).strip()

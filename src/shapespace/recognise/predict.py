@@ -1,0 +1,254 @@
+"""Train a classifier on fitted scans with labels, and answer for others: each scan gets a row, none is guessed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from shapespace.errors import InputError
+from shapespace.io.tables import write_rows
+from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.recognise.evaluate import fit_temperature, left_out, macro_accuracy, subject_folds
+from shapespace.recognise.saved import SavedClassifier, software_versions
+from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
+from shapespace.types import FloatArray
+
+UNSURE = "unsure"
+"""The answer where the likeliest class is less likely than the stated confidence, or the fit is doubtful."""
+
+CONFIDENCE = 0.5
+"""The confidence unless another is given: below it the likeliest class is more likely wrong than right."""
+
+_FOLDS = 5
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What recognition says of one scan.
+
+    Args:
+        scan: name of the fit.
+        status: of the fit.
+        prediction: a class, `UNSURE`, or empty where the fit failed or there is nothing to compare it with.
+        probabilities: (C,), or None where no probabilities can be given.
+        reason: why there is no class; empty where there is one.
+        neutral: whether it is a neutral face that others are compared with, which needs no answer.
+    """
+
+    scan: str
+    status: str
+    prediction: str
+    probabilities: FloatArray | None
+    reason: str
+    neutral: bool = False
+
+
+def train_classifier(
+    scans: Sequence[ScanCoefficients],
+    *,
+    classifier: str = "lda",
+    relative: bool = False,
+    neutral: str = NEUTRAL,
+    confidence: float = CONFIDENCE,
+    modes: int | None = None,
+    seed: int = 0,
+) -> tuple[SavedClassifier, list[str]]:
+    """Train a classifier on fitted scans with labels; return it and what the user should know.
+
+    Failed and doubtful fits and scans without a label are left out and counted. Probabilities are calibrated on people
+    left out in turn (on scans left out where no people are named), which also gives the accuracy that is told.
+
+    Args:
+        scans: with labels, and for `relative` with subjects.
+        classifier: a name of `CLASSIFIERS`.
+        relative: take coefficients relative to the subject's neutral face; neutral faces are then no class.
+        neutral: the label of neutral faces.
+        confidence: probability, 0 to 1, below which the answer will be `UNSURE`.
+        modes: number of leading modes to see; None is all.
+        seed: of folds and classifier.
+
+    Raises:
+        InputError: an unknown classifier, fits of different models, too few labels, people without a neutral face,
+            or more modes than there are.
+    """
+    if classifier not in CLASSIFIERS:
+        raise InputError(f"There is no classifier {classifier!r}; choose among {', '.join(CLASSIFIERS)}.")
+    if not 0 <= confidence <= 1:
+        raise InputError(f"The confidence must lie from 0 to 1, not {confidence!r}.")
+    model_hash = one_model(scans)
+    labelled = [scan for scan in scans if scan.label]
+    used = [scan for scan in labelled if scan.trusted]
+    lost = Counter(scan.status for scan in labelled if not scan.trusted)
+    without_label = len(scans) - len(labelled)
+    if not used:
+        raise InputError(
+            f"None of the {len(scans)} scans has both a label and a fit to be trusted; check that the table of labels "
+            "names the scans."
+        )
+    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(lost.items())]
+    if without_label:
+        notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
+    z, K = _stacked(used), _modes(used, modes)
+    labels = np.asarray([scan.label for scan in used])
+    subjects = [scan.subject for scan in used]
+    if relative:
+        is_neutral = labels == neutral
+        if not all(subjects):
+            raise InputError(
+                "Coefficients relative to neutral need to know whom each scan shows; add a column subject to the "
+                "labels."
+            )
+        z = relative_to_neutral(z, subjects, is_neutral)[~is_neutral]
+        subjects = [name for name, mine in zip(subjects, is_neutral, strict=True) if not mine]
+        labels = labels[~is_neutral]
+    z = z[:, :K]
+    classes, counts = np.unique(labels, return_counts=True)
+    if len(classes) < 2 or counts.min() < 2:
+        few = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
+        raise InputError(f"Training needs at least two classes with at least two scans each; these were found: {few}.")
+    if UNSURE in classes:
+        raise InputError(f"The label {UNSURE!r} is what shapespace answers below the confidence; give it another name.")
+    pipeline: Any = CLASSIFIERS[classifier](seed)
+    with threadpool_limits(1):
+        pipeline.fit(z, labels)
+        temperature, checked, note = _calibrate(z, labels, subjects, classes.tolist(), classifier, seed)
+    if note:
+        notes.append(note)
+    training: dict[str, Any] = {
+        "scans": len(labels),
+        "subjects": len(set(subjects)) if all(subjects) else None,
+        "per_class": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
+        "left_out": {**dict(lost), "without_label": without_label},
+    }
+    saved = SavedClassifier(
+        pipeline, classifier, model_hash, K, relative, neutral, tuple(classes.tolist()), float(confidence), temperature,
+        training, checked, software_versions(),
+    )  # fmt: skip
+    return saved, notes
+
+
+def _calibrate(
+    z: FloatArray, labels: Any, subjects: Sequence[str], classes: Sequence[str], classifier: str, seed: int
+) -> tuple[float, dict[str, Any], str]:
+    """Return the temperature, what cross-validation found, and what the user should know about it."""
+    by_subject = all(subjects)
+    groups = list(subjects) if by_subject else [str(i) for i in range(len(z))]
+    folds = min(_FOLDS, len(set(groups)))
+    splits = subject_folds(groups, folds, seed) if folds >= 2 else []
+    # A fold that would leave one class alone to train on teaches nothing.
+    if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
+        note = "There are too few people to leave some out, so accuracy is not known and probabilities not calibrated."
+        return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
+    probabilities = left_out(z, labels, splits, classes, classifier, {}, seed)
+    temperature = fit_temperature(labels.tolist(), probabilities, classes)
+    answers = np.asarray(classes)[probabilities.argmax(axis=1)]
+    accuracy = macro_accuracy(labels, answers, classes)
+    note = (
+        "" if by_subject else "The labels name no subjects, so a person may be on both sides of the cross-validation."
+    )
+    return temperature, {"macro_accuracy": accuracy, "by": "subject" if by_subject else "scan", "folds": folds}, note
+
+
+def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[Answer]:
+    """Return one answer for each of `scans`, in their order.
+
+    A failed fit gets no answer; a doubtful one, or one below the confidence, gets `UNSURE`; each with its reason.
+
+    Raises:
+        InputError: the fits are not of the classifier's model, or have fewer modes than it sees.
+    """
+    saved.refuse_other_model(one_model(scans))
+    zero = _neutral_of(saved, scans) if saved.relative_to_neutral else {}
+    answers: list[Answer] = []
+    for scan in scans:
+        is_reference = saved.relative_to_neutral and scan.label == saved.neutral
+        refusal = _refusal(saved, scan, zero, is_reference)
+        if refusal is not None or scan.z is None:
+            doubtful = scan.status == "doubtful" and not is_reference
+            answers.append(
+                Answer(scan.name, scan.status, UNSURE if doubtful else "", None, refusal or scan.reason, is_reference)
+            )
+            continue
+        z = scan.z - zero[scan.subject] if saved.relative_to_neutral else scan.z
+        p = saved.probabilities(z[None])[0]
+        best = int(p.argmax())
+        sure = bool(p[best] >= saved.confidence)
+        name = saved.classes[best]
+        why = f"The likeliest class, {name}, has the probability {p[best]:.2f}, below {saved.confidence:g}."
+        answers.append(Answer(scan.name, scan.status, name if sure else UNSURE, p, "" if sure else why))
+    return answers
+
+
+def _neutral_of(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> dict[str, FloatArray]:
+    found: dict[str, list[FloatArray]] = {}
+    for scan in scans:
+        if scan.label == saved.neutral and scan.subject and scan.trusted and scan.z is not None:
+            found.setdefault(scan.subject, []).append(scan.z)
+    return {name: np.mean(z, axis=0) for name, z in found.items()}
+
+
+def _refusal(
+    saved: SavedClassifier, scan: ScanCoefficients, zero: dict[str, FloatArray], is_reference: bool
+) -> str | None:
+    """Return why there can be no probabilities for `scan`, or None."""
+    if scan.z is None:
+        return scan.reason
+    if not scan.trusted:
+        return f"The fit is doubtful: {scan.reason}"
+    if is_reference:
+        return "The neutral face that its subject's other scans are compared with."
+    if saved.relative_to_neutral and not scan.subject:
+        return (
+            "The classifier compares with the subject's neutral face, and the labels do not say whom this scan shows."
+        )
+    if saved.relative_to_neutral and scan.subject not in zero:
+        return f"There is no usable neutral face of {scan.subject} to compare this scan with."
+    return None
+
+
+def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str]) -> None:
+    """Write a CSV table: scan, status, prediction, p_CLASS for each class, reason.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    header = [_safe(cell) for cell in ("scan", "status", "prediction", *(f"p_{name}" for name in classes), "reason")]
+    rows = [
+        (
+            _safe(answer.scan),
+            answer.status,
+            _safe(answer.prediction),
+            *(["" for _ in classes] if answer.probabilities is None else [f"{p:.6f}" for p in answer.probabilities]),
+            _safe(answer.reason),
+        )
+        for answer in answers
+    ]
+    write_rows(path, header, rows)
+
+
+def _safe(text: str) -> str:
+    # A spreadsheet would run a cell that starts like a formula.
+    return ("'" if text.startswith(_FORMULA) else "") + text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:
+    rows = [scan.z for scan in scans if scan.z is not None]
+    if len({len(z) for z in rows}) != 1:
+        raise InputError("The fits have different numbers of coefficients; fit all scans with one model.")
+    return np.stack(rows)
+
+
+def _modes(scans: Sequence[ScanCoefficients], modes: int | None) -> int:
+    known = next(len(scan.z) for scan in scans if scan.z is not None)
+    if modes is None:
+        return known
+    if not 1 <= modes <= known:
+        raise InputError(f"The fits have {known} coefficients, so a classifier cannot see {modes} of them.")
+    return modes
