@@ -151,6 +151,8 @@ def test_the_file_holds_control_points_that_scipy_can_evaluate(tmp_path: Path) -
     model.save(tmp_path / "model.h5")
     arrays, attributes = read_hdf5(tmp_path / "model.h5")
     assert attributes["representation"] == "bspline"
+    told = (Path(__file__).resolve().parents[2] / "docs" / "model-file.md").read_text("utf-8")
+    assert all(f"| `{name}` |" in told for name in arrays)
     m, n = arrays["control_counts"]
     assert (m, n, arrays["degree"]) == (8, 8, 3)
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, 8 - 2), np.ones(3)])
