@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
     from shapespace.model.shape_model import ShapeModel
+    from shapespace.recognise.shape_space import ShapeSpace
     from shapespace.types import Mesh, Similarity
 
 __version__ = "0.1.0"
@@ -22,6 +23,7 @@ __all__ = [
     "FitResult",
     "Mesh",
     "ShapeModel",
+    "ShapeSpace",
     "ShapespaceError",
     "Similarity",
     "__version__",
@@ -39,6 +41,7 @@ _HOMES = {
     "FitResult": "fit.result",
     "Mesh": "types",
     "ShapeModel": "model.shape_model",
+    "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
     "Similarity": "types",
     "fit_scan": "fit.fit",

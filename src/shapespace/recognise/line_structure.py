@@ -6,7 +6,8 @@ intensity are expected on a line through neutral, and different expressions on d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from scipy.stats import rankdata
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
+
+_SHRINKAGE = 0.1
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,27 @@ class LineScores:
 
 
 @dataclass(frozen=True)
+class PooledLineScores:
+    """All expressions together.
+
+    Args:
+        r2_through_neutral: by expression, as in `LineScores`.
+        r2_p: by expression, how often as many samples with shuffled labels lie on a line at least as well.
+        mean_r2_p: the same of the mean over the expressions.
+        spearman: mean over the expressions of the rank correlation with intensity; None without intensities.
+        monotonicity_p: how often intensities shuffled within each expression correlate at least as well on average.
+            Four levels of one expression alone cannot go below 1/24; those of several together can. None without
+            intensities.
+    """
+
+    r2_through_neutral: Mapping[str, float]
+    r2_p: Mapping[str, float]
+    mean_r2_p: float
+    spearman: float | None
+    monotonicity_p: float | None
+
+
+@dataclass(frozen=True)
 class DisjointnessScores:
     """How far apart the expressions lie.
 
@@ -46,7 +70,12 @@ class DisjointnessScores:
         cosine_silhouette: mean silhouette by cosine distance, -1 to 1.
         separability: trace of the pooled within-class scatter's pseudo-inverse times the between-class scatter.
         accuracy_p: permutation p of the accuracy,
-        silhouette_p: and of the silhouette, over shuffled labels.
+        silhouette_p: of the silhouette,
+        separability_p: of the separability,
+        margin_p: and of the smallest margin, over shuffled labels.
+        smallest_margin: over all pairs of expressions, the gap between their nearest samples along the pair's linear
+            discriminant, in pooled within-class standard deviations there; negative where the samples overlap.
+        smallest_margin_pair: the two expressions with that margin.
     """
 
     leave_one_out_accuracy: float
@@ -55,6 +84,10 @@ class DisjointnessScores:
     separability: float
     accuracy_p: float
     silhouette_p: float
+    separability_p: float
+    margin_p: float
+    smallest_margin: float
+    smallest_margin_pair: tuple[str, str]
 
 
 def line_scores(v: FloatArray, intensity: FloatArray, *, permutations: int = 999, seed: int = 0) -> LineScores:
@@ -89,6 +122,68 @@ def line_scores(v: FloatArray, intensity: FloatArray, *, permutations: int = 999
     )
 
 
+def pooled_line_scores(
+    v: FloatArray,
+    labels: Sequence[str],
+    intensity: FloatArray | None = None,
+    *,
+    permutations: int = 999,
+    seed: int = 0,
+) -> PooledLineScores:
+    """Test the lines of all expressions against shuffled labels, and their order against shuffled intensities.
+
+    Args:
+        v: (n, K) coefficients relative to neutral in standard deviations.
+        labels: n expression names, at least two of them with at least two samples each.
+        intensity: (n,), or None where it is not known.
+        permutations: of the labels, and of the intensities.
+        seed: of the permutations.
+
+    Raises:
+        InputError: one expression only, one with a single sample, or an expression of neutral samples alone.
+    """
+    names, classes = np.unique(np.asarray(labels), return_inverse=True)
+    _check(v, classes.astype(np.float64) if intensity is None else intensity)
+    if len(names) < 2 or len(classes) != len(v) or np.bincount(classes).min() < 2:
+        raise InputError("The lines of expressions need at least two expressions with at least two samples each.")
+    if not all((v[classes == c] ** 2).sum() > 0 for c in range(len(names))):
+        raise InputError("All samples of one expression are neutral, so they have no line.")
+    gram = v @ v.T
+    observed = _line_r2(gram, classes)
+    rng = np.random.default_rng(seed)
+    shuffled = np.stack([_line_r2(gram, rng.permutation(classes)) for _ in range(permutations)])
+    rho = monotonicity_p = None
+    if intensity is not None:
+        groups = [np.flatnonzero(classes == c) for c in range(len(names))]
+        along = [_position(v[mine]) for mine in groups]
+        rho = float(np.mean([_spearman(a, intensity[mine]) for a, mine in zip(along, groups, strict=True)]))
+        drawn = [
+            float(np.mean([_spearman(a, rng.permutation(intensity[m])) for a, m in zip(along, groups, strict=True)]))
+            for _ in range(permutations)
+        ]
+        monotonicity_p = _permutation_p(rho, drawn)
+    told = [str(name) for name in names]
+    return PooledLineScores(
+        r2_through_neutral=dict(zip(told, observed.tolist(), strict=True)),
+        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(told)},
+        mean_r2_p=_permutation_p(float(observed.mean()), shuffled.mean(axis=1).tolist()),
+        spearman=rho,
+        monotonicity_p=monotonicity_p,
+    )
+
+
+def _line_r2(gram: FloatArray, classes: np.ndarray) -> FloatArray:
+    """Return R2 of the line through neutral of each class, from the products (n, n) of the samples."""
+    scores: list[float] = []
+    for c in range(int(classes.max()) + 1):
+        mine = np.flatnonzero(classes == c)
+        part = gram[np.ix_(mine, mine)]
+        energy = float(np.trace(part))
+        # The squared singular values of the samples are the eigenvalues of their products.
+        scores.append(float(np.linalg.eigvalsh(part)[-1]) / energy if energy > 0 else 0.0)
+    return np.asarray(scores)
+
+
 def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 999, seed: int = 0) -> DisjointnessScores:
     """Score how disjoint the expressions are.
 
@@ -108,16 +203,23 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
         raise InputError("Disjointness needs at least two expressions with at least two samples each.")
     length = np.linalg.norm(v, axis=1, keepdims=True)
     unit = np.divide(v, length, out=np.zeros_like(v), where=length > 0)
+    # All samples lie in the span of their n rows, where these two scores are the same and cheaper.
+    inside = v @ np.linalg.svd(v, full_matrices=False)[2].T
     accuracy, silhouette = _accuracy(unit, classes), _silhouette(unit, classes)
+    separability, (margin, pair) = _separability(inside, classes), _smallest_margin(inside, classes)
     rng = np.random.default_rng(seed)
     shuffles = [rng.permutation(classes) for _ in range(permutations)]
     return DisjointnessScores(
         leave_one_out_accuracy=accuracy,
         chance=float(counts.max() / counts.sum()),
         cosine_silhouette=silhouette,
-        separability=_separability(v, classes),
+        separability=separability,
         accuracy_p=_permutation_p(accuracy, _each(_accuracy, unit, shuffles)),
         silhouette_p=_permutation_p(silhouette, _each(_silhouette, unit, shuffles)),
+        separability_p=_permutation_p(separability, _each(_separability, inside, shuffles)),
+        margin_p=_permutation_p(margin, _each(lambda x, c: _smallest_margin(x, c)[0], inside, shuffles)),
+        smallest_margin=margin,
+        smallest_margin_pair=(str(names[pair[0]]), str(names[pair[1]])),
     )
 
 
@@ -172,6 +274,27 @@ def _separability(v: FloatArray, classes: np.ndarray) -> float:
         offset = group.mean(axis=0) - mean
         between += len(group) * np.outer(offset, offset)
     return float(np.trace(np.linalg.pinv(within / len(v), hermitian=True) @ (between / len(v))))
+
+
+def _smallest_margin(v: FloatArray, classes: np.ndarray) -> tuple[float, tuple[int, int]]:
+    """Return the smallest gap over all pairs of classes, in pooled standard deviations, and the pair."""
+    n_classes = int(classes.max()) + 1
+    means = np.stack([v[classes == c].mean(axis=0) for c in range(n_classes)])
+    deviation = v - means[classes]
+    within = deviation.T @ deviation / max(len(v) - n_classes, 1)
+    # A floor for samples without scatter, and a little of a round one, since there may be fewer samples than modes.
+    within += (1e-12 * float((v**2).mean()) + 1e-300) * np.eye(len(within))
+    shrunk = (1 - _SHRINKAGE) * within + _SHRINKAGE * np.trace(within) / len(within) * np.eye(len(within))
+    best = (np.inf, (0, 1))
+    for a, b in itertools.combinations(range(n_classes), 2):
+        w = np.asarray(np.linalg.solve(shrunk, means[b] - means[a]), dtype=np.float64)
+        along = v @ w
+        gap = float(along[classes == b].min() - along[classes == a].max())
+        spread = float(np.sqrt(w @ within @ w))
+        scaled = gap / spread if spread > 0 else 0.0
+        if scaled < best[0]:
+            best = (scaled, (a, b))
+    return best
 
 
 def _each(

@@ -1,0 +1,160 @@
+"""The shape space as a scikit-learn transformer: surfaces or their fits become whitened coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.result import FitResult
+from shapespace.geometry.procrustes import Gauge
+from shapespace.model.shape_model import ShapeModel
+from shapespace.recognise.learn import BaseEstimator, TransformerMixin, check_is_fitted
+from shapespace.recognise.scans import from_record
+from shapespace.types import FloatArray, IntArray, Mesh
+
+Surface: TypeAlias = Mesh | FitResult | Mapping[str, Any]
+"""A mesh, the outcome of a fit, or the record of one as NAME.fit.json holds it."""
+
+
+class ShapeSpace(TransformerMixin, BaseEstimator):
+    """Meshes or fits to coefficients in standard deviations, z, as the first step of a scikit-learn pipeline.
+
+    `fit` builds a `ShapeModel` from meshes in correspondence, or takes `model` as it is. `transform` takes a mix of:
+
+    - meshes in the model's vertex order, which are projected (`meshes="corresponding"`), or raw scans, which are fitted
+      by `fit_scan` (`meshes="scans"`); a mesh alone does not say which it is;
+    - `FitResult`s and records of fits (as read from NAME.fit.json), of the same model, whose z is taken.
+
+    A record of a failed fit, or a scan that ends as failed, becomes a row of NaN; it is not dropped. A doubtful fit
+    keeps its coefficients here: see `status` of the fit.
+
+    Args:
+        modes: as in `ShapeModel.fit`: a number, a share of the variance, "auto", or None for all.
+        gauge: `form` or `shape`.
+        align: False takes meshes as they stand, also in `transform`.
+        alignment_vertices: indices that carry the alignment of the training meshes.
+        model: a model to use instead of building one; the settings above, but `align`, then mean nothing.
+        meshes: what meshes given to `transform` are: "corresponding" or "scans".
+        config: settings of the fits of scans; None for the usual ones.
+        seed: of the choice of modes.
+
+    Attributes:
+        model_: the `ShapeModel`.
+        model_hash_: its content hash.
+        n_features_out_: K, the number of modes.
+    """
+
+    def __init__(
+        self,
+        modes: int | float | Literal["auto"] | None = None,
+        *,
+        gauge: Gauge = "shape",
+        align: bool = True,
+        alignment_vertices: IntArray | None = None,
+        model: ShapeModel | None = None,
+        meshes: Literal["corresponding", "scans"] = "corresponding",
+        config: FitConfig | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.modes: int | float | Literal["auto"] | None = modes
+        self.gauge: Gauge = gauge
+        self.align = align
+        self.alignment_vertices = alignment_vertices
+        self.model = model
+        self.meshes = meshes
+        self.config = config
+        self.seed = seed
+
+    def __sklearn_clone__(self) -> ShapeSpace:
+        # A model is never changed, and its read-only parts cannot be copied deeply.
+        return ShapeSpace(**cast(dict[str, Any], self.get_params(deep=False)))
+
+    def fit(self, X: Sequence[Surface], y: Any = None) -> ShapeSpace:
+        """Build the shape space of meshes in correspondence, mm, or take the ready `model`, whatever `X` is.
+
+        Raises:
+            CorrespondenceError: the meshes differ in vertices or triangles.
+            InputError: something else than meshes, too few of them, no variation, too many modes, unknown settings.
+        """
+        if self.meshes not in ("corresponding", "scans"):
+            raise InputError(f"There is no kind of meshes {self.meshes!r}; choose corresponding or scans.")
+        self.model_ = self.model if self.model is not None else self._build(X)
+        self.model_hash_ = self.model_.content_hash
+        self.n_features_out_ = self.model_.n_modes
+        return self
+
+    def _build(self, X: Sequence[Surface]) -> ShapeModel:
+        meshes = [mesh for mesh in X if isinstance(mesh, Mesh)]
+        if len(meshes) != len(X):
+            raise InputError("A shape space is built from meshes in correspondence; give those, or a ready model.")
+        return ShapeModel.fit(
+            meshes,
+            modes=self.modes,
+            gauge=self.gauge,
+            align=self.align,
+            alignment_vertices=self.alignment_vertices,
+            seed=self.seed,
+        )
+
+    def transform(self, X: Sequence[Surface]) -> FloatArray:
+        """Return coefficients z (n, K) in standard deviations of the model; rows of failed fits are NaN.
+
+        Raises:
+            CorrespondenceError: a mesh that is not in the model's vertex order, where meshes are not scans.
+            InputError: a fit of another model, or something that is neither mesh nor fit.
+            FileFormatError: a record that is damaged.
+            FitError: a scan that cannot be fitted at all.
+        """
+        check_is_fitted(self)
+        rows = [self._coefficients(surface, number) for number, surface in enumerate(X, 1)]
+        return np.stack(rows) if rows else np.zeros((0, self.n_features_out_))
+
+    def _coefficients(self, surface: Surface, number: int) -> FloatArray:
+        model = self.model_
+        if isinstance(surface, Mesh):
+            if self.meshes == "scans":
+                return self._of_fit(fit_scan(model, surface, self.config or FitConfig()))
+            return model.project(surface, align=self.align) / model.stddev
+        if isinstance(surface, FitResult):
+            self._refuse_other_model(surface.model_hash, surface.scan_name)
+            return self._of_fit(surface)
+        if not isinstance(surface, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise InputError(f"Number {number} is neither a mesh nor a fit, but {type(surface).__name__}.")
+        scan = from_record(f"number {number}", surface)
+        self._refuse_other_model(scan.model_hash, scan.file)
+        if scan.z is None:
+            return np.full(model.n_modes, np.nan)
+        if scan.z.shape != (model.n_modes,):
+            raise InputError(f"The record of {scan.file} has {len(scan.z)} coefficients, not {model.n_modes}.")
+        return scan.z
+
+    def _of_fit(self, result: FitResult) -> FloatArray:
+        return np.full(self.model_.n_modes, np.nan) if result.status == "failed" else result.z
+
+    def _refuse_other_model(self, model_hash: str, name: str) -> None:
+        if model_hash != self.model_hash_:
+            raise InputError(
+                f"{name} was fitted with the model {model_hash[:12]}, and this shape space is {self.model_hash_[:12]}; "
+                "fit the scan with this model."
+            )
+
+    def inverse_transform(self, X: Any) -> list[Mesh]:
+        """Return the shapes with coefficients `X` (n, k), in standard deviations, as meshes in the model's frame, mm.
+
+        Raises:
+            InputError: more coefficients than modes, or values that are not finite.
+        """
+        check_is_fitted(self)
+        z = np.asarray(X, dtype=np.float64)
+        if z.ndim != 2 or z.shape[1] > self.n_features_out_:
+            raise InputError(f"Coefficients must be (n, k) with k at most {self.n_features_out_}, not {z.shape}.")
+        return [self.model_.mesh(row * self.model_.stddev[: len(row)]) for row in z]
+
+    def get_feature_names_out(self, input_features: Any = None) -> Any:
+        """Return the names z1 to zK, (K,)."""
+        check_is_fitted(self)
+        return np.asarray([f"z{k}" for k in range(1, self.n_features_out_ + 1)], dtype=object)

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
+
+import shapespace as ss
+from shapespace.batch.results import Source, failed_record, fit_record
+from shapespace.errors import CorrespondenceError, FileFormatError, InputError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.types import Mesh
+from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes
+
+MESHES = training_meshes(20, 300)
+
+
+def test_it_gives_the_coefficients_of_the_model_in_standard_deviations():
+    space = ss.ShapeSpace(modes=4).fit(MESHES)
+    model = ss.ShapeModel.fit(MESHES, modes=4)
+    assert space.model_hash_ == model.content_hash
+    z = space.transform(MESHES[:3])
+    np.testing.assert_allclose(z, [model.project(mesh) / model.stddev for mesh in MESHES[:3]])
+    assert list(space.get_feature_names_out()) == ["z1", "z2", "z3", "z4"]
+    assert space.transform([]).shape == (0, 4)
+
+
+def test_its_settings_are_those_of_the_model():
+    space = ss.ShapeSpace(modes=3, gauge="form", align=False).fit(MESHES)
+    assert space.model_hash_ == ss.ShapeModel.fit(MESHES, modes=3, gauge="form", align=False).content_hash
+    moved = Mesh(MESHES[0].vertices + 5.0, MESHES[0].faces)
+    assert not np.allclose(space.transform([moved]), space.transform([MESHES[0]]))
+    aligned = ss.ShapeSpace(modes=3).fit(MESHES)
+    np.testing.assert_allclose(aligned.transform([moved]), aligned.transform([MESHES[0]]), atol=1e-6)
+
+
+def test_back_and_forth_gives_the_same_coefficients():
+    space = ss.ShapeSpace(model=blob_model(300)).fit([])
+    z = np.random.default_rng(0).standard_normal((4, 5))
+    meshes = space.inverse_transform(z)
+    assert all(isinstance(mesh, Mesh) for mesh in meshes)
+    np.testing.assert_allclose(space.transform(meshes), z, atol=1e-6)
+
+
+def test_scans_are_fitted_and_fits_and_records_are_taken_as_they_are():
+    model = blob_model(300)
+    scan = raw_scan(np.array([0.5, -0.5, 1.0, 0.0, 0.3]), similarity(2, 8.0, 1.0)).scan
+    config = FitConfig(max_iterations=20)
+    result = fit_scan(model, scan, config)
+    space = ss.ShapeSpace(model=model, meshes="scans", config=config).fit([])
+    record = fit_record(result, Source("s.ply", "a"), Source("m.h5", model.content_hash))
+    failed = failed_record(Source("t.ply", "b"), Source("m.h5", model.content_hash), "t.ply is empty.", {})
+    z = space.transform([scan, result, record, failed])
+    np.testing.assert_allclose(z[:3], [result.z] * 3)
+    assert np.isnan(z[3]).all()
+
+
+def test_what_does_not_belong_to_the_model_is_refused():
+    model = blob_model(300)
+    space = ss.ShapeSpace(model=model).fit([])
+    scan = raw_scan(np.zeros(5), similarity(2, 8.0, 1.0)).scan
+    with pytest.raises(CorrespondenceError, match="fit this one instead"):
+        space.transform([scan])
+    other = failed_record(Source("t.ply", "b"), Source("m.h5", "f" * 64), "t.ply is empty.", {})
+    with pytest.raises(InputError, match=r"t\.ply was fitted with the model ffffffffffff"):
+        space.transform([other])
+    with pytest.raises(FileFormatError, match="number 1 is damaged"):
+        space.transform([{"status": "converged"}])
+    with pytest.raises(InputError, match="neither a mesh nor a fit"):
+        space.transform([np.zeros((300, 3))])
+    with pytest.raises(InputError, match="meshes in correspondence"):
+        ss.ShapeSpace().fit([other])
+    with pytest.raises(InputError, match="no kind of meshes"):
+        ss.ShapeSpace(meshes="raw").fit(MESHES)
+    with pytest.raises(InputError, match="at most 5"):
+        space.inverse_transform(np.zeros((1, 6)))
+
+
+def test_a_clone_has_the_same_settings_and_is_not_fitted():
+    model = blob_model(300)
+    space = ss.ShapeSpace(0.9, gauge="form", model=model, seed=3).fit([])
+    copy = clone(space)
+    assert copy.get_params() == space.get_params()
+    assert copy.model is model and not hasattr(copy, "model_")
+
+
+def test_it_is_the_first_step_of_a_pipeline_that_can_be_cloned():
+    labels = ["long" if np.ptp(mesh.vertices[:, 1]) > 205 else "short" for mesh in MESHES]
+    labels[:2] = ["long", "short"]
+    pipeline = make_pipeline(ss.ShapeSpace(modes=4), CLASSIFIERS["lda"](0))
+    fitted = clone(pipeline).fit(MESHES, labels)
+    assert fitted.predict_proba(MESHES[:5]).shape == (5, 2)
+    assert fitted[0].model_hash_ == ss.ShapeModel.fit(MESHES, modes=4).content_hash
