@@ -64,6 +64,8 @@ class StudyConfig:
     Args:
         people: whom it is made of.
         folds: how many times the subjects are parted; models, classifiers and scaling never see those tested.
+        taught_levels: of how many intensities of each expression, drawn anew for each person, classifiers learn; every
+            one is tested.
         identity_modes: of the additive model: a number, or a share of the variance.
         expression_modes: the same for expressions.
         strangers: people of the bundled generator, another one than the training's, who are scanned and recognised.
@@ -75,6 +77,7 @@ class StudyConfig:
 
     people: StudyPeople = field(default_factory=StudyPeople)
     folds: int = 4
+    taught_levels: int = 2
     identity_modes: int | float = 0.999
     expression_modes: int | float = 0.999
     strangers: int = 25
@@ -85,6 +88,20 @@ class StudyConfig:
             raise InputError(
                 f"{self.people.people} people cannot be parted into {self.folds} folds; each needs two of them."
             )
+
+    def taught(self, person: int) -> IntArray:
+        """Return (S,) the place of each scan among those of its expression that classifiers learn from, or -1.
+
+        Neutral has 0; the weaker of two taught scans of the first expression 1, the stronger 2, and so on.
+        """
+        rng = np.random.default_rng((self.people.seed, 6, person))
+        levels, each = len(self.people.levels), min(self.taught_levels, len(self.people.levels))
+        places = np.full(len(self.people.shown), -1, dtype=np.int32)
+        places[0] = 0
+        for number in range(len(self.people.expressions)):
+            chosen = np.sort(rng.permutation(levels)[:each])
+            places[1 + number * levels + chosen] = 1 + number * each + np.arange(each)
+        return places
 
     @property
     def digest(self) -> str:
@@ -106,9 +123,9 @@ class Fits:
 
     Args:
         z: (F, N, K) coefficients in standard deviations; K is that of the largest model and the rest is 0; NaN where a
-            fit failed.
+            fit failed, or was not needed.
         z_stddev: (F, N, K) theirs.
-        status: (F, N) index of `STATUSES`.
+        status: (F, N) index of `STATUSES`; -1 where none was needed.
         error_mm: (N,) mean distance of the vertices to the true ones, in the fold where the scan is tested.
         seconds: (N,) of that fit.
         person: (N,) who is scanned.
@@ -285,13 +302,14 @@ def _fit_person(folder: Path, config: StudyConfig, person: int) -> None:
     own = int(config.fold_of()[person])
     order = [own, *(fold for fold in range(config.folds) if fold != own)]
     scans = [(face, people.scan(face, person, k)) for k, face in enumerate(people.faces(ict, person))]
-    _fit_all(folder, person_path(folder, person), [scan for _, scan in scans], order, config.folds, with_truth=True)
+    taught = config.taught(person) >= 0
+    _fit_all(folder, person_path(folder, person), [scan for _, scan in scans], order, config.folds, taught)
 
 
 def _fit_stranger(folder: Path, config: StudyConfig, person: int) -> None:
     generator = load_faces()
     scans = [stranger_scan(generator, config, person, k) for k in range(len(stranger_shown(config)))]
-    _fit_all(folder, stranger_path(folder, person), scans, [0], config.folds, with_truth=False)
+    _fit_all(folder, stranger_path(folder, person), scans, [0], config.folds, None)
 
 
 def stranger_shown(config: StudyConfig) -> tuple[tuple[str, float], ...]:
@@ -323,23 +341,33 @@ def stranger_scan(generator: FaceGenerator, config: StudyConfig, person: int, sh
 
 
 def _fit_all(
-    folder: Path, path: Path, scans: Sequence[SimulatedScan], order: Sequence[int], folds: int, *, with_truth: bool
+    folder: Path,
+    path: Path,
+    scans: Sequence[SimulatedScan],
+    order: Sequence[int],
+    folds: int,
+    taught: npt.NDArray[np.bool_] | None,
 ) -> None:
+    """Fit each scan with the first model of `order`, and those that are taught with the others, into one file.
+
+    Without `taught` the model's vertices are not those of the truth, and there is nothing to compare.
+    """
     models = {fold: _model(model_path(folder, fold)) for fold in order}
     k, n = max(model.shape.n_modes for model in models.values()), len(scans)
     z, stddev = np.full((folds, n, k), np.nan), np.full((folds, n, k), np.nan)
-    status = np.full((folds, n), STATUSES.index("failed"), dtype=np.int32)
+    status = np.full((folds, n), -1, dtype=np.int32)
     error_mm, seconds = np.full(n, np.nan), np.full(n, np.nan)
     for row, scan in enumerate(scans):
         T: Similarity | None = None
-        for fold in order:
+        for fold in order if taught is None or taught[row] else order[:1]:
             shape = models[fold].shape
             config = FitConfig(unit="mm", robust=_FIRST if T is None else _AGAIN)
             since = time.perf_counter()
             try:
                 fitted = fit_scan(shape, scan.scan, config, T_scan_model=T)
             except ShapespaceError:
-                continue  # stays failed, and is counted as such
+                status[fold, row] = STATUSES.index("failed")  # counted as such, and never guessed
+                continue
             z[fold, row, : shape.n_modes] = fitted.z
             stddev[fold, row, : shape.n_modes] = fitted.b_stddev / shape.stddev
             z[fold, row, shape.n_modes :], stddev[fold, row, shape.n_modes :] = 0.0, 1.0
@@ -347,7 +375,7 @@ def _fit_all(
             if T is None:
                 T = fitted.T_scan_model
                 seconds[row] = time.perf_counter() - since
-                if with_truth:
+                if taught is not None:
                     away = T.apply(shape.reconstruct(fitted.b)) - scan.truth_vertices
                     error_mm[row] = float(np.linalg.norm(away, axis=1).mean()) / scan.T_scan_model.scale
     memory = io.BytesIO()

@@ -1,0 +1,147 @@
+"""Six ways from one fit to an expression, under the same folds: what the study compares in one table.
+
+Each reads the coefficients of the same registrations, made by a model that has not seen the people tested, so that only
+what becomes of them differs. `Rows` of training people teach it; `features` are then asked for of anybody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.model.additive import AdditiveModel
+from shapespace.model.bilinear import BilinearModel
+from shapespace.recognise.classifiers import ShrinkageLDA
+from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
+from shapespace.types import FloatArray, IntArray
+
+PAPER_VARIANCE = 0.985
+TextArray = npt.NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Fits by one model.
+
+    Args:
+        z: (n, K) in standard deviations, finite.
+        z_stddev: (n, K) theirs.
+        expression: n names; neutral among them.
+        shown: (n,) place of the scan among its person's: 0 is neutral, and the same number is the same expression.
+        subject: n names.
+    """
+
+    z: FloatArray
+    z_stddev: FloatArray
+    expression: TextArray
+    shown: IntArray
+    subject: TextArray
+
+    def where(self, chosen: npt.NDArray[np.bool_]) -> Rows:
+        """Return some of them."""
+        return Rows(
+            self.z[chosen], self.z_stddev[chosen], self.expression[chosen], self.shown[chosen], self.subject[chosen]
+        )
+
+    @property
+    def expressive(self) -> Rows:
+        """Those that are not neutral."""
+        return self.where(self.shown != 0)
+
+
+Features = Callable[[Rows], FloatArray]
+
+
+class Approach(Protocol):
+    """Learns from training people how to read an expression."""
+
+    def __call__(self, model: AdditiveModel, training: Rows) -> Features:
+        """Return what gives (n, k) features of an expression."""
+        ...
+
+
+def one_pca(model: AdditiveModel, training: Rows) -> Features:
+    """The paper: one PCA of all training faces, whitened, with 98.5 % of the variance."""
+    b = training.z * model.shape.stddev
+    mean = b.mean(axis=0)
+    _, size, rows = np.linalg.svd(b - mean, full_matrices=False)
+    kept = int(np.searchsorted(np.cumsum(size**2) / (size**2).sum(), PAPER_VARIANCE)) + 1
+    basis, stddev = rows[:kept].T, size[:kept] / np.sqrt(len(b) - 1)
+    return lambda faces: (faces.z * model.shape.stddev - mean) @ basis / stddev
+
+
+def additive(model: AdditiveModel, training: Rows) -> Features:
+    """Identity and expression solved for at once; e alone is the feature."""
+    return lambda faces: model.split(faces.z)[1]
+
+
+def continuous(model: AdditiveModel, training: Rows) -> Features:
+    """Personalise the mean by identity alone, fit expression to it, and once more."""
+
+    def features(faces: Rows) -> FloatArray:
+        Ra, Re = model.rotation[: model.n_identity], model.rotation[model.n_identity :]
+        out = np.empty((len(faces.z), model.n_expression))
+        for row, (z, stddev) in enumerate(zip(faces.z, faces.z_stddev, strict=True)):
+            variance = np.minimum(stddev, 0.999) ** 2
+            told, pulled = 1.0 / variance - 1.0, z / variance
+            left_a = (Ra * told) @ Ra.T + np.eye(len(Ra))
+            left_e = (Re * told) @ Re.T + np.eye(len(Re))
+            cross = (Ra * told) @ Re.T
+            e = np.zeros(len(Re))
+            for _ in range(2):
+                a = np.linalg.solve(left_a, Ra @ pulled - cross @ e)
+                e = np.linalg.solve(left_e, Re @ pulled - cross.T @ a)
+            out[row] = e
+        return out
+
+    return features
+
+
+def bilinear(model: AdditiveModel, training: Rows) -> Features:
+    """A tensor of people times expressions; the expression vector is the feature."""
+    columns = np.unique(training.shown)
+    table: list[FloatArray] = []
+    for name in np.unique(training.subject):
+        mine = training.where(training.subject == name)
+        order = np.argsort(mine.shown)
+        if len(order) == len(columns):
+            table.append(mine.z[order])
+    identity_rank, expression_rank = min(len(table), model.n_identity), min(len(columns), model.n_expression)
+    fitted = BilinearModel.fit(np.stack(table), identity_rank, expression_rank)
+    return lambda faces: fitted.encode(faces.z, faces.z_stddev)[1]
+
+
+APPROACHES: Mapping[str, Approach] = {
+    "one PCA (the paper)": one_pca,
+    "additive": additive,
+    "bilinear": bilinear,
+    "continuous": continuous,
+}
+"""Approaches whose features go to one classifier."""
+
+
+def face_types(model: AdditiveModel, training: Rows, types: int | None, seed: int) -> FaceTypes:
+    """Return the types of the training people's neutral faces."""
+    neutral = training.where(training.shown == 0)
+    return FaceTypes.fit(model.split(neutral.z)[0], types=types, seed=seed)
+
+
+def by_type(
+    model: AdditiveModel, training: Rows, faces: Rows, types: FaceTypes, *, soft: bool
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the classes and how likely each is, (n, C), by the paper's hierarchy."""
+    taught = training.expressive
+    a, e = model.split(taught.z)
+    hierarchy = ExpressionByType(types, soft=soft).fit(a, e, taught.expression.tolist())
+    return hierarchy.classes, hierarchy.predict_proba(*model.split(faces.z))
+
+
+def by_one_classifier(features: Features, training: Rows, faces: Rows) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the classes and how likely each is, (n, C), by the classifier that all approaches share."""
+    taught = training.expressive
+    classifier = ShrinkageLDA().fit(features(taught), taught.expression)
+    return tuple(classifier.classes_.tolist()), classifier.predict_proba(features(faces))

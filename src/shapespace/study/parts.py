@@ -1,0 +1,141 @@
+"""Parts of recognition.json, which the report draws: tables, confusion matrices, curves and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.recognise import evaluate
+from shapespace.types import FloatArray
+
+Part = dict[str, Any]
+BoolRow = npt.NDArray[np.bool_]
+
+
+def table(title: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[object]], note: str = "") -> Part:
+    """Return a table; `columns` are (name, kind)."""
+    return {
+        "kind": "table",
+        "title": title,
+        "note": note,
+        "columns": [{"name": name, "kind": kind} for name, kind in columns],
+        "rows": [[plain(cell) for cell in row] for row in rows],
+    }
+
+
+def plain(value: object) -> object:
+    """Return a value as JSON has it: numbers that are not finite become null."""
+    if isinstance(value, tuple):
+        return [plain(item) for item in cast(tuple[object, ...], value)]
+    bare: object = cast(Any, value).item() if isinstance(value, np.generic) else value
+    return None if isinstance(bare, float) and not np.isfinite(bare) else bare
+
+
+def confusion(
+    title: str, labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str], note: str = ""
+) -> Part:
+    """Return a confusion matrix."""
+    counts = evaluate.confusion(labels, predicted, classes)
+    return {"kind": "confusion", "title": title, "classes": list(classes), "counts": counts.tolist(), "note": note}
+
+
+def per_class(title: str, labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> Part:
+    """Return precision, recall and F1 of each class."""
+    scores = evaluate.per_class(labels, predicted, classes)
+    return table(
+        title,
+        [
+            ("Expression", "text"),
+            ("Precision", "percent"),
+            ("Recall", "percent"),
+            ("F1", "percent"),
+            ("Scans", "count"),
+        ],
+        [(name, one.precision, one.recall, one.f1, one.count) for name, one in scores.items()],
+    )
+
+
+def calibration(title: str, labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> Part:
+    """Return how often probabilities come true."""
+    found = evaluate.calibration(labels, probabilities, classes)
+    bins = [
+        {"confidence": float(said), "accuracy": float(true), "count": int(count)}
+        for said, true, count in zip(found.confidence, found.accuracy, found.count, strict=True)
+    ]
+    for one in bins:
+        one["low"], one["high"] = np.floor(10 * one["confidence"]) / 10, np.floor(10 * one["confidence"]) / 10 + 0.1
+    return {
+        "kind": "calibration",
+        "title": title,
+        "bins": bins,
+        "ece": float(found.expected_calibration_error),
+        "brier": float(found.brier),
+    }
+
+
+def learning_curve(
+    title: str, folds: Sequence[evaluate.Fold], counts: Sequence[int], *, ceiling: float | None, repeats: int = 5
+) -> Part:
+    """Return macro accuracy against the number of training people."""
+    curve = evaluate.learning_curve(folds, "lda", counts, repeats=repeats)
+    low, high = np.quantile(curve.macro_accuracy, [0.0, 1.0], axis=1)
+    return {
+        "kind": "learning_curve",
+        "title": title,
+        "subjects": curve.subjects.tolist(),
+        "mean": curve.mean.tolist(),
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "ceiling": ceiling,
+    }
+
+
+def accuracy_of(
+    labels: Sequence[str], predicted: Sequence[str], subjects: Sequence[str], chosen: BoolRow | None = None
+) -> tuple[float, tuple[float, float]]:
+    """Return macro accuracy with its bootstrap interval over people, of all or of the chosen samples."""
+    kept = np.ones(len(labels), dtype=np.bool_) if chosen is None else chosen
+    some = [np.asarray(values, dtype=str)[kept].tolist() for values in (labels, predicted, subjects)]
+    classes = sorted(set(some[0]))
+    return evaluate.macro_accuracy(some[0], some[1], classes), evaluate.subject_bootstrap(*some)
+
+
+def words(share: float) -> str:
+    """Return a share as text."""
+    return f"{100 * share:.1f} %"
+
+
+def target(what: str, wanted: str, reached: str, *, met: bool, note: str = "") -> dict[str, Any]:
+    """Return one line of the table of targets."""
+    return {"what": what, "target": wanted, "reached": reached, "met": bool(met), "note": note}
+
+
+def document(
+    title: str,
+    summary: Sequence[str],
+    targets: Sequence[Mapping[str, Any]],
+    parts: Sequence[Part],
+    *,
+    settings: Mapping[str, Any],
+    versions: Mapping[str, str],
+    model_hashes: Sequence[str],
+    version: str,
+    created: str,
+) -> dict[str, Any]:
+    """Return the whole of recognition.json."""
+    return {
+        "format": "shapespace recognition",
+        "format_version": 1,
+        "version": version,
+        "created": created,
+        "title": title,
+        "summary": list(summary),
+        "targets": list(targets),
+        "parts": list(parts),
+        "settings": dict(settings),
+        "versions": dict(versions),
+        "model_hashes": list(model_hashes),
+    }
