@@ -15,7 +15,7 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.labels import Label
 from shapespace.io.meshes import read_mesh
-from shapespace.report import sections
+from shapespace.report import recognition, sections
 from shapespace.report.labels import find_labels, labelled
 from shapespace.report.markup import (
     Cell,
@@ -77,6 +77,7 @@ class FolderPage:
         on_step: Step | None = None,
     ) -> None:
         self.folder = folder
+        self.recognised = (folder.root / recognition.FILE).is_file()
         self.label_note = ""
         found: Mapping[str, Label] = {}
         try:
@@ -126,7 +127,7 @@ class FolderPage:
             Section("The model", "Model", self.model_part),
             Section("The fits", "Fits", self.fits_part),
         ]
-        if (self.folder.root / "recognition.json").is_file():
+        if self.recognised:
             parts.append(Section("Recognition", "Recognition", self.recognition))
         parts.append(Section("Settings, versions and hashes", "Settings", self.settings))
         lead = paragraph(
@@ -447,7 +448,8 @@ class FolderPage:
         """Return one fit with every picture, as far as the file's size allows."""
         staged = self.staged(fit)
         out = sections.fit_facts(fit)
-        if self.page.left < _DETAIL_BYTES + _RESERVE_BYTES:
+        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
+        if self.page.left < _DETAIL_BYTES + reserve:
             return out + paragraph("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")
         same = self.of_one_model(str(_source(fit, "model", "hash")))
         others = [other.numbers("z") for other in same if other.name != fit.name]
@@ -459,8 +461,8 @@ class FolderPage:
     # The rest
 
     def recognition(self) -> str:
-        """Return what recognition.json holds, as tables."""
-        return sections.score_tables(self.folder.json("recognition.json"), many="Scores by class", single="Scores")
+        """Return what recognition.json holds."""
+        return recognition.recognition_section(self.page, self.folder)
 
     def settings(self) -> str:
         """Return settings that the fits share, versions and hashes."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import write_text
 from shapespace.report.page import LARGEST_REPORT_BYTES, Step
+from shapespace.report.recognition import is_study, study_page
 from shapespace.report.saved import Folder, find_fits
 
 __all__ = ["LARGEST_REPORT_BYTES", "require_report_extra", "write_report"]
@@ -36,19 +37,20 @@ def write_report(
 ) -> Path:
     """Write one HTML file on the results saved in `folder`, and return its path.
 
-    A folder with a demo.json is reported as the demo, any other as the results of `shapespace fit`. The page needs no
+    A folder with a demo.json is reported as the demo, one with a recognition.json and no fits as a study of
+    recognition, any other as the results of `shapespace fit`. The page needs no
     network; without a script it loses what turns and sorts, and can be read.
 
     Args:
         folder: of the results.
         output: the file; None writes `folder`/report.html.
-        model: file of the model of the fits; None goes by their records. The demo names its own.
+        model: file of the model of the fits; None goes by their records. The demo names its own, a study has none.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then beside the scans.
         on_step: told of each picture as it is made.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
-        FileFormatError: demo.json, `model` or `labels` is damaged.
+        FileFormatError: demo.json, the recognition.json of a study, `model` or `labels` is damaged.
         InputError: the folder holds no results, or only records that cannot be read, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
@@ -64,6 +66,10 @@ def write_report(
                 f"{folder} is a demo, which names its models and labels itself; leave out --model and --labels."
             )
         page = DemoPage(results, results.json("demo.json"), on_step).html()
+    elif is_study(results):
+        if model is not None or labels is not None:
+            raise InputError(f"{folder} is a study without fits; leave out --model and --labels.")
+        page = study_page(results, on_step)
     else:
         from shapespace.report.folder_page import FolderPage
 

@@ -63,6 +63,10 @@ class Page:
         """How many bytes may still be embedded."""
         return LARGEST_REPORT_BYTES - self._spent
 
+    def spend(self, n_bytes: int) -> None:
+        """Count bytes that are embedded by other means than this page's."""
+        self._spent += n_bytes
+
     def step(self, what: str) -> None:
         """Tell the progress bar what was just made."""
         if self._on_step is not None:

@@ -30,9 +30,15 @@ _RECORD = ".fit.json"
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder of results; names in its files are relative to it and stay inside it."""
+    """A folder of results; names in its files are relative to it and stay inside it.
+
+    Args:
+        root: the folder.
+        again: what a reader can do about a file that is wrong.
+    """
 
     root: Path
+    again: str = _AGAIN
 
     def path(self, name: object) -> Path:
         """Return the file called `name`, as the folder was named by the user.
@@ -41,14 +47,14 @@ class Folder:
             FileFormatError: it is no name, or it leads out of the folder.
         """
         if not isinstance(name, str) or not name:
-            raise FileFormatError(f"{self.root}: a result file has no name where one is needed; {_AGAIN}.")
+            raise FileFormatError(f"{self.root}: a result file has no name where one is needed; {self.again}.")
         try:
             path = self.root / name
             inside = path.resolve().is_relative_to(self.root.resolve())
         except (OSError, ValueError, RuntimeError) as error:
-            raise FileFormatError(f"{self.root}: {name[:80]!r} is not a file name; {_AGAIN}.") from error
+            raise FileFormatError(f"{self.root}: {name[:80]!r} is not a file name; {self.again}.") from error
         if not inside:
-            raise FileFormatError(f"{self.root}: {name[:80]!r} leads out of the folder of the results; {_AGAIN}.")
+            raise FileFormatError(f"{self.root}: {name[:80]!r} leads out of the folder of the results; {self.again}.")
         return path
 
     def json(self, name: object) -> dict[str, Any]:
@@ -60,13 +66,13 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_JSON)
+            _bounded(path, _LARGEST_JSON, self.again)
             try:
                 content: object = json.loads(read_bytes(path))
             except (ValueError, RecursionError) as error:
-                raise FileFormatError(f"{path} is not JSON, or it is cut short; {_AGAIN}.") from error
+                raise FileFormatError(f"{path} is not JSON, or it is cut short; {self.again}.") from error
             if not isinstance(content, dict):
-                raise FileFormatError(f"{path} does not hold a JSON object; {_AGAIN}.")
+                raise FileFormatError(f"{path} does not hold a JSON object; {self.again}.")
         return cast(dict[str, Any], _printable(cast(object, content)))
 
     def arrays(self, name: object) -> dict[str, npt.NDArray[Any]]:
@@ -78,11 +84,11 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_ARRAY)
+            _bounded(path, _LARGEST_ARRAY, self.again)
             try:
                 with zipfile.ZipFile(path) as archive:
                     for member in archive.infolist():
-                        _check_member(path, archive, member)
+                        _check_member(path, archive, member, self.again)
                 with np.load(path, allow_pickle=False) as loaded:
                     return {key: np.asarray(loaded[key]) for key in loaded.files}
             except OSError as error:
@@ -90,7 +96,9 @@ class Folder:
             except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError) as error:
                 if isinstance(error, FileFormatError):
                     raise
-                raise FileFormatError(f"{path} is not an .npz file of arrays, or it is cut short; {_AGAIN}.") from error
+                raise FileFormatError(
+                    f"{path} is not an .npz file of arrays, or it is cut short; {self.again}."
+                ) from error
 
     def mesh(self, name: object) -> Mesh:
         """Return the mesh in a file.
@@ -194,6 +202,15 @@ def read_fit(folder: Folder, entry: Mapping[str, Any]) -> SavedFit:
     return SavedFit(entry, folder.json(entry.get("json")))
 
 
+def has_fits(folder: Folder) -> bool:
+    """Return whether the record of a fit lies directly in `folder`.
+
+    Raises:
+        FileError: the folder cannot be read.
+    """
+    return bool(_records(folder))
+
+
 def find_fits(folder: Folder) -> list[SavedFit]:
     """Return the fits whose records lie directly in `folder`, in the order of their names.
 
@@ -203,13 +220,17 @@ def find_fits(folder: Folder) -> list[SavedFit]:
         FileError: the folder cannot be read.
         InputError: there is no fit in it.
     """
-    try:
-        names = sorted(path.name for path in folder.root.iterdir() if path.name.endswith(_RECORD))
-    except OSError as error:
-        raise read_error(folder.root, error) from error
+    names = _records(folder)
     if not names:
         raise InputError(f"{folder.root} holds no fits (NAME{_RECORD}); give a folder that shapespace fit wrote.")
     return [_found(folder, name) for name in names]
+
+
+def _records(folder: Folder) -> list[str]:
+    try:
+        return sorted(path.name for path in folder.root.iterdir() if path.name.endswith(_RECORD))
+    except OSError as error:
+        raise read_error(folder.root, error) from error
 
 
 def _found(folder: Folder, file: str) -> SavedFit:
@@ -282,16 +303,16 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     return model
 
 
-def _bounded(path: Path, most: int) -> None:
+def _bounded(path: Path, most: int, again: str) -> None:
     try:
         size = path.stat().st_size
     except OSError as error:
         raise read_error(path, error) from error
     if size > most:
-        raise FileFormatError(f"{path} is larger ({size / 2**20:.0f} MiB) than such a file can be; {_AGAIN}.")
+        raise FileFormatError(f"{path} is larger ({size / 2**20:.0f} MiB) than such a file can be; {again}.")
 
 
-def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, again: str) -> None:
     """Refuse an array whose header promises another size than the archive holds, before it is allocated."""
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
@@ -302,7 +323,7 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo)
     for extent in shape:
         promised *= int(extent)
     if dtype.hasobject or promised != member.file_size - header or promised > _LARGEST_ARRAY:
-        raise FileFormatError(f"{path}: the array {member.filename!r} is not what its header says; {_AGAIN}.")
+        raise FileFormatError(f"{path}: the array {member.filename!r} is not what its header says; {again}.")
 
 
 def _printable(value: object) -> object:

@@ -45,6 +45,15 @@ from shapespace.report.figures.model import (
     quality_figure,
     spectrum_figure,
 )
+from shapespace.report.figures.recognition import (
+    calibration_figure,
+    confusion_figure,
+    curve_figure,
+    face_map_figure,
+    importance_figure,
+    learning_curve_figure,
+    mesh_rows_figure,
+)
 from shapespace.report.staged import StagedFit
 
 __all__ = [
@@ -56,15 +65,22 @@ __all__ = [
     "aligned_grid",
     "b_plane",
     "b_space",
+    "calibration_figure",
     "coefficients_figure",
+    "confusion_figure",
+    "curve_figure",
     "distance_histograms",
     "distance_maps",
     "encode_webp",
     "error_curves",
+    "face_map_figure",
     "faces_grid",
     "gallery",
     "history_figure",
+    "importance_figure",
+    "learning_curve_figure",
     "mean_figure",
+    "mesh_rows_figure",
     "mode_animation",
     "modes_figure",
     "overlay_figure",
