@@ -17,7 +17,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.bilinear import BilinearModel
 from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray
 
 PAPER_VARIANCE = 0.985
 TextArray = npt.NDArray[np.str_]
@@ -41,11 +41,16 @@ class Rows:
     shown: IntArray
     subject: TextArray
 
-    def where(self, chosen: npt.NDArray[np.bool_]) -> Rows:
+    def where(self, chosen: BoolArray) -> Rows:
         """Return some of them."""
         return Rows(
             self.z[chosen], self.z_stddev[chosen], self.expression[chosen], self.shown[chosen], self.subject[chosen]
         )
+
+    @property
+    def usable(self) -> BoolArray:
+        """(n,) whether the fit did not fail."""
+        return np.asarray(np.isfinite(self.z).all(axis=1), dtype=np.bool_)
 
     @property
     def expressive(self) -> Rows:
@@ -91,10 +96,10 @@ def continuous(model: AdditiveModel, training: Rows) -> Features:
             left_a = (Ra * told) @ Ra.T + np.eye(len(Ra))
             left_e = (Re * told) @ Re.T + np.eye(len(Re))
             cross = (Ra * told) @ Re.T
-            e = np.zeros(len(Re))
+            e: FloatArray = np.zeros(len(Re))
             for _ in range(2):
-                a = np.linalg.solve(left_a, Ra @ pulled - cross @ e)
-                e = np.linalg.solve(left_e, Re @ pulled - cross.T @ a)
+                a: FloatArray = np.asarray(np.linalg.solve(left_a, Ra @ pulled - cross @ e), dtype=np.float64)
+                e = np.asarray(np.linalg.solve(left_e, Re @ pulled - cross.T @ a), dtype=np.float64)
             out[row] = e
         return out
 

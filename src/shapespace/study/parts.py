@@ -13,6 +13,7 @@ from shapespace.types import FloatArray
 
 Part = dict[str, Any]
 BoolRow = npt.NDArray[np.bool_]
+TextArray = npt.NDArray[np.str_]
 
 
 def table(title: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[object]], note: str = "") -> Part:
@@ -94,7 +95,10 @@ def learning_curve(
 
 
 def accuracy_of(
-    labels: Sequence[str], predicted: Sequence[str], subjects: Sequence[str], chosen: BoolRow | None = None
+    labels: Sequence[str] | TextArray,
+    predicted: Sequence[str] | TextArray,
+    subjects: Sequence[str] | TextArray,
+    chosen: BoolRow | None = None,
 ) -> tuple[float, tuple[float, float]]:
     """Return macro accuracy with its bootstrap interval over people, of all or of the chosen samples."""
     kept = np.ones(len(labels), dtype=np.bool_) if chosen is None else chosen

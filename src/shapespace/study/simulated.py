@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
-from shapespace.datasets.faces import Expression, FaceGenerator, load_faces
+from shapespace.datasets.faces import LICENSE, Expression, FaceGenerator, load_faces
 from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.datasets.study_people import StudyPeople, holes_of
@@ -29,6 +29,7 @@ from shapespace.fit.settings import Level, RobustSettings
 from shapespace.geometry.mirror import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel
+from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
@@ -183,14 +184,16 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
     models = [(_make_model, (folder, config, fold)) for fold in range(config.folds)]
     people = [(_fit_person, (folder, config, person)) for person in range(config.people.people)]
     strangers = [(_fit_stranger, (folder, config, person)) for person in range(config.strangers)]
+    paper = [(_fit_paper, (folder, config))]
     paths = {
+        "paper": [paper_path(folder)],
         "models": [model_path(folder, fold) for fold in range(config.folds)],
         "people": [person_path(folder, person) for person in range(config.people.people)],
         "strangers": [stranger_path(folder, person) for person in range(config.strangers)],
     }
     with ExitStack() as stack:
         pool: Executor | None = None
-        for what, jobs in (("models", models), ("people", people), ("strangers", strangers)):
+        for what, jobs in (("models", models), ("paper", paper), ("people", people), ("strangers", strangers)):
             todo = [job for job, path in zip(jobs, paths[what], strict=True) if not path.is_file()]
             done = len(jobs) - len(todo)
             told(what, done, len(jobs))
@@ -236,6 +239,11 @@ def model_path(folder: Path, fold: int) -> Path:
 def person_path(folder: Path, person: int) -> Path:
     """Return the file of a person's fits."""
     return folder / "fits" / f"person_{person:03d}.npz"
+
+
+def paper_path(folder: Path) -> Path:
+    """Return the file of the fits of the paper's experiment 1."""
+    return folder / "fits" / "experiment_1.npz"
 
 
 def stranger_path(folder: Path, person: int) -> Path:
@@ -310,6 +318,53 @@ def _fit_stranger(folder: Path, config: StudyConfig, person: int) -> None:
     generator = load_faces()
     scans = [stranger_scan(generator, config, person, k) for k in range(len(stranger_shown(config)))]
     _fit_all(folder, stranger_path(folder, person), scans, [0], config.folds, None)
+
+
+def paper_shown() -> tuple[tuple[str, float], ...]:
+    """What is tested in the paper's experiment 1: neutral, then four expressions at four intensities, 16 faces."""
+    return (("neutral", 0.0), *((name, level) for name in PAPER_EXPRESSIONS for level in (0.25, 0.5, 0.75, 1.0)))
+
+
+def _fit_paper(folder: Path, config: StudyConfig) -> None:
+    """One person of the bundled generator: 100 mixed expressions make the model, raw scans of 17 others are fitted."""
+    generator, people = load_faces(), config.people
+    rng = np.random.default_rng((people.seed, 7))
+    person = generator.draw_person(rng)
+    training = [generator.face(person, generator.mixed_expression(rng), name=f"{k:03d}") for k in range(100)]
+    whole = ShapeModel.fit(
+        training,
+        alignment_vertices=generator.regions["semi_rigid"],
+        landmarks=generator.landmarks,
+        provenance="100 mixed expressions of one simulated person",
+        licence=LICENSE,
+    )
+    model = whole.truncate(whole.modes_for_variance(0.985) or whole.n_modes)
+    b: list[FloatArray] = []
+    status: list[int] = []
+    for name, level in paper_shown():
+        face = generator.face(person, generator.draw_expression(name, level, rng) if level else None)
+        scan = simulate_scan(
+            face,
+            rng,
+            triangles=people.triangles,
+            noise_mm=people.noise_mm,
+            T_scan_model=random_similarity(rng, people.max_angle_deg, (0.9, 1.1)),
+            holes=holes_of(face, people.missing, rng),
+            split=False,
+            name=f"{name} {round(100 * level)}",
+        )
+        try:
+            fitted = fit_scan(model, scan.scan, FitConfig(unit="mm"))
+        except ShapespaceError:
+            b.append(np.full(model.n_modes, np.nan))
+            status.append(STATUSES.index("failed"))
+            continue
+        b.append(fitted.b)
+        status.append(STATUSES.index(fitted.status))
+    memory = io.BytesIO()
+    np.savez(memory, b=np.stack(b), stddev=model.stddev, status=np.array(status, dtype=np.int32))
+    make_folder(paper_path(folder).parent)
+    write_bytes(paper_path(folder), memory.getvalue())
 
 
 def stranger_shown(config: StudyConfig) -> tuple[tuple[str, float], ...]:
@@ -420,6 +475,24 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
         person=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         shown=np.tile(np.arange(counts[0], dtype=np.int32), len(parts)),
     )
+
+
+def read_paper(path: Path) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return b (17, K) mm of experiment 1, neutral first, the model's stddev (K,), and the status of each fit.
+
+    Raises:
+        FileError: the file cannot be read.
+        FileFormatError: it is damaged.
+    """
+    try:
+        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
+            return (
+                np.asarray(loaded["b"], dtype=np.float64),
+                np.asarray(loaded["stddev"], dtype=np.float64),
+                np.asarray(loaded["status"], dtype=np.int32),
+            )
+    except (ValueError, KeyError, EOFError, OSError) as error:
+        raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
 
 
 def _joined(parts: Sequence[dict[str, npt.NDArray[Any]]], key: str, axis: int) -> FloatArray:
