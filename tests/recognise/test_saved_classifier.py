@@ -262,7 +262,8 @@ def test_the_list_of_types_is_no_longer_than_the_classifiers_need(tmp_path):
         trained(name).save(tmp_path / "c.skops")
         with zipfile.ZipFile(tmp_path / "c.skops") as archive:
             walk(json.loads(archive.read("schema.json")))
-    assert used == TRUSTED
+    assert used <= TRUSTED
+    assert TRUSTED - used <= {"numpy.int64"}  # of older versions of scikit-learn
 
 
 def test_a_name_that_is_not_of_its_format_is_refused(tmp_path):

@@ -51,6 +51,7 @@ TRUSTED = frozenset(
         "builtins.str",
         "numpy.ndarray",
         "numpy.float64",
+        "numpy.int64",  # up to scikit-learn 1.7
     }
 )
 """The types that a classifier's file may hold."""
