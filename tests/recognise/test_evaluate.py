@@ -274,3 +274,21 @@ def test_what_cannot_be_evaluated_is_refused():
         fit_temperature(["a", "b"], np.full((2, 2), 0.5), ("a", "c"))
     with pytest.raises(InputError, match="decision map"):
         decision_map(np.zeros((5, 3, 2)), np.ones(2), np.zeros((4, 3)), ["a"] * 4)
+
+
+def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch):
+    from shapespace.recognise import evaluate
+
+    z, labels, subjects = people(n=12)
+    owner = {row.tobytes(): person for row, person in zip(z[:, :1], subjects, strict=True)}
+    seen = []
+
+    def watched(X, y, test, *rest):
+        seen.append(({owner[row[:1].tobytes()] for row in X}, {owner[row[:1].tobytes()] for row in test}))
+        return original(X, y, test, *rest)
+
+    original = evaluate.predict_probabilities
+    monkeypatch.setattr(evaluate, "predict_probabilities", watched)
+    nested_predictions(folds_of(z, labels, subjects, 3), classifiers=["lda"], modes=(None,), inner_folds=4)
+    assert len(seen) == 3 * (4 + 3 * 4 + 1)
+    assert all(not trained & tested for trained, tested in seen)
