@@ -63,6 +63,7 @@ _KINDS = {
     "curve": "Curve",
     "text": "Notes",
 }
+_BESIDE = ("confusion", "calibration", "learning_curve", "modes", "face_map", "curve")
 _CHAPTER = 2
 
 
@@ -100,7 +101,8 @@ def study_page(folder: Folder, on_step: Step | None = None) -> str:
     made = f"shapespace {_line(content.get('version'))}".strip()
     if content.get("created"):
         made += f", {_line(moment(content['created']))}"
-    lead = paragraph("What a study of recognition measured, with its targets, whether they were met or missed.")
+    beside = ", beside the targets that were set for it" if content.get("targets") else ""
+    lead = paragraph(f"What a study of recognition measured{beside}.")
     lead += paragraph(f"{made}.", "soft")
     parts: list[Section] = []
     if study.has_summary:
@@ -199,9 +201,11 @@ class _Study:
                 met.append(verdict)
             notes |= bool(known.get("note"))
             rows.append([Cell(_line(known.get(key)) or DASH) for key in ("what", "target", "reached")])
-            rows[-1] += [_verdict(verdict), Cell(_line(known.get("note")))]
+            rows[-1] += [_verdict(verdict), Cell(_line(known.get("note")) or DASH)]
         columns = [Column(head) for head in ("What", "Target", "Reached", "Verdict", "Note")]
         told = f"{sum(met)} of {counted(len(met), 'target')} met" if met else "Targets, and what was reached"
+        if met and len(met) < len(rows):
+            told += f", {len(rows) - len(met)} without a verdict"
         kept = len(columns) if notes else len(columns) - 1
         return table(columns[:kept], [row[:kept] for row in rows[:_MOST_ROWS]], caption=f"{told}.", stack=True)
 
@@ -224,15 +228,14 @@ class _Study:
                 groups.append((_title(part), part, []))
             else:
                 groups[-1][2].append(part)
-        if len(parts) > _MOST_PARTS:
-            left = {"kind": "text", "title": "Left out", "text": f"{len(parts) - _MOST_PARTS} parts are left out."}
-            groups[-1][2].append(left)
         if not groups[0][2]:
             groups = groups[1:]
 
         def make(heading: str, own: Any, inner: list[Any]) -> str:
             body = "" if own is None else self.body(own)
-            return body + self.parts(inner, level if heading else level - 1)
+            body += self.parts(inner, level if heading else level - 1)
+            last = inner is groups[-1][2] and len(parts) > _MOST_PARTS
+            return body + (paragraph(f"{len(parts) - _MOST_PARTS} parts are left out.") if last else "")
 
         return [
             (heading, lambda heading=heading, own=own, inner=inner: make(heading, own, inner))
@@ -240,7 +243,7 @@ class _Study:
         ]
 
     def parts(self, parts: Sequence[Any], level: int) -> str:
-        """Return parts under their headings, confusion matrices that follow each other side by side."""
+        """Return parts under their headings, charts that follow each other side by side."""
         out = ""
         beside: list[str] = []
 
@@ -251,7 +254,7 @@ class _Study:
 
         for part in parts:
             made = self.page.guarded(_title(part), lambda part=part: self.body(part), level)
-            if as_mapping(part).get("kind") == "confusion":
+            if as_mapping(part).get("kind") in _BESIDE:
                 beside.append(made)
             else:
                 out += flush() + made
@@ -354,9 +357,8 @@ class _Study:
         said = "" if ece is None else f"; expected calibration error {100 * ece:.1f} points"
         return self.page.figure(
             figures.calibration_figure(low, high, confidence, accuracy, count, ece=ece, brier=brier),
-            f"{note} Above: how often answers are right, against the probability stated for them; larger dots stand "
-            "for more answers. Below the dashed line answers are right less often than stated. Below: how many answers "
-            "state each probability.".strip(),
+            f"{note} How often answers are right, against the probability stated for them: under the dashed line they "
+            "are right less often than stated. Larger dots stand for more answers, which the bars count.".strip(),
             alt=f"Calibration: {listed(told, 20)}{said}",
             chart=True,
         )
@@ -370,7 +372,8 @@ class _Study:
             None if part.get(key) is None else _array(part.get(key), key, finite=False) for key in ("low", "high")
         )
         ceiling = _optional(part.get("ceiling"), "ceiling")
-        figure = figures.learning_curve_figure(subjects, mean, low=low, high=high, ceiling=ceiling)
+        band = _line(part.get("band")) or "interval"
+        figure = figures.learning_curve_figure(subjects, mean, low=low, high=high, band=band, ceiling=ceiling)
         told = [f"{100 * value:.1f} % from {count:g} people" for count, value in zip(subjects, mean, strict=True)]
         said = "" if ceiling is None else f"; ceiling {100 * ceiling:.1f} %"
         about = "Share of right answers on people who were not learned from, against how many were."

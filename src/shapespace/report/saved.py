@@ -47,14 +47,16 @@ class Folder:
             FileFormatError: it is no name, or it leads out of the folder.
         """
         if not isinstance(name, str) or not name:
-            raise FileFormatError(f"{self.root}: a result file has no name where one is needed; {self.again}.")
+            raise FileFormatError(f"A result file has no name where one is needed; {self.again}.")
         try:
             path = self.root / name
             inside = path.resolve().is_relative_to(self.root.resolve())
         except (OSError, ValueError, RuntimeError) as error:
-            raise FileFormatError(f"{self.root}: {name[:80]!r} is not a file name; {self.again}.") from error
+            raise FileFormatError(f"{name[:80]!r} in a result file is not a file name; {self.again}.") from error
         if not inside:
-            raise FileFormatError(f"{self.root}: {name[:80]!r} leads out of the folder of the results; {self.again}.")
+            raise FileFormatError(
+                f"{name[:80]!r} in a result file leads out of the folder of the results; {self.again}."
+            )
         return path
 
     def json(self, name: object) -> dict[str, Any]:

@@ -150,8 +150,8 @@ def calibration_figure(
     """Draw how often answers are right against the probability that was stated, and how many answers state it.
 
     Args:
-        low: (n,) where each bin of probabilities begins, 0 to 1,
-        high: (n,) and where it ends.
+        low: (n,) where each bin of probabilities begins,
+        high: (n,) and where it ends; both are cut to 0 to 1.
         confidence: (n,) mean probability stated in the bin, 0 to 1.
         accuracy: (n,) share of right answers in the bin, 0 to 1.
         count: (n,) answers in the bin; those without any are left out, whatever their other numbers.
@@ -169,9 +169,12 @@ def calibration_figure(
         found = _numbers(values, f"the {name} of a calibration", finite=False)
         if found.shape != many.shape:
             raise InputError(f"The bins of a calibration have {len(many)} counts but {len(found)} numbers for {name}.")
-        if not ((found[known] >= 0) & (found[known] <= 1)).all():
+        found = found[known]
+        if name in ("low", "high"):
+            found = np.clip(found, 0, 1)
+        if not ((found >= 0) & (found <= 1)).all():
             raise InputError(f"The {name} of a calibration must lie within 0 to 1.")
-        parts.append(100 * found[known])
+        parts.append(100 * found)
     many = many[known]
     if not len(many):
         raise InputError("There is nothing to draw of a calibration without answers.")
@@ -185,7 +188,16 @@ def calibration_figure(
     above.plot([0, 100], [0, 100], color=GREY, ls=(0, (4, 3)), lw=1.4, label="right as often as stated")
     size = 26 + 190 * many / many.max()
     above.plot(stated, right, color=FORWARD, lw=1.6, zorder=2)
-    above.scatter(stated, right, s=size, color=FORWARD, edgecolors="white", linewidths=0.8, zorder=3, label="answers")
+    above.scatter(
+        stated,
+        right,
+        s=size,
+        color=FORWARD,
+        edgecolors="white",
+        linewidths=0.8,
+        zorder=3,
+        label="answers, more in larger dots",
+    )
     above.set(xlim=(floor, 101.5), ylim=(min(floor, float(right.min()) - 5, 100.0), 104), ylabel="right answers (%)")
     legend(above, loc="lower right" if right[-1] > 60 else "upper left")
     below.bar(start, many, width=end - start, align="edge", color=_BARS, edgecolor="white")
@@ -200,6 +212,7 @@ def learning_curve_figure(
     *,
     low: npt.ArrayLike | None = None,
     high: npt.ArrayLike | None = None,
+    band: str = "interval",
     ceiling: float | None = None,
     title: str = "",
 ) -> Figure:
@@ -210,6 +223,7 @@ def learning_curve_figure(
         mean: (n,) accuracy, 0 to 1.
         low: (n,) lower end of its interval, where it is known,
         high: (n,) and upper end.
+        band: what the interval is.
         ceiling: accuracy that no such classifier can be expected to pass, where it is known.
         title: above the figure; by default it says where the curve begins and ends.
 
@@ -232,7 +246,7 @@ def learning_curve_figure(
     bottom = float(y.min())
     if low is not None and high is not None:
         ends = [100 * _numbers(values, "the interval of a learning curve")[order] for values in _like(x, low, high)]
-        axes.fill_between(x, ends[0], ends[1], color=_BARS, alpha=0.5, lw=0, label="interval")
+        axes.fill_between(x, ends[0], ends[1], color=_BARS, alpha=0.5, lw=0, label=escaped(short(band, 40)))
         bottom = min(bottom, float(ends[0].min()))
     axes.plot(x, y, color=FORWARD, lw=2, marker="o", ms=5, label="right answers")
     if ceiling is not None:
