@@ -221,9 +221,11 @@ def _add_report(commands: Any) -> None:
 
 def _add_recognise(commands: Any) -> None:
     sub = commands.add_parser("recognise", help="tell expressions or other classes apart by fitted coefficients")
-    sub = sub.add_subparsers(required=True, metavar="train|predict")
+    sub = sub.add_subparsers(required=True, metavar="train|predict|transfer|study")
     _add_recognise_train(sub)
     _add_recognise_predict(sub)
+    _add_recognise_transfer(sub)
+    _add_recognise_study(sub)
 
 
 def _add_recognise_train(commands: Any) -> None:
@@ -256,6 +258,35 @@ def _add_recognise_predict(commands: Any) -> None:
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.csv")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful or an answer unsure")
     sub.set_defaults(run=_recognise_predict)
+
+
+def _add_recognise_transfer(commands: Any) -> None:
+    sub = _add(commands, "transfer", "put one person's expression on another, from fits by an additive model",
+               "shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply")  # fmt: skip
+    sub.add_argument("model", type=Path, metavar="MODEL.h5", help="made by build --additive")
+    sub.add_argument("person", type=Path, metavar="PERSON.fit.json", help="fit of who is to be shown")
+    sub.add_argument("expression", type=Path, metavar="EXPRESSION.fit.json", help="fit of what they shall do")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.ply")
+    sub.set_defaults(run=_recognise_transfer)
+
+
+def _add_recognise_study(commands: Any) -> None:
+    sub = _add(commands, "study", "recognition measured on unseen people, ending in a report",
+               "shapespace recognise study -o study\n"
+               "         shapespace recognise study --data BU-3DFE --model model.h5 -o study")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, default=Path("shapespace-study"), metavar="DIR",
+                     help="where to write; a study that was interrupted goes on")  # fmt: skip
+    sub.add_argument("--data", type=Path, metavar="DIR",
+                     help="labelled scans: BU-3DFE, Bosphorus, or a folder with labels.csv")  # fmt: skip
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="shape model that fits them, with --data")
+    sub.add_argument("--people", type=_positive, metavar="N", help="simulated people (default 100)")
+    sub.add_argument("--strangers", type=_natural, metavar="N", help="people of another generator (default 25)")
+    sub.add_argument("--folds", type=_positive, metavar="N",
+                     help="folds by subject (default 4 for simulated people, 10 with --data)")  # fmt: skip
+    sub.add_argument("--seed", type=_natural, metavar="S", help="of everything that is drawn")
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=_recognise_study)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -517,6 +548,46 @@ def _recognise_predict(arguments: argparse.Namespace) -> int:
         _say("shapespace: no scan could be answered for; the reasons stand in the table.")
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"] + counts["unsure"]) else 0
+
+
+def _recognise_transfer(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    commands.recognise_transfer(arguments.model, arguments.person, arguments.expression, arguments.output)
+    if arguments.json:
+        _print_json({"file": str(arguments.output)})
+    else:
+        _print(f"{arguments.output}: {arguments.person.name} with the expression of {arguments.expression.name}")
+    return 0
+
+
+def _recognise_study(arguments: argparse.Namespace) -> int:
+    from shapespace import commands
+
+    report, targets, holds = commands.recognise_study(
+        arguments.output,
+        data=arguments.data,
+        model=arguments.model,
+        people=arguments.people,
+        strangers=arguments.strangers,
+        folds=arguments.folds,
+        seed=arguments.seed,
+        jobs=arguments.jobs,
+        quiet=arguments.quiet,
+    )
+    if arguments.json:
+        _print_json({"report": str(report), "targets": targets})
+    else:
+        for line in holds.splitlines():
+            _print(line)
+        for one in targets:
+            _print(f"{one['what']}: {one['reached']} ({one['target']}{'' if one['met'] else '; missed'})")
+        _print(f"The report is {report}")
+    if not arguments.no_open:
+        import webbrowser
+
+        webbrowser.open(report.absolute().as_uri())
+    return 0
 
 
 def _view(arguments: argparse.Namespace) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from tqdm import tqdm
@@ -25,11 +25,11 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_bytes, read_error, remove_file, write_bytes, write_text
 from shapespace.io.labels import read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, read_coefficients
-from shapespace.types import MM_PER_UNIT, Mesh
+from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
 ABOUT = "about.json"
 """Beside simulated faces: their provenance and licence, for the models made of them."""
@@ -471,3 +471,78 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
         DataError: no such data set, no network, or content that does not match its hash.
     """
     return fetch.data_get(name, to=to, progress=False if quiet else None)
+
+
+def recognise_transfer(model: Path, person: Path, expression: Path, output: Path) -> None:
+    """Write the person of one fit with the expression of another, as a mesh.
+
+    Raises:
+        FileError: something cannot be read, or the mesh not written.
+        FileFormatError: a record is damaged.
+        InputError: the model does not part identity and expression, or a fit is of another one.
+    """
+    from shapespace.model.additive import AdditiveModel
+
+    additive = AdditiveModel.load(model)
+    z: list[FloatArray] = []
+    for path in (person, expression):
+        record = read_record(path)
+        if record.get("status") == "failed":
+            raise InputError(f"{path} is the record of a fit that failed, so there is nothing to transfer.")
+        source = record.get("model")
+        if not isinstance(source, dict) or cast(dict[str, Any], source).get("hash") != additive.shape.content_hash:
+            raise InputError(f"{path} is a fit by another model than {model.name}; fit the scan with this one.")
+        values = np.asarray(record.get("z", []), dtype=np.float64)
+        if values.shape != (additive.shape.n_modes,):
+            raise InputError(
+                f"{path} holds {len(values)} coefficients of {additive.shape.n_modes}; fit the scan with all modes."
+            )
+        z.append(values)
+    write_mesh(output, additive.transfer(z[0], z[1]))
+
+
+def recognise_study(
+    output: Path,
+    *,
+    data: Path | None,
+    model: Path | None,
+    people: int | None,
+    strangers: int | None,
+    folds: int | None,
+    seed: int | None,
+    jobs: int,
+    quiet: bool,
+) -> tuple[Path, list[dict[str, Any]], str]:
+    """Run the recognition study; return its report, its targets and what the scans are, in words.
+
+    Raises:
+        DataError: ICT-FaceKit is not here.
+        FileError: something cannot be read or written.
+        InputError: arguments that do not go together, or a folder of another study.
+        ShapespaceError: the extras `recognise` and `report` are not installed.
+    """
+    if (data is None) != (model is None):
+        raise InputError("A study of scans of your own needs both --data DIR and --model MODEL.h5.")
+    if data is not None and (people is not None or strangers is not None):
+        raise InputError("--people and --strangers belong to the simulated study; leave them out with --data.")
+    from shapespace.study.run import run_own_study, run_study  # needs the extras
+
+    workers = jobs or cores()
+    holds = ""
+    with telling_of_compiling(quiet=quiet):
+        if data is not None and model is not None:
+            report, holds = run_own_study(
+                output, data, model, folds=folds or 10, workers=workers, seed=seed or 0, quiet=quiet
+            )
+        else:
+            from shapespace.datasets.study_people import StudyPeople
+            from shapespace.study.simulated import StudyConfig
+
+            chosen = StudyPeople() if people is None else StudyPeople(people=people)
+            chosen = chosen if seed is None else replace(chosen, seed=seed)
+            config = StudyConfig(people=chosen)
+            config = config if folds is None else replace(config, folds=folds)
+            config = config if strangers is None else replace(config, strangers=strangers)
+            report = run_study(output, config, workers=workers, quiet=quiet)
+    content = json.loads(read_bytes(output / "recognition.json"))
+    return report, content["targets"], holds

@@ -67,7 +67,8 @@ def calibration(title: str, labels: Sequence[str], probabilities: FloatArray, cl
         for said, true, count in zip(found.confidence, found.accuracy, found.count, strict=True)
     ]
     for one in bins:
-        one["low"], one["high"] = np.floor(10 * one["confidence"]) / 10, np.floor(10 * one["confidence"]) / 10 + 0.1
+        one["low"] = min(float(np.floor(10 * one["confidence"])) / 10, 0.9)
+        one["high"] = one["low"] + 0.1
     return {
         "kind": "calibration",
         "title": title,
@@ -90,6 +91,7 @@ def learning_curve(
         "mean": curve.mean.tolist(),
         "low": low.tolist(),
         "high": high.tolist(),
+        "band": f"lowest and highest of {repeats} draws",
         "ceiling": ceiling,
     }
 
@@ -105,6 +107,14 @@ def accuracy_of(
     some = [np.asarray(values, dtype=str)[kept].tolist() for values in (labels, predicted, subjects)]
     classes = sorted(set(some[0]))
     return evaluate.macro_accuracy(some[0], some[1], classes), evaluate.subject_bootstrap(*some)
+
+
+def fixed(folds: Sequence[evaluate.Fold], classifier: str) -> evaluate.Predictions | None:
+    """Return the predictions of one classifier, or None where it asks for more samples than there are."""
+    try:
+        return evaluate.fixed_predictions(folds, classifier)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def words(share: float) -> str:

@@ -54,7 +54,7 @@ _STRANGERS_LEAST = 0.85
 _RANK_1_LEAST = 0.95
 _LINE_R2_LEAST = 0.98
 _P_MOST = 0.01
-_CURVE = (5, 10, 20, 40, 75)
+_CURVE = (2, 5, 10, 20, 40, 75)
 NOT_REAL = (
     "All faces here are simulated, so these figures cannot be compared with those published for real scans, such as "
     "the 81 to 92 % on BU-3DFE, which themselves depend on the protocol."
@@ -451,7 +451,11 @@ class _Maker:
             word = "known" if relative else "unknown"
             rows.append(self._row(f"chosen by nested cross-validation ({chosen})", nested.predicted, word))
             for name in CLASSIFIERS:
-                rows.append(self._row(name, evaluate.fixed_predictions(folds, name).predicted, word))
+                fixed = parts.fixed(folds, name)
+                if fixed is None:
+                    rows.append((f"{name} (too few samples)", word, None, None, None, None))
+                else:
+                    rows.append(self._row(name, fixed.predicted, word))
         for relative, key in ((False, ""), (True, ", known")):
             found = by_neutral[relative].predicted
             best[f"all{key}"] = parts.accuracy_of(self.labels, found, self.subjects)[0]
@@ -500,8 +504,7 @@ class _Maker:
         training = study.training(0).expressive
         a, e = model.split(training.z)
         t = np.concatenate([np.zeros_like(a), e], axis=1)
-        moved = model.shape.vertex_basis @ (model.shape.stddev[:, None] * model.rotation.T)
-        basis: FloatArray = np.asarray(moved, dtype=np.float64).reshape(-1, 3, model.shape.n_modes)
+        basis = _basis_of_codes(model)
         decision = evaluate.decision_map(basis, np.ones(t.shape[1]), t, training.expression.tolist())
         regions = _regions(study)
         faces: IntArray = model.shape.faces if model.shape.faces is not None else np.zeros((0, 3), dtype=np.int32)
@@ -792,6 +795,13 @@ def _spread_mm(model: AdditiveModel, codes: FloatArray, *, identity: bool) -> fl
         [model.shape.reconstruct(model.join(code, none) if identity else model.join(none, code)) for code in codes]
     )
     return float(np.sqrt(surfaces.var(axis=0).sum(axis=1)).mean())
+
+
+def _basis_of_codes(model: AdditiveModel) -> FloatArray:
+    """Return (V, 3, K) what one standard deviation of each of [a; e] does to each vertex, mm."""
+    to_b: FloatArray = model.shape.stddev[:, None] * model.rotation.T
+    flat: FloatArray = model.shape.vertex_basis @ to_b
+    return flat.reshape(model.shape.n_vertices, 3, model.shape.n_modes)
 
 
 def _regions(study: Study) -> dict[str, IntArray]:
