@@ -12,6 +12,7 @@ from shapespace.recognise.classifiers import (
     CalibratedSVC,
     NearestMeanDirection,
     ShrinkageLDA,
+    ShrinkageQDA,
 )
 
 # A scikit-learn Pipeline fits the very steps it was given; scikit-learn expects these two of its own pipelines to fail.
@@ -26,7 +27,13 @@ def expected(estimator: BaseEstimator) -> dict[str, str]:
 
 
 @parametrize_with_checks(
-    [NearestMeanDirection(), ShrinkageLDA(), CalibratedSVC(), *(make(0) for make in CLASSIFIERS.values())],
+    [
+        NearestMeanDirection(),
+        ShrinkageLDA(),
+        ShrinkageQDA(),
+        CalibratedSVC(),
+        *(make(0) for make in CLASSIFIERS.values()),
+    ],
     expected_failed_checks=expected,
 )
 def test_scikit_learn_finds_nothing_wrong(estimator, check):
@@ -77,6 +84,29 @@ def test_our_lda_is_that_of_scikit_learn(shrinkage):
     np.testing.assert_allclose(ours.predict_proba(new), theirs.predict_proba(new), atol=1e-9)
 
 
+def test_our_qda_is_that_of_the_normal_densities_and_with_full_shrinkage_the_lda():
+    from scipy.stats import multivariate_normal
+
+    z, labels = three_directions(n=90, spread=2.0)
+    new, _ = three_directions(seed=2, spread=2.0)
+    density = []
+    for name in np.unique(labels):
+        mine = z[labels == name]
+        density.append(multivariate_normal(mine.mean(axis=0), np.cov(mine.T, bias=True)).pdf(new))
+    expected = np.stack(density, axis=1)
+    expected /= expected.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(ShrinkageQDA(0.0).fit(z, labels).predict_proba(new), expected, atol=1e-9)
+    linear = ShrinkageLDA().fit(z, labels).predict_proba(new)
+    np.testing.assert_allclose(ShrinkageQDA(1.0).fit(z, labels).predict_proba(new), linear, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", CLASSIFIERS)
+def test_classes_with_fewer_samples_than_modes_can_be_told_apart(name):
+    z, labels = three_directions(n=9, k=20)
+    new, truth = three_directions(n=60, k=20, seed=1)
+    assert (CLASSIFIERS[name](0).fit(z, labels).predict(new) == truth).mean() > 0.6
+
+
 def test_the_nearest_mean_direction_is_that_of_its_definition():
     z, labels = three_directions(spread=2.0)
     new, _ = three_directions(seed=3, spread=2.0)
@@ -108,7 +138,9 @@ def test_the_temperature_rises_where_directions_say_less():
     assert NearestMeanDirection(0.25).fit(*three_directions()).temperature_ == 0.25
 
 
-@pytest.mark.parametrize("wrong", [NearestMeanDirection(0.0), CalibratedSVC(temperature=-1.0), ShrinkageLDA(1.5)])
+@pytest.mark.parametrize(
+    "wrong", [NearestMeanDirection(0.0), CalibratedSVC(temperature=-1.0), ShrinkageLDA(1.5), ShrinkageQDA(-0.1)]
+)
 def test_settings_without_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="must"):
         wrong.fit(*three_directions())

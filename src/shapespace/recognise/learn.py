@@ -9,7 +9,6 @@ from shapespace.errors import ShapespaceError
 try:
     import skops.io as skops_io
     from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
-    from sklearn.discriminant_analysis import QuadraticDiscriminantAnalysis
     from sklearn.linear_model import LogisticRegression
     from sklearn.model_selection import StratifiedKFold
     from sklearn.neighbors import KNeighborsClassifier
@@ -37,7 +36,6 @@ __all__ = [
     "KNeighborsClassifier",
     "LogisticRegression",
     "Pipeline",
-    "QuadraticDiscriminantAnalysis",
     "StandardScaler",
     "StratifiedKFold",
     "TransformerMixin",

@@ -39,7 +39,7 @@ TRUSTED = frozenset(
         "shapespace.recognise.classifiers.CalibratedSVC",
         "shapespace.recognise.classifiers.NearestMeanDirection",
         "shapespace.recognise.classifiers.ShrinkageLDA",
-        "sklearn.discriminant_analysis.QuadraticDiscriminantAnalysis",
+        "shapespace.recognise.classifiers.ShrinkageQDA",
         "sklearn.linear_model._logistic.LogisticRegression",
         "sklearn.neighbors._classification.KNeighborsClassifier",
         "sklearn.pipeline.Pipeline",
