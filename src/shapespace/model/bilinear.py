@@ -13,7 +13,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class BilinearModel:
         return self.mean + np.einsum("i,j,ijk->k", identity, expression, self.core)
 
     def encode(
-        self, z: FloatArray, z_stddev: FloatArray | None = None, *, iterations: int = 20
+        self, z: FloatArray, z_stddev: FloatArray | None = None, *, iterations: int = 8
     ) -> tuple[FloatArray, FloatArray]:
         """Return identity (n, I) and expression (n, J) of coefficients z (n, K), by alternating ridge least squares.
 

@@ -20,6 +20,8 @@ from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 PAPER_VARIANCE = 0.985
+_BILINEAR_IDENTITIES = 30
+"""More cost time and change nothing."""
 TextArray = npt.NDArray[np.str_]
 
 
@@ -115,7 +117,8 @@ def bilinear(model: AdditiveModel, training: Rows) -> Features:
         order = np.argsort(mine.shown)
         if len(order) == len(columns):
             table.append(mine.z[order])
-    identity_rank, expression_rank = min(len(table), model.n_identity), min(len(columns), model.n_expression)
+    identity_rank = min(len(table), model.n_identity, _BILINEAR_IDENTITIES)
+    expression_rank = min(len(columns), model.n_expression)
     fitted = BilinearModel.fit(np.stack(table), identity_rank, expression_rank)
     return lambda faces: fitted.encode(faces.z, faces.z_stddev)[1]
 

@@ -40,6 +40,10 @@ def confusion(
 ) -> Part:
     """Return a confusion matrix."""
     counts = evaluate.confusion(labels, predicted, classes)
+    unanswered = int(counts[:, len(classes) :].sum())
+    counts = counts[:, : len(classes)]
+    if unanswered:
+        note = f"{note} {unanswered} without an answer are not shown.".strip()
     return {"kind": "confusion", "title": title, "classes": list(classes), "counts": counts.tolist(), "note": note}
 
 

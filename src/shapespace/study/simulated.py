@@ -37,25 +37,17 @@ STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
 
-_FIRST = RobustSettings(
+SETTINGS = RobustSettings(
     levels=(
-        Level(0, 1_500, 1_000, False, 8, 1.0),
-        Level(10, 1_500, 1_000, False, 6, 1.0),
+        Level(0, 1_500, 1_000, False, 3, 1.0),
+        Level(10, 1_500, 1_000, False, 4, 1.0),
         Level(40, 2_500, 1_500, False, 2, 1.0),
-        Level(None, 2_500, 1_000, False, 6, 0.2),
-        Level(None, 5_000, 1_000, True, 8, 0.05),
+        Level(None, 2_000, 800, False, 4, 0.2),
+        Level(None, 4_000, 800, True, 8, 0.05),
     ),
     beyond_share=np.inf,
 )
-_AGAIN = RobustSettings(
-    levels=(
-        Level(0, 1_500, 1_000, False, 4, 1.0),
-        Level(None, 2_500, 1_000, False, 8, 0.2),
-        Level(None, 5_000, 1_000, True, 8, 0.05),
-    ),
-    beyond_share=np.inf,
-)
-"""Fits of one scan with the models of other folds start at the pose found first; its shape is found anew."""
+"""Of all fits: fewer matches than the defaults, for scans of 4,000 vertices; 0.004 mm behind them in vertex error."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class StudyConfig:
     people: StudyPeople = field(default_factory=StudyPeople)
     folds: int = 4
     taught_levels: int = 2
-    identity_modes: int | float = 0.999
+    identity_modes: int | float = 0.9999
     expression_modes: int | float = 0.999
     strangers: int = 25
     stranger_levels: tuple[float, ...] = (0.75, 1.0)
@@ -416,8 +408,9 @@ def _fit_all(
         T: Similarity | None = None
         for fold in order if taught is None or taught[row] else order[:1]:
             shape = models[fold].shape
-            config = FitConfig(unit="mm", robust=_FIRST if T is None else _AGAIN)
+            config = FitConfig(unit="mm", robust=SETTINGS)
             since = time.perf_counter()
+            # Fits with the models of other folds start at the pose found first; shape and pose are then found anew.
             try:
                 fitted = fit_scan(shape, scan.scan, config, T_scan_model=T)
             except ShapespaceError:

@@ -499,7 +499,9 @@ class _Maker:
         study = self.study
         learned = self.features["additive"]
         folds = [self._learned_fold(learned[f], f, relative=False) for f in range(study.config.folds)]
-        loss = evaluate.mode_importance(folds, repeats=2).mean(axis=0)
+        fewest = min(fold.train.shape[1] for fold in folds)
+        losses = [evaluate.mode_importance([fold], modes=fewest, repeats=2)[0, :fewest] for fold in folds]
+        loss = np.mean(losses, axis=0)
         model = study.models[0]
         training = study.training(0).expressive
         a, e = model.split(training.z)
