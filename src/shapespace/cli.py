@@ -148,6 +148,11 @@ def _add_build(commands: Any) -> None:
                      help="what the modes move: vertices (default), or control points of a B-spline surface, without "
                           "or with the detail of the mean that it cannot hold")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
+    sub.add_argument("--additive", type=Path, metavar="LABELS.csv",
+                     help="part identity and expression: CSV of file, subject and label, one of them neutral; --modes or "
+                          "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip
+    sub.add_argument("--expression-variance", type=_share, metavar="SHARE",
+                     help="with --additive: modes of expression that hold this share (default 0.99)")  # fmt: skip
     sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
     sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
@@ -263,7 +268,7 @@ def _add_recognise_predict(commands: Any) -> None:
 def _add_recognise_transfer(commands: Any) -> None:
     sub = _add(commands, "transfer", "put one person's expression on another, from fits by an additive model",
                "shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply")  # fmt: skip
-    sub.add_argument("model", type=Path, metavar="MODEL.h5", help="made by build --additive")
+    sub.add_argument("model", type=Path, metavar="MODEL.h5", help="made by build --additive LABELS.csv")
     sub.add_argument("person", type=Path, metavar="PERSON.fit.json", help="fit of who is to be shown")
     sub.add_argument("expression", type=Path, metavar="EXPRESSION.fit.json", help="fit of what they shall do")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.ply")
@@ -414,6 +419,8 @@ def _build(arguments: argparse.Namespace) -> int:
         landmarks=arguments.landmarks,
         representation=arguments.representation,
         control_points=arguments.control_points,
+        labels=arguments.additive,
+        expression_variance=arguments.expression_variance,
         provenance=arguments.provenance,
         licence=arguments.licence,
         seed=arguments.seed,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from tqdm import tqdm
@@ -31,10 +31,15 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, read_coefficients
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
+if TYPE_CHECKING:
+    from shapespace.model.additive import AdditiveModel
+
 ABOUT = "about.json"
 """Beside simulated faces: their provenance and licence, for the models made of them."""
 
 _RECORD = ".fit.json"
+_NEUTRAL = "neutral"
+_IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 
 
 def progress_bar(total: int | None, what: str, unit: str, *, quiet: bool) -> tqdm[Any]:
@@ -107,8 +112,12 @@ def build(
     quiet: bool,
     representation: str = "vertices",
     control_points: tuple[int, int] | None = None,
+    labels: Path | None = None,
+    expression_variance: float | None = None,
 ) -> tuple[ShapeModel, list[str]]:
     """Build a model from mesh files and save it; return it and what the user should know.
+
+    With `labels`, a table of subjects and expressions, it is one that parts identity and expression.
 
     Raises:
         FileError: a mesh cannot be read, or the model not written.
@@ -147,6 +156,20 @@ def build(
     if modes == "auto" and len(files) < 4:
         modes = None
         notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+    said = provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    if labels is not None:
+        if representation != "vertices":
+            raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
+        if not align:
+            raise InputError("A model that parts identity and expression aligns its faces itself; leave --no-align out.")
+        additive = _additive(files, loaded, labels, modes, gauge, marks, expression_variance, said, licence)
+        additive.save(output)
+        notes.append(
+            f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by {labels}."
+        )
+        return additive.shape, notes
+    if expression_variance is not None:
+        raise InputError("--expression-variance belongs to --additive LABELS.csv; give both, or neither.")
     model = ShapeModel.fit(
         loaded,
         modes=modes,
@@ -155,12 +178,45 @@ def build(
         landmarks=marks,
         representation=representation,
         control_points=control_points,
-        provenance=provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}",
+        provenance=said,
         licence=licence,
         seed=seed,
     )
     model.save(output)
     return model, notes
+
+
+def _additive(
+    files: Sequence[Path],
+    meshes: Sequence[Mesh],
+    labels: Path,
+    modes: int | float | Literal["auto"] | None,
+    gauge: Gauge,
+    landmarks: Mapping[str, int],
+    expression_variance: float | None,
+    provenance: str,
+    licence: str,
+) -> AdditiveModel:
+    from shapespace.model.additive import AdditiveModel
+
+    known = read_labels(labels)
+    lacking = [file.name for file in files if file.stem not in known or not known[file.stem].subject]
+    if lacking:
+        raise InputError(
+            f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
+        )
+    own = [known[file.stem] for file in files]
+    return AdditiveModel.fit(
+        meshes,
+        [label.subject for label in own],
+        [label.text == _NEUTRAL for label in own],
+        identity_modes=_IDENTITY_VARIANCE if modes == "auto" else modes,
+        expression_modes=_EXPRESSION_VARIANCE if expression_variance is None else expression_variance,
+        gauge=gauge,
+        landmarks=landmarks,
+        provenance=provenance,
+        licence=licence,
+    )
 
 
 def _about(path: Path) -> tuple[str, str] | None:

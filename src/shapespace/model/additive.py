@@ -29,6 +29,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 _STILL_ROUNDS = 3
 _STILL_SHAPES = 60
 _NO_VARIANCE = 1e-10
+_NO_MOTION_MM = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +248,7 @@ class AdditiveModel:
         arrays, attributes = read_hdf5(Path(path))
         if "split_rotation" not in arrays or "split_identity" not in attributes:
             raise ModelFileError(
-                f"{path} does not part identity and expression; build it with --additive and a table of labels."
+                f"{path} does not part identity and expression; build it with --additive LABELS.csv."
             )
         try:
             return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
@@ -293,7 +294,7 @@ def _modes_through_zero(data: FloatArray, wanted: int | float | None) -> tuple[F
     values, vectors = eigh(gram)
     values, vectors = values[::-1], vectors[:, ::-1]
     total = float(values.sum())
-    if total <= 0:
+    if total <= data.shape[1] * _NO_MOTION_MM**2:
         raise InputError("No expression differs from its neutral face, so there is nothing to model.")
     kept = int((values > _NO_VARIANCE * values[0]).sum())
     if isinstance(wanted, float):

@@ -1,0 +1,166 @@
+"""Identity and expression apart: an ordinary model in other words, that says who and what."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapespace.errors import InputError, ModelFileError
+from shapespace.model.additive import AdditiveModel, still_vertices
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import Mesh
+from synthetic_shapes import training_meshes
+
+SUBJECTS, EXPRESSIONS = 8, 3
+
+
+class World:
+    """Faces that really are mean + A a + B e; the lower half alone moves with an expression."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(5)
+        self.mean = training_meshes(vertices=300)[0]
+        v = self.mean.vertices
+        smooth = [np.cos(v @ rng.normal(0, 0.03, (3, 3)) + rng.uniform(0, 6, 3)) for _ in range(4 + EXPRESSIONS)]
+        low = np.clip((np.median(v[:, 1]) - v[:, 1]) / 20, 0, 1)[:, None]
+        self.A, self.B = 3.0 * np.stack(smooth[:4]), 4.0 * low * np.stack(smooth[4:])
+        self.a = rng.standard_normal((SUBJECTS, 4))
+
+    def face(self, a: np.ndarray, e: np.ndarray) -> Mesh:
+        return self.mean.with_vertices(
+            self.mean.vertices + np.tensordot(a, self.A, axes=1) + np.tensordot(e, self.B, axes=1)
+        )
+
+    def set(self) -> tuple[list[Mesh], list[str], list[bool]]:
+        shown = np.concatenate([np.zeros((1, EXPRESSIONS)), np.eye(EXPRESSIONS)])
+        rows = [(self.face(a, e), f"s{k}", not e.any()) for k, a in enumerate(self.a) for e in shown]
+        meshes, subjects, neutral = (list(part) for part in zip(*rows, strict=True))
+        return meshes, subjects, neutral
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World()
+
+
+@pytest.fixture(scope="module")
+def model(world: World) -> AdditiveModel:
+    above = np.flatnonzero((world.B == 0).all(axis=(0, 2))).astype(np.int32)
+    return AdditiveModel.fit(
+        *world.set(), identity_modes=4, expression_modes=EXPRESSIONS, gauge="form", alignment_vertices=above
+    )
+
+
+def z_of(model: AdditiveModel, mesh: Mesh) -> np.ndarray:
+    return model.shape.project(mesh) / model.shape.stddev
+
+
+def test_it_has_the_modes_of_identity_and_of_expression(model: AdditiveModel) -> None:
+    assert (model.n_identity, model.n_expression) == (4, EXPRESSIONS)
+    assert np.allclose(model.shape.basis.T @ model.shape.basis, np.eye(7), atol=1e-9)
+
+
+def test_splitting_and_joining_are_each_others_inverse(model: AdditiveModel) -> None:
+    z = np.random.default_rng(0).standard_normal(7)
+    assert np.allclose(model.join(*model.split(z)), z * model.shape.stddev)
+
+
+def test_its_covariance_is_that_of_identity_plus_that_of_expression(model: AdditiveModel) -> None:
+    one = np.eye(7)
+    parts = np.stack([model.shape.reconstruct(model.join(t[:4], t[4:])) - model.shape.mean_vertices for t in one])
+    W = parts.reshape(7, -1).T
+    assert np.allclose(W @ W.T, (model.shape.basis * model.shape.stddev**2) @ model.shape.basis.T, atol=1e-8)
+
+
+def test_a_person_keeps_identity_whatever_the_face_does(world: World, model: AdditiveModel) -> None:
+    rng = np.random.default_rng(1)
+    a = rng.standard_normal(4)
+    codes = [model.split(z_of(model, world.face(a, e))) for e in 0.8 * rng.standard_normal((4, EXPRESSIONS))]
+    rest_a, rest_e = model.split(z_of(model, world.face(a, np.zeros(EXPRESSIONS))))
+    assert np.abs(rest_e).max() < 0.1
+    assert max(np.abs(code - rest_a).max() for code, _ in codes) < 0.15
+
+
+def test_an_expression_is_put_on_somebody_else_to_half_a_millimetre(world: World, model: AdditiveModel) -> None:
+    rng = np.random.default_rng(2)
+    one, other = rng.standard_normal((2, 4))
+    e = np.array([0.7, 0.0, 0.2])
+    moved = model.transfer(z_of(model, world.face(one, np.zeros(3))), z_of(model, world.face(other, e)))
+    wanted = model.shape.reconstruct(model.shape.project(world.face(one, e)))
+    away = moved.vertices - wanted
+    assert np.linalg.norm(away, axis=1).mean() < 0.5
+    assert np.linalg.norm(model.shape.mean_vertices - wanted, axis=1).mean() > 2
+
+
+def test_scans_of_one_person_together_tell_identity_better_than_one(model: AdditiveModel) -> None:
+    rng = np.random.default_rng(3)
+    single, tied = [], []
+    for _ in range(40):
+        a, e = rng.standard_normal(4), rng.standard_normal((5, EXPRESSIONS))
+        truth = np.concatenate([np.tile(a, (5, 1)), e], axis=1) @ model.rotation
+        noise = np.full(truth.shape, 0.5)
+        told = 1.0 / noise**2
+        seen = (truth + noise * rng.standard_normal(truth.shape)) * told / (told + 1.0)
+        stddev = np.sqrt(1.0 / (told + 1.0))
+        found, shown = model.tie(seen, stddev)
+        assert shown.shape == (5, EXPRESSIONS)
+        single.append(np.abs(model.split(seen[0])[0] - a).mean())
+        tied.append(np.abs(found - a).mean())
+    assert np.mean(tied) < 0.65 * np.mean(single)
+
+
+def test_one_scan_tied_with_nothing_is_the_scan(model: AdditiveModel) -> None:
+    z, stddev = np.random.default_rng(4).standard_normal(7), np.full(7, 0.3)
+    a, e = model.tie(z[None], stddev[None])
+    assert np.allclose(np.concatenate([a, e[0]]), np.concatenate(model.split(z)), atol=1e-9)
+
+
+def test_its_file_reads_as_the_plain_model_too(model: AdditiveModel, tmp_path: Path) -> None:
+    model.save(tmp_path / "m.h5")
+    again = AdditiveModel.load(tmp_path / "m.h5")
+    assert again.n_identity == 4 and np.array_equal(again.rotation, model.rotation)
+    assert ShapeModel.load(tmp_path / "m.h5").content_hash == model.shape.content_hash
+
+
+def test_a_plain_model_is_not_taken_for_one(model: AdditiveModel, tmp_path: Path) -> None:
+    model.shape.save(tmp_path / "plain.h5")
+    with pytest.raises(ModelFileError, match="does not part identity and expression"):
+        AdditiveModel.load(tmp_path / "plain.h5")
+
+
+def test_still_vertices_are_those_that_expressions_leave_alone(world: World) -> None:
+    meshes, _, neutral = world.set()
+    rest = np.stack([m.vertices for m, plain in zip(meshes, neutral, strict=True) if plain])
+    shown = np.stack([m.vertices for m, plain in zip(meshes, neutral, strict=True) if not plain])
+    still = still_vertices(np.repeat(rest, EXPRESSIONS, axis=0), shown, 0.3)
+    moved = np.abs(world.B).sum(axis=(0, 2))
+    assert len(still) == round(0.3 * len(moved)) and moved[still].max() <= np.median(moved)
+
+
+def test_training_sets_that_cannot_be_parted_are_refused(world: World) -> None:
+    meshes, subjects, neutral = world.set()
+    with pytest.raises(InputError, match="There is no neutral face of s0"):
+        AdditiveModel.fit(meshes[1:], subjects[1:], neutral[1:])
+    with pytest.raises(InputError, match="at least two people"):
+        AdditiveModel.fit(meshes[:4], subjects[:4], neutral[:4])
+    with pytest.raises(InputError, match="one subject"):
+        AdditiveModel.fit(meshes, subjects[1:], neutral)
+    with pytest.raises(InputError, match="so 30 cannot be had"):
+        AdditiveModel.fit(meshes, subjects, neutral, expression_modes=30)
+    still = [m for m, plain in zip(meshes, neutral, strict=True) if plain]
+    with pytest.raises(InputError, match="No expression differs"):
+        AdditiveModel.fit(
+            [*still, *still],
+            [f"s{k}" for k in range(8)] * 2,
+            [True] * 8 + [False] * 8,
+            alignment_vertices=np.arange(300),
+        )
+
+
+def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> None:
+    with pytest.raises(InputError, match="Give 7 finite coefficients"):
+        model.split(np.zeros(6))
+    with pytest.raises(InputError, match="at most 4 finite coefficients of identity"):
+        model.join(np.zeros(5), ())
+    with pytest.raises(InputError, match="positive standard deviations"):
+        model.tie(np.zeros((2, 7)), np.zeros((2, 7)))
