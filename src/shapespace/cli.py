@@ -123,6 +123,8 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--seed", type=_natural, default=0, metavar="S")
     faces.add_argument("--source", choices=("bundled", "ict-facekit"), default="bundled")
     faces.add_argument("--area", choices=("face", "face_and_head"), default="face", help="of ict-facekit")
+    faces.add_argument("--raw", action="store_true",
+                       help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
     faces.set_defaults(run=_data_faces)
 
 
@@ -149,7 +151,7 @@ def _add_build(commands: Any) -> None:
                           "or with the detail of the mean that it cannot hold")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
     sub.add_argument("--additive", type=Path, metavar="LABELS.csv",
-                     help="part identity and expression: CSV of file, subject and label, one of them neutral; --modes or "
+                     help="part identity and expression: CSV of file, subject and label (one is neutral); --modes or "
                           "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip
     sub.add_argument("--expression-variance", type=_share, metavar="SHARE",
                      help="with --additive: modes of expression that hold this share (default 0.99)")  # fmt: skip
@@ -362,6 +364,7 @@ def _data_faces(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         area=arguments.area,
         quiet=arguments.quiet,
+        raw=arguments.raw,
     )
     if arguments.json:
         _print_json({"folder": str(arguments.output), "faces": count})

@@ -161,7 +161,9 @@ def build(
         if representation != "vertices":
             raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
         if not align:
-            raise InputError("A model that parts identity and expression aligns its faces itself; leave --no-align out.")
+            raise InputError(
+                "A model that parts identity and expression aligns its faces itself; leave --no-align out."
+            )
         additive = _additive(files, loaded, labels, modes, gauge, marks, expression_variance, said, licence)
         additive.save(output)
         notes.append(
@@ -364,9 +366,17 @@ def fit_scans(
 
 
 def write_simulated_faces(
-    folder: Path, *, source: str, subjects: int, expressions: Sequence[str], seed: int, area: str, quiet: bool
+    folder: Path,
+    *,
+    source: str,
+    subjects: int,
+    expressions: Sequence[str],
+    seed: int,
+    area: str,
+    quiet: bool,
+    raw: bool = False,
 ) -> int:
-    """Write corresponded faces of the bundled or of the ICT generator, and return how many.
+    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
 
     Raises:
         InputError: an unknown expression or area.
@@ -385,10 +395,12 @@ def write_simulated_faces(
             if area not in ("face", "face_and_head"):
                 raise InputError(f"The area must be face or face_and_head, not {area!r}.")
             ict.write_people(
-                folder, subjects=subjects, seed=seed, area=area, expressions=expressions, progress=progress
+                folder, subjects=subjects, seed=seed, area=area, expressions=expressions, raw=raw, progress=progress
             )
         else:
-            bundled.write_faces(folder, subjects=subjects, expressions=expressions, seed=seed, progress=progress)
+            bundled.write_faces(
+                folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, progress=progress
+            )
     licence, of = ("MIT", f"ICT-FaceKit, area {area}") if source == "ict-facekit" else (bundled.LICENSE, "shapespace")
     about = {
         "provenance": f"{subjects} simulated people of {of}, seed {seed}, expressions: {', '.join(expressions)}",

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.datasets.loop import loop_operator
+from shapespace.datasets.simulated_scan import plain_scan
 from shapespace.errors import DataError, InputError
 from shapespace.io.files import make_folder
 from shapespace.io.landmarks import write_landmark_indices
@@ -356,6 +357,7 @@ def write_faces(
     subjects: int,
     expressions: Sequence[str] = ("neutral",),
     seed: int = 0,
+    raw: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
@@ -367,6 +369,7 @@ def write_faces(
         subjects: how many people, 1 to 100,000.
         expressions: names out of `EXPRESSIONS`, each drawn once per person at full intensity.
         seed: a number of 0 or more.
+        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
         progress: called with (files written, files in all).
 
     Returns:
@@ -394,10 +397,13 @@ def write_faces(
         for name in expressions:
             expression = faces.draw_expression(name, 1.0, np.random.default_rng([seed, k, 1 + known.index(name)]))
             file = f"{person.name}_{name}.ply"
-            write_mesh(folder / file, faces.face(person, expression))
+            face = faces.face(person, expression)
+            rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
+            write_mesh(folder / file, plain_scan(face, rng) if raw else face)
             labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))
     write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
-    write_landmark_indices(folder / "landmarks.csv", faces.landmarks)
+    if not raw:
+        write_landmark_indices(folder / "landmarks.csv", faces.landmarks)
     return folder

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.datasets import fetch, ict_files
+from shapespace.datasets.simulated_scan import plain_scan
 from shapespace.errors import DataError, InputError
 from shapespace.io.files import make_folder
 from shapespace.io.landmarks import write_landmark_indices
@@ -226,6 +227,7 @@ def write_people(
     seed: int,
     area: Area = "face",
     expressions: Sequence[str] = ("neutral",),
+    raw: bool = False,
     faces: IctFaces | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
@@ -240,6 +242,7 @@ def write_people(
         seed: of their coefficients; the first people are the same whatever `subjects` is.
         area: `face` or `face_and_head`.
         expressions: names of `EXPRESSIONS` or of the published expressions, at full intensity.
+        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
         faces: the model; None loads it.
         progress: called with (done, total) after each file.
 
@@ -260,11 +263,14 @@ def write_people(
     for person, coefficients in enumerate(model.draw_people(subjects, seed)):
         for name, mixture in mixtures.items():
             path = folder / f"person_{person:03d}_{name}.ply"
-            write_mesh(path, model.mesh(coefficients, mixture, area, path.stem))
+            face = model.mesh(coefficients, mixture, area, path.stem)
+            rng = np.random.default_rng([seed, person, list(mixtures).index(name)])
+            write_mesh(path, plain_scan(face, rng) if raw else face)
             paths.append(path)
             rows.append((path.name, f"person_{person:03d}", name, 0.0 if name == "neutral" else 1.0))
             if progress is not None:
                 progress(len(paths), subjects * len(mixtures))
     write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), rows)
-    write_landmark_indices(folder / "landmarks.csv", landmark_vertices(area))
+    if not raw:
+        write_landmark_indices(folder / "landmarks.csv", landmark_vertices(area))
     return paths

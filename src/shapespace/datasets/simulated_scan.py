@@ -211,6 +211,19 @@ def simulate_scan(
     )
 
 
+def plain_scan(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """Return `mesh` as a scanner would give it: 20,000 other triangles, any pose, 0.2 mm of noise, two small holes."""
+    return simulate_scan(
+        mesh,
+        rng,
+        triangles=20_000,
+        T_scan_model=random_similarity(rng, max_angle_deg=180.0),
+        holes=(Hole(8.0), Hole(5.0)),
+        split=False,
+        name=mesh.name,
+    ).scan
+
+
 def retriangulate(
     mesh: Mesh, rng: np.random.Generator, triangles: int, *, split: bool = True
 ) -> tuple[FloatArray, LongArray]:

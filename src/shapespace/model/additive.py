@@ -247,9 +247,7 @@ class AdditiveModel:
         shape = ShapeModel.load(path)
         arrays, attributes = read_hdf5(Path(path))
         if "split_rotation" not in arrays or "split_identity" not in attributes:
-            raise ModelFileError(
-                f"{path} does not part identity and expression; build it with --additive LABELS.csv."
-            )
+            raise ModelFileError(f"{path} does not part identity and expression; build it with --additive LABELS.csv.")
         try:
             return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
         except (InputError, ValueError, TypeError) as error:
