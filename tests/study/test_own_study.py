@@ -115,9 +115,8 @@ def test_a_table_without_subjects_cannot_part_them(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_rows(tmp_path / "l.csv", ("file", "label"), [("subject_000_neutral.ply", "neutral")])
-    code = command(
-        "build", str(world / "training"), "-o", str(tmp_path / "m.h5"), "--additive", str(tmp_path / "l.csv")
-    )
-    assert code == 2 and "each mesh needs a label and a subject" in capsys.readouterr().err
-    code = command("build", str(world / "training"), "-o", str(tmp_path / "m.h5"), "--expression-variance", "0.9")
-    assert code == 2 and "belongs to --additive" in capsys.readouterr().err
+    built = ("build", str(world / "training"), "-o", str(tmp_path / "m.h5"))
+    assert command(*built, "--additive", str(tmp_path / "l.csv")) == 2
+    assert "each mesh needs a label and a subject" in capsys.readouterr().err
+    assert command(*built, "--expression-variance", "0.9") == 2
+    assert "belongs to --additive" in capsys.readouterr().err

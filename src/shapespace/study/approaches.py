@@ -123,6 +123,23 @@ def bilinear(model: AdditiveModel, training: Rows) -> Features:
     return lambda faces: fitted.encode(faces.z, faces.z_stddev)[1]
 
 
+def beside_neutral(model: AdditiveModel, faces: Rows, z_neutral: FloatArray) -> FloatArray:
+    """Return expressions (n, Ke) where the same person's neutral scan is known: identity stays, e alone is solved for.
+
+    Args:
+        model: of the fits.
+        faces: the fits.
+        z_neutral: (n, K) fits of the neutral scans of the same people; NaN gives NaN.
+    """
+    Re = model.rotation[model.n_identity :]
+    out = np.full((len(faces.z), len(Re)), np.nan)
+    for row in np.flatnonzero(faces.usable & np.isfinite(z_neutral).all(axis=1)):
+        told = 1.0 / np.minimum(faces.z_stddev[row], 0.999) ** 2 - 1.0
+        moved = (Re * told) @ (faces.z[row] - z_neutral[row])
+        out[row] = np.linalg.solve((Re * told) @ Re.T + np.eye(len(Re)), moved)
+    return out
+
+
 APPROACHES: Mapping[str, Approach] = {
     "one PCA (the paper)": one_pca,
     "additive": additive,
