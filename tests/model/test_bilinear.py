@@ -45,4 +45,4 @@ def test_tables_and_ranks_that_cannot_be_are_refused() -> None:
     with pytest.raises(InputError, match="every expression of every person"):
         BilinearModel.fit(table, 3, 4)
     with pytest.raises(InputError, match=r"Give \(n, 12\)"):
-        BilinearModel.fit(made()[0], 3, 4).encode(np.zeros((2, 11)))
+        BilinearModel.fit(made()[0], 3, 4).encode(np.zeros((2, 11)), np.ones((2, 11)))

@@ -1,4 +1,4 @@
-"""The bilinear model: each coefficient vector is a core tensor times an identity times an expression vector.
+"""The bilinear model: each coefficient vector b is a core tensor times an identity times an expression vector.
 
 Source: Tenenbaum and Freeman, Neural Computation 12(6), 2000; Vlasic et al., SIGGRAPH 2005, for faces. The comparator
 of the additive model: it knows that one person's smile differs from another's, and needs every expression of everyone.
@@ -14,30 +14,34 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
 _TOLERANCE = 1e-4
+_LEAST_VARIANCE_MM2 = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class BilinearModel:
-    """z is close to mean + sum over i, j of identity_i expression_j core_ij.
+    """b is close to mean + sum over i, j of identity_i expression_j core_ij.
 
     Args:
-        mean: (K,) of all training coefficients, in standard deviations.
-        core: (I, J, K).
+        mean: (K,) of all training coefficients, mm.
+        core: (I, J, K) mm.
         identities: (S, I) of the training people.
         expressions: (X, J) of the training expressions.
+        left: (K,) variance that the ranks leave, mm^2.
     """
 
     mean: FloatArray
     core: FloatArray
     identities: FloatArray
     expressions: FloatArray
+    left: FloatArray
 
     @classmethod
     def fit(cls, table: FloatArray, identity_rank: int, expression_rank: int) -> BilinearModel:
         """Fit by the higher-order singular value decomposition (De Lathauwer et al., SIAM J. Matrix Anal. 21(4), 2000).
 
         Args:
-            table: (S, X, K) coefficients of S people in the same X expressions, in standard deviations.
+            table: (S, X, K) coefficients b of S people in the same X expressions, mm; modes of equal variance, as z
+                has, could not be cut to a rank.
             identity_rank: at most S.
             expression_rank: at most X.
 
@@ -54,34 +58,33 @@ class BilinearModel:
         people = np.linalg.svd(centred.reshape(S, -1), full_matrices=False)[0][:, :identity_rank]
         shown = np.linalg.svd(centred.transpose(1, 0, 2).reshape(X, -1), full_matrices=False)[0][:, :expression_rank]
         core = np.einsum("sxk,si,xj->ijk", centred, people, shown, optimize=True)
-        return cls(mean, core, people, shown)
+        left = centred - np.einsum("si,xj,ijk->sxk", people, shown, core, optimize=True)
+        return cls(mean, core, people, shown, left.var(axis=(0, 1)))
 
     def decode(self, identity: FloatArray, expression: FloatArray) -> FloatArray:
-        """Return z (K,) of an identity (I,) with an expression (J,)."""
+        """Return b (K,), mm, of an identity (I,) with an expression (J,)."""
         return self.mean + np.einsum("i,j,ijk->k", identity, expression, self.core)
 
-    def encode(
-        self, z: FloatArray, z_stddev: FloatArray | None = None, *, iterations: int = 8
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return identity (n, I) and expression (n, J) of coefficients z (n, K), by alternating ridge least squares.
+    def encode(self, b: FloatArray, b_stddev: FloatArray, *, iterations: int = 8) -> tuple[FloatArray, FloatArray]:
+        """Return identity (n, I) and expression (n, J) of coefficients b (n, K), by alternating ridge least squares.
 
         Args:
-            z: in standard deviations.
-            z_stddev: (n, K) how well each is known; None for equally well.
+            b: mm.
+            b_stddev: (n, K) how well each is known, mm.
             iterations: at most.
 
         Raises:
             InputError: coefficients of another number, or not finite.
         """
         K = len(self.mean)
-        if z.ndim != 2 or z.shape[1] != K or not np.isfinite(z).all():
-            raise InputError(f"Give (n, {K}) finite coefficients, not {z.shape}.")
-        told = 1.0 / (np.full(z.shape, 0.3) if z_stddev is None else np.maximum(z_stddev, 0.05)) ** 2
+        if b.ndim != 2 or b.shape[1] != K or b_stddev.shape != b.shape or not np.isfinite(b).all():
+            raise InputError(f"Give (n, {K}) finite coefficients and standard deviations, not {b.shape}.")
+        told = 1.0 / (b_stddev**2 + self.left + _LEAST_VARIANCE_MM2)
         priors = [
             (part.mean(axis=0), 1.0 / part.var(axis=0).clip(1e-12)) for part in (self.identities, self.expressions)
         ]
-        identities, expressions = np.empty((len(z), self.core.shape[0])), np.empty((len(z), self.core.shape[1]))
-        for row, (value, weight) in enumerate(zip(z - self.mean, told, strict=True)):
+        identities, expressions = np.empty((len(b), self.core.shape[0])), np.empty((len(b), self.core.shape[1]))
+        for row, (value, weight) in enumerate(zip(b - self.mean, told, strict=True)):
             identity, expression = priors[0][0].copy(), priors[1][0].copy()
             for _ in range(iterations):
                 before = expression

@@ -21,7 +21,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 
 PAPER_VARIANCE = 0.985
 _BILINEAR_IDENTITIES = 30
-"""More cost time and change nothing."""
+"""Twice as many were worse: the product then explains what it should not."""
 TextArray = npt.NDArray[np.str_]
 
 
@@ -116,11 +116,12 @@ def bilinear(model: AdditiveModel, training: Rows) -> Features:
         mine = training.where(training.subject == name)
         order = np.argsort(mine.shown)
         if len(order) == len(columns):
-            table.append(mine.z[order])
+            table.append(mine.z[order] * model.shape.stddev)
     identity_rank = min(len(table), model.n_identity, _BILINEAR_IDENTITIES)
     expression_rank = min(len(columns), model.n_expression)
     fitted = BilinearModel.fit(np.stack(table), identity_rank, expression_rank)
-    return lambda faces: fitted.encode(faces.z, faces.z_stddev)[1]
+    stddev = model.shape.stddev
+    return lambda faces: fitted.encode(faces.z * stddev, faces.z_stddev * stddev)[1]
 
 
 def beside_neutral(model: AdditiveModel, faces: Rows, z_neutral: FloatArray) -> FloatArray:
