@@ -224,10 +224,10 @@ class _Maker:
             f"highest intensities and {words(ceiling['all'])} for all, since people make expressions in ways of their "
             "own: that is the ceiling.",
             f"The additive model reaches {words(chosen['high, known'])} and {words(chosen['all, known'])} beside the "
-            f"person's neutral scan, and {words(chosen['high'])} and {words(chosen['all'])} from one scan alone; one PCA "
-            f"with LDA reaches {words(compared['one PCA (the paper)'])} for all from one scan.",
-            f"A system trained on these faces tells {words(strangers)} of the paper's four expressions right on faces of "
-            "another generator, once adapted to them without labels.",
+            f"person's neutral scan, {words(chosen['high'])} and {words(chosen['all'])} from one scan alone; one PCA with "
+            f"LDA reaches {words(compared['one PCA (the paper)'])} for all from one scan.",
+            f"A system trained on these faces tells {words(strangers)} of the paper's four expressions right on faces "
+            "of another generator, once adapted to them without labels.",
             NOT_REAL,
         ]
         total = sum(seconds.values())
@@ -512,7 +512,7 @@ class _Maker:
         a, e = model.split(training.z)
         t: FloatArray = np.concatenate([np.zeros(a.shape), e], axis=1)
         basis = _basis_of_codes(model)
-        decision = evaluate.decision_map(basis, np.ones(t.shape[1]), t, training.expression.tolist())
+        decision = evaluate.decision_map(basis, np.ones(model.shape.n_modes), t, training.expression.tolist())
         regions = _regions(study)
         faces: IntArray = model.shape.faces if model.shape.faces is not None else np.zeros((0, 3), dtype=np.int32)
         memory = io.BytesIO()
