@@ -608,9 +608,12 @@ def recognise_study(
 
             chosen = StudyPeople() if people is None else StudyPeople(people=people)
             chosen = chosen if seed is None else replace(chosen, seed=seed)
-            config = StudyConfig(people=chosen)
-            config = config if folds is None else replace(config, folds=folds)
-            config = config if strangers is None else replace(config, strangers=strangers)
+            usual = StudyConfig()
+            config = StudyConfig(
+                people=chosen,
+                folds=usual.folds if folds is None else folds,
+                strangers=usual.strangers if strangers is None else strangers,
+            )
             report = run_study(output, config, workers=workers, quiet=quiet)
     content = json.loads(read_bytes(output / "recognition.json"))
     return report, content["targets"], holds

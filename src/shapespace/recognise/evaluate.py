@@ -287,13 +287,17 @@ def _nested(
     ]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
+    fewest = min(len(train) for train, _ in inner)
     for name in names:
         for parameters in _grid(name):
+            if int(parameters.get("classify__n_neighbors", 1)) > fewest:
+                continue  # so many neighbours there are not
             probabilities = left_out(X[:, :m], labels, inner, classes, name, parameters, seed)
             accuracy = macro_accuracy(labels, _answers(probabilities, classes), classes)
             if best is None or accuracy > best[0] + 1e-12:
                 best = accuracy, name, parameters, probabilities
-    assert best is not None
+    if best is None:
+        raise InputError("None of the classifiers can be had with so few training samples; add samples.")
     accuracy, name, parameters, probabilities = best
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
@@ -334,6 +338,9 @@ def predict_probabilities(
     Rows of `test` that are not finite give NaN; classes that the training samples lack have probability 0.
     """
     pipeline: Any = CLASSIFIERS[classifier](seed).set_params(**parameters)
+    neighbours = int(getattr(pipeline[-1], "n_neighbors", 1))
+    if neighbours > len(X):
+        raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
     pipeline.fit(X, labels)
     finite = np.isfinite(test).all(axis=1)
     answer = np.full((len(test), len(classes)), np.nan)

@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.errors import InputError
 from shapespace.recognise import evaluate
 from shapespace.types import FloatArray
 
@@ -117,7 +118,7 @@ def fixed(folds: Sequence[evaluate.Fold], classifier: str) -> evaluate.Predictio
     """Return the predictions of one classifier, or None where it asks for more samples than there are."""
     try:
         return evaluate.fixed_predictions(folds, classifier)
-    except np.linalg.LinAlgError:
+    except InputError:
         return None
 
 

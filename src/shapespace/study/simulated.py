@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
@@ -451,7 +452,7 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
         try:
             with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
                 part = {key: np.asarray(loaded[key]) for key in ("z", "z_stddev", "status", "error_mm", "seconds")}
-        except (ValueError, KeyError, EOFError, OSError) as error:
+        except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
             raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
         for key, rest in (("z", 0.0), ("z_stddev", 1.0)):
             whole = np.full((*part[key].shape[:2], n_modes), rest)
@@ -484,7 +485,7 @@ def read_paper(path: Path) -> tuple[FloatArray, FloatArray, IntArray]:
                 np.asarray(loaded["stddev"], dtype=np.float64),
                 np.asarray(loaded["status"], dtype=np.int32),
             )
-    except (ValueError, KeyError, EOFError, OSError) as error:
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
 
 

@@ -18,11 +18,13 @@ import numpy.typing as npt
 
 from shapespace import __version__
 from shapespace.datasets.ict import IctFaces, load_ict
+from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.recognise.hierarchy import FaceTypes
 from shapespace.recognise.line_structure import disjointness, line_scores, pooled_line_scores
 from shapespace.study import approaches, parts
 from shapespace.study.approaches import APPROACHES, Features, Rows
@@ -224,8 +226,8 @@ class _Maker:
             f"highest intensities and {words(ceiling['all'])} for all, since people make expressions in ways of their "
             "own: that is the ceiling.",
             f"The additive model reaches {words(chosen['high, known'])} and {words(chosen['all, known'])} beside the "
-            f"person's neutral scan, {words(chosen['high'])} and {words(chosen['all'])} from one scan alone; one PCA with "
-            f"LDA reaches {words(compared['one PCA (the paper)'])} for all from one scan.",
+            f"person's neutral scan, {words(chosen['high'])} and {words(chosen['all'])} from one scan alone; one PCA "
+            f"with LDA reaches {words(compared['one PCA (the paper)'])} for all from one scan.",
             f"A system trained on these faces tells {words(strangers)} of the paper's four expressions right on faces "
             "of another generator, once adapted to them without labels.",
             NOT_REAL,
@@ -271,7 +273,9 @@ class _Maker:
         weights = np.concatenate([config.people.unit_weights(study.ict, p) for p in range(config.people.people)])
         weights = weights[:, weights.std(axis=0) > 0]
         folds = [self._fold(weights, weights, fold, taught=False) for fold in range(config.folds)]
-        found = evaluate.nested_predictions(folds, classifiers=("lda", "logistic", "svm"), modes=(None,))
+        found = evaluate.nested_predictions(
+            folds, classifiers=("lda", "logistic", "svm"), modes=(None,), inner_folds=_inner(folds)
+        )
         self.true_weights = np.asarray(found.predicted)
         every, interval = parts.accuracy_of(self.labels, found.predicted, self.subjects)
         high, _ = parts.accuracy_of(self.labels, found.predicted, self.subjects, self.high)
@@ -407,33 +411,39 @@ class _Maker:
         rows: list[tuple[object, ...]] = []
         counts: list[int] = []
         for types in (None, 3):
-            found = [
-                approaches.face_types(study.models[f], study.training(f), types, study.config.people.seed)
-                for f in range(study.config.folds)
-            ]
-            if types is None:
-                counts = [one.count for one in found]
-            for soft in (False, True):
-                predicted = np.full(len(self.labels), "", dtype=self.labels.dtype)
-                for fold, one in enumerate(found):
-                    tested = study.tested(fold)
-                    faces = study.rows(fold, tested)
-                    usable = faces.usable
-                    classes, likely = approaches.by_type(
-                        study.models[fold], study.training(fold), faces.where(usable), one, soft=soft
-                    )
-                    at = self.index[np.flatnonzero(tested)[usable]]
-                    predicted[at] = np.asarray(classes)[likely.argmax(axis=1)]
-                how = "types by BIC" if types is None else f"{types} types"
-                rows.append(
-                    self._row(f"{'soft' if soft else 'hard'} hierarchy, {how}", tuple(predicted.tolist()), "unknown")
-                )
-        chosen = sorted(set(counts))
+            how = "types by BIC" if types is None else f"{types} types"
+            try:
+                found = [
+                    approaches.face_types(study.models[f], study.training(f), types, study.config.people.seed)
+                    for f in range(study.config.folds)
+                ]
+                answers = {soft: self._by_type(found, soft=soft) for soft in (False, True)}
+            except InputError as error:
+                rows += [
+                    (f"{word} hierarchy, {how}: {error}", "unknown", None, None, None, None)
+                    for word in ("hard", "soft")
+                ]
+                continue
+            counts += [one.count for one in found if types is None]
+            for soft, predicted in answers.items():
+                rows.append(self._row(f"{'soft' if soft else 'hard'} hierarchy, {how}", predicted, "unknown"))
+        asked = " or ".join(map(str, sorted(set(counts)))) or "an unknown number of"
         return rows, (
-            f"BIC asks for {' or '.join(map(str, chosen))} type{'s' if chosen[-1] > 1 else ''} of face: identities of "
-            "these people are one normal cloud, so that three types are forced on them for the comparison, and cost "
-            "training faces for each."
+            f"BIC asks for {asked} type(s) of face: identities of these people are drawn from one normal cloud. Three "
+            "types are forced on them for the comparison, and each has fewer training faces."
         )
+
+    def _by_type(self, types: Sequence[FaceTypes], *, soft: bool) -> tuple[str, ...]:
+        study = self.study
+        predicted = np.full(len(self.labels), "", dtype=self.labels.dtype)
+        for fold, one in enumerate(types):
+            tested = study.tested(fold)
+            faces = study.rows(fold, tested)
+            classes, likely = approaches.by_type(
+                study.models[fold], study.training(fold), faces.where(faces.usable), one, soft=soft
+            )
+            predicted[self.index[np.flatnonzero(tested)[faces.usable]]] = np.asarray(classes)[likely.argmax(axis=1)]
+        return tuple(predicted.tolist())
 
     # The default
 
@@ -447,7 +457,7 @@ class _Maker:
         for relative in (False, True):
             folds = [self._learned_fold(learned[f], f, relative=relative) for f in range(config.folds)]
             self.told("the classifier, by nested cross-validation")
-            nested = evaluate.nested_predictions(folds, modes=(10, None))
+            nested = evaluate.nested_predictions(folds, modes=(10, None), inner_folds=_inner(folds))
             by_neutral[relative] = nested
             chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
             word = "known" if relative else "unknown"
@@ -770,6 +780,11 @@ class _Maker:
             for f in range(self.study.config.folds)
         ]
         return parts.accuracy_of(self.labels, evaluate.fixed_predictions(folds, "lda").predicted, self.subjects)[0]
+
+
+def _inner(folds: Sequence[evaluate.Fold]) -> int:
+    """Return how many folds the training people are parted into: four, or fewer where there are fewer people."""
+    return min(4, *(len(set(fold.train_subjects)) for fold in folds))
 
 
 def _same_rows(folds: Sequence[evaluate.Fold]) -> list[evaluate.Fold]:
