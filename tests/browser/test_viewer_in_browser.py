@@ -25,10 +25,16 @@ VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 
 
+def hear_signals() -> None:
+    """Undo what nohup or a background shell hands down, so that the viewer is stopped as at a terminal."""
+    for one in (signal.SIGHUP, signal.SIGINT):
+        signal.signal(one, signal.SIG_DFL)
+
+
 def serve(*arguments: str) -> tuple[subprocess.Popen, str]:
     process = subprocess.Popen(
         [sys.executable, "-m", "shapespace", "view", *arguments, "--no-open", "--quiet"],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}, preexec_fn=hear_signals,
     )  # fmt: skip
     assert process.stdout is not None
     line = process.stdout.readline()
