@@ -164,3 +164,16 @@ def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> Non
         model.join(np.zeros(5), ())
     with pytest.raises(InputError, match="positive standard deviations"):
         model.tie(np.zeros((2, 7)), np.zeros((2, 7)))
+
+
+def test_kin_are_left_out_together_when_variances_are_found(world: World) -> None:
+    meshes, subjects, neutral = world.set()
+    twins = [f"{name}'s twin" for name in subjects]
+    kin = [*subjects, *subjects]
+    together, strangers = (
+        AdditiveModel.fit(meshes * 2, subjects + twins, neutral * 2, gauge="form", expression_modes=1, kin=given)
+        for given in (kin, None)
+    )
+    assert together.shape.total_variance > strangers.shape.total_variance  # twins hide how new a new person is
+    with pytest.raises(InputError, match="kin for each or none"):
+        AdditiveModel.fit(meshes, subjects, neutral, kin=kin)

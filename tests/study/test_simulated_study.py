@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,11 +23,13 @@ SMALL = StudyConfig(
 
 
 @pytest.fixture(scope="module")
-def done(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("study") / "s"
-    prepare_folder(folder, SMALL)
-    run_fits(folder, SMALL, workers=2)
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHAPESPACE_DATA", str(shared_data))
+        prepare_folder(folder, SMALL)
+        run_fits(folder, SMALL, workers=2)
+        yield folder
 
 
 def test_each_person_is_tested_in_one_fold_and_taught_in_the_others() -> None:

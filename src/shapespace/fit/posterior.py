@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -34,6 +35,9 @@ _ALL_KEPT = 1e-6
 _NOISE_TEMPERATURE = 1.7
 _PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
+
+_new_shapes: WeakKeyDictionary[ShapeModel, FloatArray] = WeakKeyDictionary()
+"""Of each model in use: it takes longer to find than the rest of the posterior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,9 @@ def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_mod
         beyond_model_mm: RMS of what the model left of the residuals.
     """
     model, x = fit.prepared.model, fit.surface.vertices
-    new_shapes = variance_of_new_shapes(model)
+    if model not in _new_shapes:
+        _new_shapes[model] = variance_of_new_shapes(model)
+    new_shapes = _new_shapes[model]
     prior = np.concatenate([new_shapes, fit.stddev[model.n_modes :] ** 2])
     w, v = fit.weigh()
     matches, data = float(w.sum()) + float(v.sum()), data_hessian(fit)

@@ -22,6 +22,7 @@ from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import read_hdf5, write_hdf5
 from shapespace.model import model_file
+from shapespace.model.held_out import held_out_variances
 from shapespace.model.pca import principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
@@ -72,11 +73,15 @@ class AdditiveModel:
         gauge: Gauge = "shape",
         alignment_vertices: IntArray | None = None,
         still_share: float = 0.3,
+        kin: Sequence[str] | None = None,
         landmarks: Mapping[str, int] | None = None,
         provenance: str = "",
         licence: str = "",
     ) -> AdditiveModel:
         """Build the model of corresponding `meshes`, in mm.
+
+        The directions of the modes are those of all meshes; their variances are those that people have who took no
+        part in the modes, so that a new face is not read as an expression for want of identity.
 
         Args:
             meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
@@ -88,6 +93,8 @@ class AdditiveModel:
             alignment_vertices: that carry the alignment, such as forehead and nose; None takes those that expressions
                 move least.
             still_share: how many those are, as a share of all.
+            kin: (N,) names of those that are left out together when variances are found, such as a face and its mirror
+                image; None takes `subjects`.
             landmarks: name -> vertex, kept in the model.
             provenance: what the meshes are, in words.
             licence: of the meshes.
@@ -97,8 +104,8 @@ class AdditiveModel:
             InputError: too few of them, or an expression without its person's neutral.
         """
         faces = common_faces(meshes)
-        if not len(meshes) == len(subjects) == len(neutral):
-            raise InputError("Give one subject and one word on neutral for each mesh.")
+        if not len(meshes) == len(subjects) == len(neutral) == len(kin or subjects):
+            raise InputError("Give one subject and one word on neutral for each mesh, and kin for each or none.")
         people = list(dict.fromkeys(s for s, plain in zip(subjects, neutral, strict=True) if plain))
         expressive = [i for i, plain in enumerate(neutral) if not plain]
         if len(people) < 2 or not expressive:
@@ -124,16 +131,25 @@ class AdditiveModel:
         for k, r in enumerate(row):
             T = fit_similarity(shapes[k][still], neutrals[r][still], with_scale=gauge == "shape")
             shapes[k] = T.apply(shapes[k]) - neutrals[r]
+        kin_of = dict(zip(subjects, kin or subjects, strict=True))
         identity = principal_components(neutrals.reshape(len(neutrals), -1), identity_modes)
-        B, expression_variance, left = _modes_through_zero(shapes.reshape(len(shapes), -1), expression_modes)
-        A, identity_variance = identity.basis, identity.variance
+        A, centred = identity.basis, (neutrals - neutrals.mean(axis=0)).reshape(len(neutrals), -1)
+        identity_variance, identity_left = held_out_variances(
+            centred @ centred.T, [kin_of[name] for name in people], identity.variance, centred=True
+        )
+        moved = shapes.reshape(len(shapes), -1)
+        gram = moved @ moved.T
+        B, sample = _modes_through_zero(moved, gram, expression_modes)
+        expression_variance, expression_left = held_out_variances(
+            gram, [kin_of[subjects[i]] for i in expressive], sample, centred=False
+        )
         shape, rotation = _as_shape_model(A * np.sqrt(identity_variance), B * np.sqrt(expression_variance))
         basis, stddev = shape
         model = ShapeModel(
             mean=identity.mean,
             basis=basis,
             stddev=stddev,
-            total_variance=identity.total_variance + float(expression_variance.sum()) + left,
+            total_variance=float(identity_variance.sum() + expression_variance.sum()) + identity_left + expression_left,
             n_training=len(meshes),
             faces=faces,
             gauge=gauge,
@@ -283,13 +299,14 @@ def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3)
     return still
 
 
-def _modes_through_zero(data: FloatArray, wanted: int | float | None) -> tuple[FloatArray, FloatArray, float]:
-    """Return modes (D, K) and second moments (K,) about zero of `data` (N, D), and what they leave.
+def _modes_through_zero(
+    data: FloatArray, gram: FloatArray, wanted: int | float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return modes (D, K) and second moments (K,) about zero of `data` (N, D), whose products are `gram` (N, N).
 
     About zero and not the mean: neutral is zero, and an expression runs along a line through it.
     """
-    gram = data @ data.T / len(data)
-    values, vectors = eigh(gram)
+    values, vectors = eigh(gram / len(data))
     values, vectors = values[::-1], vectors[:, ::-1]
     total = float(values.sum())
     if total <= data.shape[1] * _NO_MOTION_MM**2:
@@ -306,7 +323,7 @@ def _modes_through_zero(data: FloatArray, wanted: int | float | None) -> tuple[F
     values, vectors = values[:kept], vectors[:, :kept]
     modes = data.T @ (vectors / np.sqrt(values * len(data)))
     modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(kept)])
-    return modes, values, total - float(values.sum())
+    return modes, values
 
 
 def _as_shape_model(A: FloatArray, B: FloatArray) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:

@@ -33,6 +33,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
+MIRRORED = ", mirrored"
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 Progress: TypeAlias = Callable[[str, int, int], None]
@@ -72,7 +73,7 @@ class StudyConfig:
     people: StudyPeople = field(default_factory=StudyPeople)
     folds: int = 4
     taught_levels: int = 2
-    identity_modes: int | float = 0.9999
+    identity_modes: int | float = 0.99999
     expression_modes: int | float = 0.999
     strangers: int = 25
     stranger_levels: tuple[float, ...] = (0.75, 1.0)
@@ -278,7 +279,7 @@ def training_meshes(
         for face, (_, level) in zip(faces, config.people.shown, strict=True):
             if level in (0.0, strongest):
                 meshes += [face, face.with_vertices(mirrored(face.vertices, other))]
-                subjects += [config.people.subject(person), f"{config.people.subject(person)}, mirrored"]
+                subjects += [config.people.subject(person), config.people.subject(person) + MIRRORED]
                 neutral += 2 * [level == 0.0]
     return meshes, subjects, neutral
 
@@ -286,12 +287,14 @@ def training_meshes(
 def _make_model(folder: Path, config: StudyConfig, fold: int) -> None:
     training = np.flatnonzero(config.fold_of() != fold)
     meshes, subjects, neutral = training_meshes(config, _faces_of_ict(), training.tolist())
+    kin = [subject.removesuffix(MIRRORED) for subject in subjects]
     AdditiveModel.fit(
         meshes,
         subjects,
         neutral,
         identity_modes=config.identity_modes,
         expression_modes=config.expression_modes,
+        kin=kin,
         landmarks=landmark_vertices("face"),
         provenance=f"{len(training)} simulated people of ICT-FaceKit with {len(config.people.expressions)} expressions",
         licence="MIT",
