@@ -29,6 +29,7 @@ from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.distance import surface_distances
 from shapespace.geometry.surface import boundary_vertices, face_areas, face_vectors
 from shapespace.model.shape_model import ShapeModel
+from shapespace.study.shape_spaces import floor_mm as floor_of
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
 
 Split = Literal["test", "dev"]
@@ -36,8 +37,6 @@ TRAINING_SEED: Mapping[Split, int] = {"test": 0, "dev": 100}
 PEOPLE_SEED: Mapping[Split, int] = {"test": 1000, "dev": 2000}
 PEOPLE = 10
 FAILED_MM = 3.0
-_FLOOR_STEPS = 20
-_FLOOR_REACHED_MM = 1e-4
 TRIANGLES = 40_000
 COARSE_TRIANGLES = 4_000
 CLOUD_POINTS = 20_000
@@ -174,7 +173,7 @@ class Bench:
             return None
         key = (case.model, modes, hashlib.sha256(face.vertices.tobytes()).hexdigest())
         if key not in self._floors:
-            self._floors[key] = _floor_mm(self.model(case.model, modes), face.vertices)
+            self._floors[key] = floor_of(self.model(case.model, modes), face.vertices)
         return self._floors[key]
 
     def kept(self, key: tuple[str | int | float, ...], make: Callable[[], Mesh]) -> Mesh:
@@ -528,30 +527,7 @@ def error_mm(vertices: FloatArray, scan: Scan) -> FloatArray:
 
 def floor_mm(model: ShapeModel, scan: Scan) -> float:
     """Return the mean error of the best shape in the model at its best pose, the true correspondences known."""
-    return _floor_mm(model, scan.T_scan_model.inverse().apply(scan.truth))
-
-
-def _floor_mm(model: ShapeModel, truth: FloatArray) -> float:
-    # Pose and coefficients are solved for together: in turn they crawl where modes hold pose or size.
-    b, T = model.project(truth, align=False), Similarity.identity()
-    modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
-    for _ in range(_FLOOR_STEPS):
-        shape = T.apply(model.reconstruct(b))
-        arm = shape - T.translation
-        turn = np.cross(np.eye(3), arm[:, None]).transpose(0, 2, 1)
-        move = np.broadcast_to(np.eye(3), turn.shape)
-        reach = T.scale * (T.rotation @ modes)
-        J = np.concatenate([turn, move, arm[:, :, None], reach], axis=2).reshape(-1, 7 + model.n_modes)
-        # A touch of damping, since modes may hold all of a pose.
-        H = J.T @ J
-        H[np.diag_indices_from(H)] *= 1.0 + 1e-9
-        step = np.linalg.solve(H, J.T @ (truth - shape).ravel())
-        turned = Rotation.from_rotvec(step[:3]).as_matrix() @ T.rotation
-        T = Similarity(T.scale * np.exp(step[6]), turned, T.translation + step[3:6])
-        b = b + step[7:]
-        if np.abs(J @ step).max() < _FLOOR_REACHED_MM:
-            break
-    return float(np.linalg.norm(T.apply(model.reconstruct(b)) - truth, axis=1).mean())
+    return floor_of(model, scan.T_scan_model.inverse().apply(scan.truth))
 
 
 def surface_figures(vertices: FloatArray, model: ShapeModel, scan: Scan, mm_per_length: float) -> dict[str, float]:

@@ -578,6 +578,7 @@ def recognise_study(
     strangers: int | None,
     folds: int | None,
     seed: int | None,
+    shape_spaces: bool,
     jobs: int,
     quiet: bool,
 ) -> tuple[Path, list[dict[str, Any]], str]:
@@ -591,8 +592,10 @@ def recognise_study(
     """
     if (data is None) != (model is None):
         raise InputError("A study of scans of your own needs both --data DIR and --model MODEL.h5.")
-    if data is not None and (people is not None or strangers is not None):
-        raise InputError("--people and --strangers belong to the simulated study; leave them out with --data.")
+    if data is not None and (people is not None or strangers is not None or shape_spaces):
+        raise InputError(
+            "--people, --strangers and --shape-spaces belong to the simulated study; leave them out with --data."
+        )
     from shapespace.study.run import run_own_study, run_study  # needs the extras
 
     workers = jobs or cores()
@@ -604,6 +607,7 @@ def recognise_study(
             )
         else:
             from shapespace.datasets.study_people import StudyPeople
+            from shapespace.study.shape_spaces import ShapeSpaces
             from shapespace.study.simulated import StudyConfig
 
             chosen = StudyPeople() if people is None else StudyPeople(people=people)
@@ -614,6 +618,7 @@ def recognise_study(
                 folds=usual.folds if folds is None else folds,
                 strangers=usual.strangers if strangers is None else strangers,
             )
-            report = run_study(output, config, workers=workers, quiet=quiet)
+            compared = ShapeSpaces() if shape_spaces else None
+            report = run_study(output, config, workers=workers, quiet=quiet, compared=compared)
     content = json.loads(read_bytes(output / "recognition.json"))
     return report, content["targets"], holds

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError, ModelFileError
+from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.model.additive import AdditiveModel, still_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
@@ -164,6 +165,14 @@ def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> Non
         model.join(np.zeros(5), ())
     with pytest.raises(InputError, match="positive standard deviations"):
         model.tie(np.zeros((2, 7)), np.zeros((2, 7)))
+
+
+def test_the_file_says_that_its_variances_are_of_people_left_out(model: AdditiveModel, tmp_path: Path) -> None:
+    model.save(tmp_path / "m.h5")
+    read = ShapeModel.load(tmp_path / "m.h5")
+    assert read.held_out and not ShapeModel.fit(training_meshes(vertices=300)).held_out
+    assert read.content_hash == model.shape.content_hash
+    assert np.array_equal(variance_of_new_shapes(read), read.stddev**2)
 
 
 def test_kin_are_left_out_together_when_variances_are_found(world: World) -> None:

@@ -14,6 +14,7 @@ from shapespace.datasets.study_people import StudyPeople
 from shapespace.errors import FileFormatError, InputError
 from shapespace.model.additive import AdditiveModel
 from shapespace.study import simulated, tables
+from shapespace.study.shape_spaces import ShapeSpaces
 from shapespace.study.simulated import StudyConfig, model_path, person_path, prepare_folder, read_fits, run_fits
 
 SMALL = StudyConfig(
@@ -122,10 +123,45 @@ def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path)
     assert 'class="broken"' not in report and "cannot be compared with those published" in report
 
 
+SPACES = ShapeSpaces(
+    training=10, people=1, modes=4, counts=(8,), triangles=4_000, taught=3, tested=1,
+    recognised=("vertices", "bspline-detail 8x8"),
+)  # fmt: skip
+
+
+def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(done: Path, tmp_path: Path) -> None:
+    from shapespace.study.run import run_study
+
+    folder = tmp_path / "s"
+    shutil.copytree(done, folder)
+    report = run_study(folder, SMALL, workers=2, quiet=True, compared=SPACES).read_text(encoding="utf-8")
+    assert 'class="broken"' not in report and "Vertices and control points at 4 modes" in report
+    made = json.loads((folder / "recognition.json").read_text())
+    tables_of = {part["title"].split(",")[0].split(":")[0]: part for part in made["parts"] if part["kind"] == "table"}
+    names = ["vertices", "bspline 8x8", "bspline-detail 8x8"]
+    assert [row[0] for row in tables_of["Vertices and control points at 4 modes"]["rows"]] == names
+    refused = {row[0]: row[-1] for row in tables_of["The same models made of damaged meshes"]["rows"]}
+    assert refused["vertices"] is None and refused["bspline 8x8"] > 0
+    assert len(tables_of["Expressions told in each shape space"]["rows"]) == 2
+    overlap = {tuple(row[:2]): row[3] for row in tables_of["What lies double when a face is laid out flat"]["rows"]}
+    assert overlap["ICT-FaceKit", "cylinder"] > 0.02 and overlap["ICT-FaceKit", "disc"] < 1e-6
+    before = {path: path.stat().st_mtime_ns for path in (folder / "shape_spaces").rglob("*.json")}
+    gone = next(path for path in before if path.parent.name == "fits")
+    gone.unlink()
+    run_study(folder, SMALL, workers=1, quiet=True, compared=SPACES)
+    assert {p for p, at in before.items() if p.stat().st_mtime_ns != at} == {gone}
+    with pytest.raises(InputError, match="was measured with other settings"):
+        run_study(folder, SMALL, workers=1, quiet=True, compared=replace(SPACES, modes=3))
+    gone.write_text("{")
+    with pytest.raises(FileFormatError, match="is damaged; delete it"):
+        run_study(folder, SMALL, workers=1, quiet=True, compared=SPACES)
+
+
 def test_arguments_that_do_not_go_together_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, wanted in (
         (["--data", str(tmp_path)], "needs both --data DIR and --model"),
         (["--data", str(tmp_path), "--model", "m.h5", "--people", "4"], "belong to the simulated study"),
+        (["--data", str(tmp_path), "--model", "m.h5", "--shape-spaces"], "belong to the simulated study"),
         (["--people", "3", "--folds", "3"], "cannot be parted into 3 folds"),
     ):
         code = cli.main(["recognise", "study", "-o", str(tmp_path / "o"), "--no-open", "--quiet", *arguments])

@@ -101,12 +101,13 @@ def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
 
     Modes are chosen to fit the training shapes, so their variances there say too little of others: far too little for
     the last of N - 1 modes of N shapes. Nonlinear shrinkage estimates it from the spectrum alone (Ledoit and Wolf,
-    Annals of Statistics 48(5), 2020, section 4.5 for more coordinates than shapes). Never below the model's own.
+    Annals of Statistics 48(5), 2020, section 4.5 for more coordinates than shapes). Never below the model's own, which
+    are taken as they are where they were found on shapes left out.
     """
     own, n = model.stddev**2, model.n_training
     left = model.total_variance - float(own.sum())
     rest = n - 1 - model.n_modes
-    if n < _FEWEST_SHAPES:
+    if n < _FEWEST_SHAPES or model.held_out:
         return own
     spectrum = own
     if rest > 0 and left > _ALL_KEPT * model.total_variance:

@@ -156,6 +156,7 @@ class AdditiveModel:
             landmarks=landmarks or {},
             provenance=provenance,
             licence=licence,
+            held_out=True,
         )
         return cls(model, rotation, len(identity_variance))
 

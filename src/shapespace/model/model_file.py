@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
+_HELD_OUT = "held out"
 _EVERY_MODEL = ("mean", "basis", "stddev", "faces")
 """What is not of one representation."""
 
@@ -32,7 +33,7 @@ def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, 
         "format": FORMAT_NAME,
         "format_version": FORMAT_VERSION,
         "units": "mm",
-        "variance_divisor": "N - 1",
+        "variance_divisor": _HELD_OUT if model.held_out else "N - 1",
         "gauge": model.gauge,
         "representation": model.representation,
         "total_variance": model.total_variance,
@@ -88,6 +89,7 @@ def load(path: Path) -> dict[str, Any]:
             "coding": {name: array for name, array in arrays.items() if name not in _EVERY_MODEL},
             "provenance": str(attributes["provenance"]),
             "licence": str(attributes["licence"]),
+            "held_out": attributes.get("variance_divisor") == _HELD_OUT,
         }
     except (AttributeError, KeyError, ValueError, TypeError) as error:
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing: {error}.") from error

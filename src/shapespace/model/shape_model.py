@@ -48,6 +48,7 @@ class ShapeModel:
         coding: the arrays of that representation; none for vertices.
         provenance: what it was made from, in words.
         licence: licence of the training data.
+        held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
 
     Raises:
         InputError: arrays whose shapes do not belong together.
@@ -65,6 +66,7 @@ class ShapeModel:
     coding: Mapping[str, npt.NDArray[Any]] = field(default_factory=lambda: dict[str, npt.NDArray[Any]]())
     provenance: str = ""
     licence: str = ""
+    held_out: bool = False
 
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)

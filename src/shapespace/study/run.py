@@ -16,14 +16,19 @@ from shapespace.errors import ShapespaceError
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.report.html import require_report_extra, write_report
 from shapespace.study.own_scans import run_own
-from shapespace.study.simulated import StudyConfig, prepare_folder, run_fits
-from shapespace.study.tables import make_tables
+from shapespace.study.parts import Part
+from shapespace.study.shape_space_tables import shape_space_parts
+from shapespace.study.shape_spaces import ShapeSpaces, prepare, stages
+from shapespace.study.simulated import StudyConfig, prepare_folder, run_fits, run_jobs
+from shapespace.study.tables import SHAPE_SPACES, make_tables, seconds_of_study
 
 _PARTS = 14
 """Steps of the tables, for the bar."""
 
 
-def run_study(folder: Path, config: StudyConfig, *, workers: int, quiet: bool = False) -> Path:
+def run_study(
+    folder: Path, config: StudyConfig, *, workers: int, quiet: bool = False, compared: ShapeSpaces | None = None
+) -> Path:
     """Run the simulated study in `folder`, or go on with it, and return the path of its report.
 
     Args:
@@ -31,6 +36,7 @@ def run_study(folder: Path, config: StudyConfig, *, workers: int, quiet: bool = 
         config: of the study.
         workers: processes that fit.
         quiet: no progress bar.
+        compared: shape spaces that are compared too, in tables that follow.
 
     Raises:
         DataError: ICT-FaceKit is not here.
@@ -40,10 +46,13 @@ def run_study(folder: Path, config: StudyConfig, *, workers: int, quiet: bool = 
     """
     require_report_extra()
     prepare_folder(folder, config)
+    inside = None if compared is None else prepare(folder, compared, config.people.seed)
+    more = [] if compared is None or inside is None else stages(inside, compared, config.people.seed)
     seconds = _Seconds(folder)
     with ExitStack() as stack:
         bar = stack.enter_context(tqdm(unit="step", leave=False, disable=True if quiet else None))
         bar.total = config.folds + 1 + config.people.people + config.strangers + _PARTS + 1
+        bar.total += sum(len(jobs) for _, jobs, _ in more)
         counted: dict[str, int] = {}
 
         def progress(what: str, done: int, total: int) -> None:
@@ -57,8 +66,13 @@ def run_study(folder: Path, config: StudyConfig, *, workers: int, quiet: bool = 
 
         with seconds.of("models and fits"):
             run_fits(folder, config, workers=workers, on_progress=progress)
+        further: list[Part] = []
+        if compared is not None and inside is not None:
+            with seconds.of(SHAPE_SPACES):
+                run_jobs(more, workers=workers, on_progress=progress)
+                further = shape_space_parts(inside, compared, config.people.seed)
         with seconds.of("tables", fresh=True):
-            make_tables(folder, config, seconds=seconds.known, on_part=part)
+            make_tables(folder, config, seconds=seconds.known, on_part=part, further=further)
         _tell_seconds(folder, seconds)
         bar.set_description("report")
         return write_report(folder)
@@ -70,7 +84,7 @@ def _tell_seconds(folder: Path, seconds: _Seconds) -> None:
     content = json.loads(read_bytes(path))
     for name, value in seconds.known.items():
         content["settings"][f"seconds, {name}"] = round(value, 1)
-    total = sum(seconds.known.values())
+    total = seconds_of_study(seconds.known)
     for one in content["targets"]:
         if one["what"].startswith("Wall time"):
             one["reached"], one["met"] = f"{total / 60:.1f} minutes", total < 900

@@ -38,6 +38,8 @@ PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
+Job: TypeAlias = tuple[Callable[..., None], tuple[Any, ...]]
+Stage: TypeAlias = tuple[str, Sequence[Job], Sequence[Path]]
 
 SETTINGS = RobustSettings(
     levels=(
@@ -175,27 +177,44 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
     """
     told: Progress = on_progress or _untold
     load_ict()
-    models = [(_make_model, (folder, config, fold)) for fold in range(config.folds)]
-    people = [(_fit_person, (folder, config, person)) for person in range(config.people.people)]
-    strangers = [(_fit_stranger, (folder, config, person)) for person in range(config.strangers)]
-    paper = [(_fit_paper, (folder, config))]
-    paths = {
-        "paper": [paper_path(folder)],
-        "models": [model_path(folder, fold) for fold in range(config.folds)],
-        "people": [person_path(folder, person) for person in range(config.people.people)],
-        "strangers": [stranger_path(folder, person) for person in range(config.strangers)],
-    }
+    run_jobs(
+        [
+            ("models", [(_make_model, (folder, config, fold)) for fold in range(config.folds)],
+             [model_path(folder, fold) for fold in range(config.folds)]),
+            ("paper", [(_fit_paper, (folder, config))], [paper_path(folder)]),
+            ("people", [(_fit_person, (folder, config, person)) for person in range(config.people.people)],
+             [person_path(folder, person) for person in range(config.people.people)]),
+            ("strangers", [(_fit_stranger, (folder, config, person)) for person in range(config.strangers)],
+             [stranger_path(folder, person) for person in range(config.strangers)]),
+        ],
+        workers=workers,
+        on_progress=told,
+    )  # fmt: skip
+
+
+def run_jobs(stages: Sequence[Stage], *, workers: int, on_progress: Progress) -> None:
+    """Run stages one after the other, the jobs of each in worker processes, without those whose file is there.
+
+    Args:
+        stages: (what, jobs, the file that each job ends in).
+        workers: processes.
+        on_progress: called with each stage and after each job.
+
+    Raises:
+        FitError: a worker was stopped from outside.
+        ShapespaceError: as a job does.
+    """
     with ExitStack() as stack:
         pool: Executor | None = None
-        for what, jobs in (("models", models), ("paper", paper), ("people", people), ("strangers", strangers)):
-            todo = [job for job, path in zip(jobs, paths[what], strict=True) if not path.is_file()]
+        for what, jobs, paths in stages:
+            todo = [job for job, path in zip(jobs, paths, strict=True) if not path.is_file()]
             done = len(jobs) - len(todo)
-            told(what, done, len(jobs))
+            on_progress(what, done, len(jobs))
             if todo and pool is None:
                 pool = stack.enter_context(_pool(workers))
             for _ in _run(pool, todo):
                 done += 1
-                told(what, done, len(jobs))
+                on_progress(what, done, len(jobs))
 
 
 def _untold(what: str, done: int, total: int) -> None:
@@ -208,7 +227,7 @@ def _pool(workers: int) -> Executor:
     return ProcessPoolExecutor(workers, mp_context=context(), initializer=threadpool_limits, initargs=(1,))
 
 
-def _run(pool: Executor | None, jobs: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> Iterator[None]:
+def _run(pool: Executor | None, jobs: Sequence[Job]) -> Iterator[None]:
     if pool is None:
         return
     with ExitStack() as stack:
