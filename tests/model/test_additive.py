@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError, ModelFileError
+from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.model.additive import AdditiveModel, still_vertices
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import Mesh
+from shapespace.types import Mesh, Similarity
 from synthetic_shapes import training_meshes
 
 SUBJECTS, EXPRESSIONS = 8, 3
@@ -93,27 +94,79 @@ def test_an_expression_is_put_on_somebody_else_to_half_a_millimetre(world: World
     assert np.linalg.norm(model.shape.mean_vertices - wanted, axis=1).mean() > 2
 
 
+def covariance(rng: np.random.Generator, noise: float) -> np.ndarray:
+    """Return (7, 7) what is known after a fit that hardly parts some directions from others."""
+    J = rng.standard_normal((12, 7)) * np.geomspace(3.0, 0.1, 7)
+    return np.linalg.inv(J.T @ J / noise**2 + np.eye(7))
+
+
+def fitted(rng: np.random.Generator, truth: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Return (7,) the fit of `truth`, both in standard deviations, whose covariance after it is C."""
+    told = np.linalg.inv(C) - np.eye(7)
+    return C @ (told @ truth + np.linalg.cholesky(told + 1e-9 * np.eye(7)) @ rng.standard_normal(7))
+
+
 def test_scans_of_one_person_together_tell_identity_better_than_one(model: AdditiveModel) -> None:
     rng = np.random.default_rng(3)
     single, tied = [], []
-    for _ in range(40):
+    for _ in range(60):
         a, e = rng.standard_normal(4), rng.standard_normal((5, EXPRESSIONS))
         truth = np.concatenate([np.tile(a, (5, 1)), e], axis=1) @ model.rotation
-        noise = np.full(truth.shape, 0.5)
-        told = 1.0 / noise**2
-        seen = (truth + noise * rng.standard_normal(truth.shape)) * told / (told + 1.0)
-        stddev = np.sqrt(1.0 / (told + 1.0))
-        found, shown = model.tie(seen, stddev)
+        covariances = [covariance(rng, 0.5) for _ in truth]
+        seen = np.stack([fitted(rng, t, C) for t, C in zip(truth, covariances, strict=True)])
+        found, shown = model.tie([model.told(z, C) for z, C in zip(seen, covariances, strict=True)])
         assert shown.shape == (5, EXPRESSIONS)
-        single.append(np.abs(model.split(seen[0])[0] - a).mean())
+        single.append(np.abs(model.split(seen)[0] - a).mean())
         tied.append(np.abs(found - a).mean())
-    assert np.mean(tied) < 0.65 * np.mean(single)
+    assert np.mean(tied) < 0.75 * np.mean(single)
 
 
 def test_one_scan_tied_with_nothing_is_the_scan(model: AdditiveModel) -> None:
-    z, stddev = np.random.default_rng(4).standard_normal(7), np.full(7, 0.3)
-    a, e = model.tie(z[None], stddev[None])
-    assert np.allclose(np.concatenate([a, e[0]]), np.concatenate(model.split(z)), atol=1e-9)
+    rng = np.random.default_rng(4)
+    z = rng.standard_normal(7)
+    a, e = model.tie([model.told(z, covariance(rng, 0.3))])
+    assert np.allclose(np.concatenate([a, e[0]]), np.concatenate(model.split(z)), atol=1e-8)
+
+
+def test_tying_is_the_least_squares_over_all_scans_at_once(model: AdditiveModel) -> None:
+    rng = np.random.default_rng(6)
+    told = [model.told(rng.standard_normal(7), covariance(rng, 0.4)) for _ in range(3)]
+    for neutral in (None, [True, False, False]):
+        blocks = [np.zeros((7, 4 + 3 * EXPRESSIONS)) for _ in told]
+        for k, block in enumerate(blocks):
+            block[:4, :4] = np.eye(4)
+            if neutral is None or not neutral[k]:
+                block[4:, 4 + 3 * k : 7 + 3 * k] = np.eye(3)
+        left, right = np.eye(4 + 3 * EXPRESSIONS), np.zeros(4 + 3 * EXPRESSIONS)
+        for B, one in zip(blocks, told, strict=True):
+            left, right = left + B.T @ one.precision @ B / 3, right + B.T @ one.pull / 3
+        wanted = np.linalg.solve(left, right)
+        a, e = model.tie(told, neutral)
+        assert np.allclose(a, wanted[:4]) and np.allclose(e.ravel(), wanted[4:])
+
+
+def test_a_known_neutral_scan_frees_expressions_from_identity(model: AdditiveModel) -> None:
+    rng = np.random.default_rng(7)
+    alone, beside = [], []
+    for _ in range(60):
+        a, e = rng.standard_normal(4), rng.standard_normal(EXPRESSIONS)
+        truths = np.stack([np.r_[a, np.zeros(EXPRESSIONS)], np.r_[a, e]]) @ model.rotation
+        C = [covariance(rng, 0.5) for _ in truths]
+        told = [model.told(fitted(rng, t, c), c) for t, c in zip(truths, C, strict=True)]
+        alone.append(np.abs(model.tie(told[1:])[1][0] - e).mean())
+        beside.append(np.abs(model.tie(told, [True, False])[1][1] - e).mean())
+    assert np.mean(beside) < 0.95 * np.mean(alone)
+
+
+def test_what_a_robust_fit_knows_can_be_tied(world: World, model: AdditiveModel) -> None:
+    scan = world.face(np.array([0.5, -0.5, 0.2, 0.1]), np.array([0.6, 0.0, 0.3]))
+    one = fit_scan(model.shape, scan, FitConfig(unit="mm"), T_scan_model=Similarity.identity())
+    assert one.z_covariance is not None
+    assert np.allclose(np.sqrt(one.z_covariance.diagonal()) * model.shape.stddev, one.b_stddev, rtol=1e-6)
+    a, _ = model.tie([model.told(one.z, one.z_covariance)])
+    assert np.allclose(a, model.split(one.z)[0], atol=1e-6)
+    config = FitConfig(method="paper", unit="mm")
+    assert fit_scan(model.shape, scan, config, T_scan_model=Similarity.identity()).z_covariance is None
 
 
 def test_its_file_reads_as_the_plain_model_too(model: AdditiveModel, tmp_path: Path) -> None:
@@ -163,8 +216,12 @@ def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> Non
         model.split(np.zeros(6))
     with pytest.raises(InputError, match="at most 4 finite coefficients of identity"):
         model.join(np.zeros(5), ())
-    with pytest.raises(InputError, match="positive standard deviations"):
-        model.tie(np.zeros((2, 7)), np.zeros((2, 7)))
+    with pytest.raises(InputError, match=r"their \(7, 7\) covariance"):
+        model.told(np.zeros(7), np.ones(7))
+    with pytest.raises(InputError, match="positive definite"):
+        model.told(np.zeros(7), np.zeros((7, 7)))
+    with pytest.raises(InputError, match="at least one fit"):
+        model.tie([])
 
 
 def test_the_file_says_that_its_variances_are_of_people_left_out(model: AdditiveModel, tmp_path: Path) -> None:

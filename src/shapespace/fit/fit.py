@@ -257,6 +257,7 @@ def _fit_scan(
         b_stddev=fitted.b_stddev,
         shrinkage=fitted.shrinkage,
         z=fitted.b / model.stddev[: len(fitted.b)],
+        z_covariance=_in_standard_deviations(fitted.b_covariance, model),
         stages=stages,
         history=history,
         method=config.method,
@@ -284,6 +285,13 @@ def _fit_scan(
         scan=scan,
         find_regions=fitted.regions,
     )
+
+
+def _in_standard_deviations(b_covariance: FloatArray | None, model: ShapeModel) -> FloatArray | None:
+    if b_covariance is None:
+        return None
+    stddev = model.stddev[: len(b_covariance)]
+    return b_covariance / (stddev[:, None] * stddev)
 
 
 def _not_all_seen(stages: Mapping[str, Stage]) -> list[str]:

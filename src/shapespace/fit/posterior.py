@@ -46,11 +46,13 @@ class Posterior:
 
     Args:
         b_stddev: (K,) standard deviation of each coefficient, mm; never above the model's.
+        b_covariance: (K, K) of the coefficients, mm^2.
         shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
         evidence: what speaks for and against the fit, by name; the unit stands in the name.
     """
 
     b_stddev: FloatArray
+    b_covariance: FloatArray
     shrinkage: FloatArray
     evidence: Mapping[str, float]
 
@@ -85,6 +87,7 @@ def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_mod
     expected = float((doubted * _gram(fit)).sum()) / len(x)
     return Posterior(
         np.sqrt(variance),
+        covariance[POSE : POSE + K, POSE : POSE + K],
         1.0 - variance / prior[:K],
         {
             **_matched(fit, v, fit.b[: model.n_modes] ** 2 / new_shapes),

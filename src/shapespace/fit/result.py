@@ -72,6 +72,7 @@ class FitResult:
             paper's it goes by the model's own noise and is mostly too small.
         shrinkage: (K,) in [0, 1]: near 1 the scan told the coefficient, near 0 only the model did.
         z: (K,) b in standard deviations of the model.
+        z_covariance: (K, K) of z, calibrated; None of the paper's method. It is in no file.
         stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
         history: every state the loop went through, in the scan's mm frame.
         method: the method that ran.
@@ -94,6 +95,7 @@ class FitResult:
     b_stddev: FloatArray
     shrinkage: FloatArray
     z: FloatArray
+    z_covariance: FloatArray | None
     stages: Mapping[str, Stage]
     history: Sequence[IcpState]
     method: str

@@ -337,6 +337,7 @@ def robust_icp(
         T_scan_model=T,
         b=b,
         b_stddev=known.b_stddev[:wanted],
+        b_covariance=known.b_covariance[:wanted, :wanted],
         shrinkage=known.shrinkage[:wanted],
         vertices_scan_mm=fit.T.apply(fit.surface.vertices),
         rms_mm=fit.rms_mm,

@@ -47,6 +47,7 @@ class Fitted:
         rms_mm: RMS distance of the matched vertices from the scan, mm of the model's frame.
         regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
         evidence: what the verdict goes by, by name.
+        b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
     """
 
     T_scan_model: Similarity
@@ -57,6 +58,7 @@ class Fitted:
     rms_mm: float
     regions: Callable[[], IntArray] = field(repr=False)
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
+    b_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)

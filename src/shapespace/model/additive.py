@@ -34,6 +34,19 @@ _NO_MOTION_MM = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
+class Told:
+    """What one fit told of [a; e], in standard deviations, its prior taken out.
+
+    Args:
+        precision: (K, K) of the scan alone.
+        pull: (K,) precision @ what the scan alone would have.
+    """
+
+    precision: FloatArray
+    pull: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class AdditiveModel:
     """A shape model whose whitened coefficients split into identity a and expression e: [a; e] = rotation @ z.
 
@@ -204,41 +217,64 @@ class AdditiveModel:
         """Return the person of coefficients `z_of` (K,) with the expression of `z_expression` (K,), as a mesh in mm."""
         return self.mesh(self.split(z_of)[0], self.split(z_expression)[1])
 
-    def tie(self, z: npt.ArrayLike, z_stddev: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return one identity and the expressions of several scans of one person, by all their fits together.
-
-        Each fit told z within z_stddev, of which its prior is taken out before all scans are put together under one
-        prior: the normal equations are block-arrow, so a is solved for first and each e after it.
+    def told(self, z: npt.ArrayLike, z_covariance: npt.ArrayLike) -> Told:
+        """Return what a fit told of identity and expression, for `tie`.
 
         Args:
-            z: (n, K) coefficients of fits, in standard deviations.
-            z_stddev: (n, K) their standard deviations after the fit, below 1 where the scan told something.
+            z: (K,) coefficients, in standard deviations: `FitResult.z`.
+            z_covariance: (K, K) of them after the fit: `FitResult.z_covariance`. The diagonal alone will not do, since
+                identity and expression are known far better apart from each other than one by one.
+
+        Raises:
+            InputError: arrays of other shapes, or no covariance.
+        """
+        z, covariance = self._checked(z), np.asarray(z_covariance, dtype=np.float64)
+        k = self.shape.n_modes
+        if z.ndim != 1 or covariance.shape != (k, k) or not np.isfinite(covariance).all():
+            raise InputError(
+                f"Give ({k},) coefficients and their ({k}, {k}) covariance, as the robust method has them."
+            )
+        values, vectors = eigh(covariance)
+        if values[0] <= 0:
+            raise InputError("The covariance of coefficients must be positive definite.")
+        known, turned = np.maximum(1.0 / values - 1.0, 0.0), self.rotation @ vectors
+        return Told((turned * known) @ turned.T, turned @ ((known + 1.0) * (vectors.T @ z)))
+
+    def tie(self, told: Sequence[Told], neutral: Sequence[bool] | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return one identity and the expressions of several scans of one person, by all their fits together.
+
+        The normal equations are block-arrow, so a is solved for first and each e after it. What identity has outside
+        the model is the same in all scans of a person and does not average out, so n scans count 1/n each.
+
+        Args:
+            told: what each fit told.
+            neutral: (n,) which scans are known to show the neutral face, with e = 0; None of them.
 
         Returns:
             a (Ka,) and e (n, Ke), in standard deviations.
 
         Raises:
-            InputError: arrays of other shapes, or values that are not finite.
+            InputError: no scans, or another number of words on neutral.
         """
-        z, stddev = self._checked(z), np.asarray(z_stddev, dtype=np.float64)
-        if z.ndim != 2 or stddev.shape != z.shape or not (stddev > 0).all():
-            raise InputError(f"Give (n, {self.shape.n_modes}) coefficients and as many positive standard deviations.")
-        variance = np.minimum(stddev, 0.999) ** 2
-        told = 1.0 / variance - 1.0
-        pulled = z / variance
-        Ra, Re = self.rotation[: self.n_identity], self.rotation[self.n_identity :]
-        left: FloatArray = np.eye(self.n_identity)
-        right: FloatArray = np.zeros(self.n_identity)
-        solves: list[tuple[FloatArray, FloatArray]] = []
-        for h, p in zip(told, pulled, strict=True):
-            cross = (Ra * h) @ Re.T
-            own = (Re * h) @ Re.T + np.eye(self.n_expression)
-            solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, Re @ p])), dtype=np.float64)
-            left = left + (Ra * h) @ Ra.T - cross @ solved[:, :-1]
-            right = right + Ra @ p - cross @ solved[:, -1]
-            solves.append((solved[:, :-1], solved[:, -1]))
+        if not told or (neutral is not None and len(neutral) != len(told)):
+            raise InputError("Give what at least one fit told, and one word on neutral for each or none.")
+        k, share = self.n_identity, 1.0 / len(told)
+        left: FloatArray = np.eye(k)
+        right: FloatArray = np.zeros(k)
+        solves: list[FloatArray | None] = []
+        for number, one in enumerate(told):
+            precision, pull = share * one.precision, share * one.pull
+            left, right = left + precision[:k, :k], right + pull[:k]
+            if neutral is not None and neutral[number]:
+                solves.append(None)
+                continue
+            cross, own = precision[:k, k:], precision[k:, k:] + np.eye(self.n_expression)
+            solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, pull[k:]])), dtype=np.float64)
+            left, right = left - cross @ solved[:, :-1], right - cross @ solved[:, -1]
+            solves.append(solved)
         a: FloatArray = np.asarray(np.linalg.solve(left, right), dtype=np.float64)
-        return a, np.stack([own - with_a @ a for with_a, own in solves])
+        rest = np.zeros(self.n_expression)
+        return a, np.stack([rest if s is None else s[:, -1] - s[:, :-1] @ a for s in solves])
 
     def save(self, path: Path | str) -> None:
         """Write a model file that also reads as the plain shape model.

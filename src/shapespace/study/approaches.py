@@ -7,7 +7,7 @@ what becomes of them differs. `Rows` of training people teach it; `features` are
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -35,6 +35,8 @@ class Rows:
         expression: n names; neutral among them.
         shown: (n,) place of the scan among its person's: 0 is neutral, and the same number is the same expression.
         subject: n names.
+        e_beside: (n, Ke) expressions found together with the person's neutral scan; NaN where there is none.
+        e_together: (n, Ke) expressions found together with all the person's scans, none of them labelled.
     """
 
     z: FloatArray
@@ -42,12 +44,15 @@ class Rows:
     expression: TextArray
     shown: IntArray
     subject: TextArray
+    e_beside: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    e_together: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def where(self, chosen: BoolArray) -> Rows:
         """Return some of them."""
         return Rows(
-            self.z[chosen], self.z_stddev[chosen], self.expression[chosen], self.shown[chosen], self.subject[chosen]
-        )
+            self.z[chosen], self.z_stddev[chosen], self.expression[chosen], self.shown[chosen], self.subject[chosen],
+            *(part[chosen] if len(part) else part for part in (self.e_beside, self.e_together)),
+        )  # fmt: skip
 
     @property
     def usable(self) -> BoolArray:
@@ -122,6 +127,18 @@ def bilinear(model: AdditiveModel, training: Rows) -> Features:
     fitted = BilinearModel.fit(np.stack(table), identity_rank, expression_rank)
     stddev = model.shape.stddev
     return lambda faces: fitted.encode(faces.z * stddev, faces.z_stddev * stddev)[1]
+
+
+def about_own_mean(model: AdditiveModel, faces: Rows) -> FloatArray:
+    """Return expressions (n, Ke) less the mean of all scans of the same person, whatever they show.
+
+    Which takes no label, but a set of scans of each person in which expressions are balanced.
+    """
+    e = model.split(faces.z)[1]
+    for name in np.unique(faces.subject):
+        own = faces.subject == name
+        e[own] -= e[own].mean(axis=0)
+    return e
 
 
 def beside_neutral(model: AdditiveModel, faces: Rows, z_neutral: FloatArray) -> FloatArray:

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from shapespace import __version__
 from shapespace.datasets.faces import load_faces
-from shapespace.datasets.ict import IctFaces, load_ict
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.datasets.study_people import StudyPeople, holes_of
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
@@ -32,7 +31,7 @@ from shapespace.geometry.surface import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.model.representation import BSplineSurface
 from shapespace.model.shape_model import ShapeModel
-from shapespace.study.simulated import Stage
+from shapespace.study.simulated import Stage, faces_of_ict
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 Record: TypeAlias = dict[str, Any]
@@ -191,8 +190,8 @@ def _write(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def _compare(inside: Path, compared: ShapeSpaces, kind: str) -> None:
-    drawn = load_ict_once().draw_people(compared.training + compared.people, seed=_SEED)
-    meshes = [load_ict_once().mesh(row, name=f"person {i}") for i, row in enumerate(drawn)]
+    drawn = faces_of_ict().draw_people(compared.training + compared.people, seed=_SEED)
+    meshes = [faces_of_ict().mesh(row, name=f"person {i}") for i, row in enumerate(drawn)]
     training, others = meshes[: compared.training], meshes[compared.training :]
     since = time.process_time()
     model = compared.model(training, kind, align=False)
@@ -303,7 +302,7 @@ def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
 
 
 def _expressions(inside: Path, compared: ShapeSpaces, kind: str, seed: int) -> None:
-    people, ict = expressive_people(seed), load_ict_once()
+    people, ict = expressive_people(seed), faces_of_ict()
     strongest = [k for k, (_, level) in enumerate(people.shown) if level in (0.0, max(people.levels))]
     meshes: list[Mesh] = []
     for person in range(compared.taught):
@@ -315,7 +314,7 @@ def _expressions(inside: Path, compared: ShapeSpaces, kind: str, seed: int) -> N
 def _fit_person(inside: Path, kind: str, person: int, seed: int) -> None:
     people, model = expressive_people(seed), _loaded(_model_path(inside, kind))
     record: Record = {"z": [], "error_mm": [], "status": []}
-    for k, face in enumerate(people.faces(load_ict_once(), person)):
+    for k, face in enumerate(people.faces(faces_of_ict(), person)):
         scan = people.scan(face, person, k)
         try:
             fitted = fit_scan(model, scan.scan, FitConfig(unit="mm"))
@@ -331,16 +330,7 @@ def _fit_person(inside: Path, kind: str, person: int, seed: int) -> None:
     _write(person_path(inside, kind, person), record)
 
 
-_ict: IctFaces | None = None
 _models: dict[Path, ShapeModel] = {}
-
-
-def load_ict_once() -> IctFaces:
-    """Return ICT-FaceKit, read once in each process."""
-    global _ict
-    if _ict is None:
-        _ict = load_ict()
-    return _ict
 
 
 def _loaded(path: Path) -> ShapeModel:
@@ -360,7 +350,7 @@ def _maps(inside: Path, compared: ShapeSpaces) -> None:
     changes = people - people.mean(axis=0)
     overlap: list[Record] = []
     by_region: list[Record] = []
-    for name, mesh in (("ICT-FaceKit", load_ict_once().mesh()), ("bundled faces", template)):
+    for name, mesh in (("ICT-FaceKit", faces_of_ict().mesh()), ("bundled faces", template)):
         for title, uv in (("cylinder", cylinder_map(mesh)), ("disc", disc_map(mesh))):
             folded, twice, _ = _shared_area(uv, mesh)
             overlap.append({"faces": name, "map": title, "folded": folded, "shared": twice})

@@ -6,7 +6,7 @@ import io
 import json
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from shapespace import __version__
 from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
 from shapespace.datasets.faces import LICENSE, Expression, FaceGenerator, load_faces
+from shapespace.datasets.fetch import present_folder
 from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.datasets.study_people import StudyPeople, holes_of
@@ -29,12 +30,13 @@ from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.geometry.mirror import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
-from shapespace.model.additive import AdditiveModel
+from shapespace.model.additive import AdditiveModel, Told
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 MIRRORED = ", mirrored"
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
+_SAVED = ("z", "z_stddev", "status", "error_mm", "seconds", "e_beside", "e_together", "a_together")
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
@@ -125,6 +127,10 @@ class Fits:
         status: (F, N) index of `STATUSES`; -1 where none was needed.
         error_mm: (N,) mean distance of the vertices to the true ones, in the fold where the scan is tested.
         seconds: (N,) of that fit.
+        e_beside: (F, N, Ke) expressions by tying each scan with the person's neutral scan, known as such; NaN where
+            there is none. Ke is that of the largest model and the rest is 0.
+        e_together: (F, N, Ke) by tying all expressive scans of the person, none of them known as anything.
+        a_together: (F, P, Ka) the identity of those.
         person: (N,) who is scanned.
         shown: (N,) index of `StudyPeople.shown`.
     """
@@ -134,6 +140,9 @@ class Fits:
     status: IntArray
     error_mm: FloatArray
     seconds: FloatArray
+    e_beside: FloatArray
+    e_together: FloatArray
+    a_together: FloatArray
     person: IntArray
     shown: IntArray
 
@@ -176,7 +185,6 @@ def run_fits(folder: Path, config: StudyConfig, *, workers: int, on_progress: Pr
         FileError: the folder cannot be written.
     """
     told: Progress = on_progress or _untold
-    load_ict()
     run_jobs(
         [
             ("models", [(_make_model, (folder, config, fold)) for fold in range(config.folds)],
@@ -224,7 +232,15 @@ def _untold(what: str, done: int, total: int) -> None:
 def _pool(workers: int) -> Executor:
     start_loading(tell=False)
     wait_until_loaded()
-    return ProcessPoolExecutor(workers, mp_context=context(), initializer=threadpool_limits, initargs=(1,))
+    folder = present_folder("ict-facekit", "ICT-FaceKit")
+    return ProcessPoolExecutor(workers, mp_context=context(), initializer=_begin, initargs=(folder,))
+
+
+def _begin(folder: Path) -> None:
+    """Start a worker; it is told where ICT-FaceKit is, since its environment may be older than this process's."""
+    global _ict_folder
+    _ict_folder = folder
+    threadpool_limits(1)
 
 
 def _run(pool: Executor | None, jobs: Sequence[Job]) -> Iterator[None]:
@@ -264,14 +280,16 @@ def stranger_path(folder: Path, person: int) -> Path:
     return folder / "fits" / f"stranger_{person:03d}.npz"
 
 
+_ict_folder: Path | None = None
 _ict: IctFaces | None = None
 _models: dict[Path, AdditiveModel] = {}
 
 
-def _faces_of_ict() -> IctFaces:
+def faces_of_ict() -> IctFaces:
+    """Return ICT-FaceKit, read once in each process."""
     global _ict
     if _ict is None:
-        _ict = load_ict()
+        _ict = load_ict(_ict_folder)
     return _ict
 
 
@@ -305,7 +323,7 @@ def training_meshes(
 
 def _make_model(folder: Path, config: StudyConfig, fold: int) -> None:
     training = np.flatnonzero(config.fold_of() != fold)
-    meshes, subjects, neutral = training_meshes(config, _faces_of_ict(), training.tolist())
+    meshes, subjects, neutral = training_meshes(config, faces_of_ict(), training.tolist())
     kin = [subject.removesuffix(MIRRORED) for subject in subjects]
     AdditiveModel.fit(
         meshes,
@@ -321,7 +339,7 @@ def _make_model(folder: Path, config: StudyConfig, fold: int) -> None:
 
 
 def _fit_person(folder: Path, config: StudyConfig, person: int) -> None:
-    people, ict = config.people, _faces_of_ict()
+    people, ict = config.people, faces_of_ict()
     own = int(config.fold_of()[person])
     order = [own, *(fold for fold in range(config.folds) if fold != own)]
     scans = [(face, people.scan(face, person, k)) for k, face in enumerate(people.faces(ict, person))]
@@ -427,6 +445,7 @@ def _fit_all(
     z, stddev = np.full((folds, n, k), np.nan), np.full((folds, n, k), np.nan)
     status = np.full((folds, n), -1, dtype=np.int32)
     error_mm, seconds = np.full(n, np.nan), np.full(n, np.nan)
+    told: dict[int, dict[int, Told]] = {fold: {} for fold in order}
     for row, scan in enumerate(scans):
         T: Similarity | None = None
         for fold in order if taught is None or taught[row] else order[:1]:
@@ -443,15 +462,21 @@ def _fit_all(
             stddev[fold, row, : shape.n_modes] = fitted.b_stddev / shape.stddev
             z[fold, row, shape.n_modes :], stddev[fold, row, shape.n_modes :] = 0.0, 1.0
             status[fold, row] = STATUSES.index(fitted.status)
+            assert fitted.z_covariance is not None
+            told[fold][row] = models[fold].told(fitted.z, fitted.z_covariance)
             if T is None:
                 T = fitted.T_scan_model
                 seconds[row] = time.perf_counter() - since
                 if taught is not None:
                     away = T.apply(shape.reconstruct(fitted.b)) - scan.truth_vertices
                     error_mm[row] = float(np.linalg.norm(away, axis=1).mean()) / scan.T_scan_model.scale
+    tied = _tied(models, told, folds, n)
     memory = io.BytesIO()
     np.savez(
         memory,
+        e_beside=tied["e_beside"].astype(np.float32),
+        e_together=tied["e_together"].astype(np.float32),
+        a_together=tied["a_together"].astype(np.float32),
         z=z.astype(np.float32),
         z_stddev=stddev.astype(np.float32),
         status=status,
@@ -460,6 +485,30 @@ def _fit_all(
     )
     make_folder(path.parent)
     write_bytes(path, memory.getvalue())
+
+
+def _tied(
+    models: Mapping[int, AdditiveModel], told: Mapping[int, Mapping[int, Told]], folds: int, scans: int
+) -> dict[str, FloatArray]:
+    """Return e beside the neutral scan, which is row 0, and e and a of all others together, by fold."""
+    most_e = max(model.n_expression for model in models.values())
+    most_a = max(model.n_identity for model in models.values())
+    beside, together = np.full((folds, scans, most_e), np.nan), np.full((folds, scans, most_e), np.nan)
+    identity = np.full((folds, 1, most_a), np.nan)
+    for fold, model in models.items():
+        known = told[fold]
+        rows = [row for row in known if row != 0]
+        if not rows:
+            continue
+        a, e = model.tie([known[row] for row in rows])
+        together[fold, rows], identity[fold] = 0.0, 0.0
+        together[fold, rows, : model.n_expression], identity[fold, 0, : model.n_identity] = e, a
+        if 0 in known:
+            beside[fold, rows] = 0.0
+            for row in rows:
+                _, e = model.tie([known[0], known[row]], neutral=[True, False])
+                beside[fold, row, : model.n_expression] = e[1]
+    return {"e_beside": beside, "e_together": together, "a_together": identity}
 
 
 def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
@@ -473,7 +522,7 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
     for path in paths:
         try:
             with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
-                part = {key: np.asarray(loaded[key]) for key in ("z", "z_stddev", "status", "error_mm", "seconds")}
+                part = {key: np.asarray(loaded[key]) for key in _SAVED}
         except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
             raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
         for key, rest in (("z", 0.0), ("z_stddev", 1.0)):
@@ -481,6 +530,10 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
             whole[..., : part[key].shape[2]] = part[key]
             part[key] = whole
         parts.append(part)
+    for key in ("e_beside", "e_together", "a_together"):
+        most = max(part[key].shape[2] for part in parts)
+        for part in parts:
+            part[key] = np.pad(part[key], ((0, 0), (0, 0), (0, most - part[key].shape[2])))
     counts = [parts[0]["z"].shape[1]] * len(parts)
     return Fits(
         z=_joined(parts, "z", 1),
@@ -488,6 +541,9 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
         status=np.concatenate([part["status"] for part in parts], axis=1).astype(np.int32),
         error_mm=_joined(parts, "error_mm", 0),
         seconds=_joined(parts, "seconds", 0),
+        e_beside=_joined(parts, "e_beside", 1),
+        e_together=_joined(parts, "e_together", 1),
+        a_together=_joined(parts, "a_together", 1),
         person=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         shown=np.tile(np.arange(counts[0], dtype=np.int32), len(parts)),
     )
