@@ -250,7 +250,9 @@ def _add_recognise_train(commands: Any) -> None:
     sub.add_argument("--neutral", default="neutral", metavar="LABEL", help="label of neutral faces (default neutral)")
     sub.add_argument("--confidence", type=_probability, default=0.5, metavar="P",
                      help="answer unsure below this probability (default 0.5)")  # fmt: skip
-    sub.add_argument("--modes", type=_positive, metavar="K", help="leading modes to see (default: all)")
+    sub.add_argument("--modes", type=_positive, metavar="K", help="leading coefficients to see (default: all)")
+    sub.add_argument("--expression-of", type=Path, metavar="MODEL.h5",
+                     help="see the expression alone, as parted by this model of build --additive")  # fmt: skip
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=_recognise_train)
 
@@ -517,6 +519,7 @@ def _recognise_train(arguments: argparse.Namespace) -> int:
         neutral=arguments.neutral,
         confidence=arguments.confidence,
         modes=arguments.modes,
+        expression_of=arguments.expression_of,
         seed=arguments.seed,
     )
     for note in notes:

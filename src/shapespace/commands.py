@@ -458,6 +458,7 @@ def recognise_train(
     neutral: str,
     confidence: float,
     modes: int | None,
+    expression_of: Path | None,
     seed: int,
 ) -> tuple[dict[str, Any], list[str]]:
     """Train a classifier on the fits in `results` and save it; return its facts and what the user should know.
@@ -465,15 +466,29 @@ def recognise_train(
     Raises:
         FileError: something cannot be read, or the classifier not written.
         FileFormatError: results or labels are damaged.
-        InputError: what `train_classifier` refuses, or a name that does not end in .skops.
+        InputError: what `train_classifier` refuses, fits of another model than `expression_of`, or a name that does
+            not end in .skops.
+        ModelFileError: `expression_of` does not part identity and expression.
         ShapespaceError: the extra `recognise` is not installed.
     """
+    from shapespace.model.additive import AdditiveModel
     from shapespace.recognise.predict import train_classifier
+    from shapespace.recognise.scans import one_model
 
     scans = labelled(read_scans(results), read_labels(labels))
+    projection: FloatArray | None = None
+    if expression_of is not None:
+        model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
+        if model.shape.content_hash != fitted_with:
+            raise InputError(
+                f"{results} holds fits of the model {fitted_with[:12]}, and {expression_of} is "
+                f"{model.shape.content_hash[:12]}; give the model that the scans were fitted with."
+            )
+        projection = model.rotation[model.n_identity :]
     saved, notes = train_classifier(
-        scans, classifier=classifier, relative=relative, neutral=neutral, confidence=confidence, modes=modes, seed=seed
-    )
+        scans, classifier=classifier, relative=relative, neutral=neutral, confidence=confidence, modes=modes,
+        projection=projection, seed=seed,
+    )  # fmt: skip
     make_folder(output.absolute().parent)
     saved.save(output)
     return saved.facts(), notes

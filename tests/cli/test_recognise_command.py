@@ -11,7 +11,10 @@ import pytest
 
 from conftest import Run, World
 from shapespace.batch.results import Source, coefficient_row, failed_record, write_coefficients, write_record
+from shapespace.errors import InputError
 from shapespace.io.tables import write_rows
+from shapespace.model.additive import AdditiveModel
+from shapespace.model.shape_model import ShapeModel
 
 pytest.importorskip("sklearn", reason="the extra `recognise` is not installed")
 
@@ -151,7 +154,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
         (("train", tmp_path / "empty", *labels, *out), "holds no results"),
         (("train", train, *labels, "-o", tmp_path / "x.pkl"), "ends in .skops"),
         (("train", train, *labels, *out, "--classifier", "forest"), "no classifier 'forest'"),
-        (("train", train, *labels, *out, "--modes", 9), "have 4 coefficients"),
+        (("train", train, *labels, *out, "--modes", 9), "There are 4 coefficients"),
         (("train", train, "--labels", tmp_path / "few.csv", *out), "at least two classes"),
         (("train", train, "--labels", train / "p0_smile.fit.json", *out), "table of labels|CSV"),
         (("predict", classifier, new, "-o", tmp_path / "a.csv"), "give --labels"),
@@ -164,6 +167,47 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
         assert any(part in outcome.sentence() for part in said.split("|")), outcome.err
     (train / "p0_smile.fit.json").write_text('{"format": "shapespace fit"}')
     assert "p0_smile is damaged" in run("recognise", "train", train, *labels, *out).sentence()
+
+
+def additive_model(path: Path) -> str:
+    """Write a model whose last coefficients are the expression, turned among all four; return its hash."""
+    rng = np.random.default_rng(3)
+    shape = ShapeModel(
+        mean=rng.normal(0, 50, 60), basis=np.linalg.qr(rng.standard_normal((60, 4)))[0], stddev=np.arange(8.0, 4.0, -1),
+        total_variance=200.0, n_training=30,
+    )  # fmt: skip
+    AdditiveModel(shape, np.linalg.qr(rng.standard_normal((4, 4)))[0], 2).save(path)
+    return shape.content_hash
+
+
+def test_expression_alone_is_seen_where_the_model_parts_it(run: Run, tmp_path: Path) -> None:
+    own = additive_model(tmp_path / "m.h5")
+    train, new = (make_results(tmp_path / name, 8, seed, own) for name, seed in (("t", 0), ("n", 1)))
+    common = ("--labels", train / "labels.csv", "--expression-of", tmp_path / "m.h5")
+    made = run("recognise", "train", train, *common, "-o", tmp_path / "c.skops", "--relative", "--json")
+    assert made.code == 0, made.err
+    assert (made.facts["coefficients"], made.facts["modes"]) == ("expression", 2)
+    told = ("recognise", "predict", tmp_path / "c.skops", new, "--labels", new / "labels.csv")
+    assert run(*told, "-o", tmp_path / "a.csv").code == 0
+    # What identity does to all coefficients must not be seen by a classifier of e alone.
+    rotation = AdditiveModel.load(tmp_path / "m.h5").rotation
+    from shapespace.recognise.saved import load_classifier
+
+    saved, shift = load_classifier(tmp_path / "c.skops"), rotation[:2].sum(axis=0)
+    z = np.random.default_rng(0).standard_normal((5, 4))
+    assert np.allclose(saved.probabilities(z), saved.probabilities(z + 9.0 * shift))
+    assert not np.allclose(saved.probabilities(z), saved.probabilities(z + rotation[3]))
+    with pytest.raises(InputError, match=r"with K 4, not \(5, 2\)"):
+        saved.probabilities(z[:, :2])
+    for wrong, said in (
+        (("--expression-of", train / "labels.csv"), "labels.csv"),
+        (("--expression-of", tmp_path / "m.h5", "--modes", "3"), "There are 2 coefficients"),
+    ):
+        outcome = run("recognise", "train", train, "--labels", train / "labels.csv", "-o", tmp_path / "x.skops", *wrong)
+        assert outcome.code == 2 and said in outcome.sentence()
+    others = make_results(tmp_path / "o", 8, 0)
+    outcome = run("recognise", "train", others, *common, "-o", tmp_path / "x.skops")
+    assert outcome.code == 2 and "give the model that the scans were fitted with" in outcome.sentence()
 
 
 @pytest.mark.parametrize("command", ["train", "predict"])

@@ -144,7 +144,7 @@ def test_one_person_alone_gives_no_accuracy():
     [
         (lambda s: s, {"classifier": "forest"}, "no classifier 'forest'; choose among mean-direction"),
         (lambda s: s, {"confidence": 2.0}, "from 0 to 1"),
-        (lambda s: s, {"modes": 6}, "have 5 coefficients"),
+        (lambda s: s, {"modes": 6}, "There are 5 coefficients"),
         (lambda s: [changed(x, label="") for x in s], {}, "None of the 32 scans"),
         (lambda s: [changed(x, label="smile") for x in s], {}, "at least two classes"),
         (lambda s: s[:4], {}, "at least two scans each"),

@@ -73,6 +73,39 @@ def test_probabilities_see_the_leading_modes_only(good):
             classifier.probabilities(wrong)
 
 
+def with_projection(tmp_path: Path) -> Path:
+    turned = np.linalg.qr(np.random.default_rng(8).standard_normal((7, 7)))[0][:5]
+    trained(projection=turned).save(tmp_path / "e.skops")
+    return tmp_path / "e.skops"
+
+
+def test_a_classifier_of_expressions_keeps_what_parts_them(tmp_path):
+    after = load_classifier(with_projection(tmp_path))
+    z, _ = samples(seed=4)
+    assert after.projection.shape == (5, 7) and after.width == 7
+    plain = trained()
+    np.testing.assert_allclose(after.probabilities(z @ after.projection), plain.probabilities(z), atol=1e-12)
+
+
+@pytest.mark.parametrize("damage", ["gone", "pickled", "narrow", "not finite"])
+def test_a_damaged_projection_is_refused(tmp_path, damage):
+    path, stream = with_projection(tmp_path), io.BytesIO()
+    if damage == "pickled":
+        np.save(stream, np.array([[{}]], dtype=object), allow_pickle=True)
+    elif damage == "narrow":
+        np.save(stream, np.eye(7)[:3])
+    else:
+        np.save(stream, np.full((5, 7), np.nan))
+    content = {} if damage == "gone" else {"projection.npy": stream.getvalue()}
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist() if name != "projection.npy"} | content
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+    with pytest.raises(FileFormatError, match="train it again"):
+        load_classifier(path)
+
+
 def test_coefficients_of_another_model_are_refused(good):
     classifier = load_classifier(good)
     classifier.refuse_other_model(HASH)

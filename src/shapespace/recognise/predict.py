@@ -58,6 +58,7 @@ def train_classifier(
     neutral: str = NEUTRAL,
     confidence: float = CONFIDENCE,
     modes: int | None = None,
+    projection: FloatArray | None = None,
     seed: int = 0,
 ) -> tuple[SavedClassifier, list[str]]:
     """Train a classifier on fitted scans with labels; return it and what the user should know.
@@ -71,7 +72,9 @@ def train_classifier(
         relative: take coefficients relative to the subject's neutral face; neutral faces are then no class.
         neutral: the label of neutral faces.
         confidence: probability, 0 to 1, below which the answer will be `UNSURE`.
-        modes: number of leading modes to see; None is all.
+        modes: number of leading coefficients to see; None is all.
+        projection: (Ke, K) from coefficients to those of expression, to see these alone: the last rows of
+            `AdditiveModel.rotation`.
         seed: of folds and classifier.
 
     Raises:
@@ -95,7 +98,14 @@ def train_classifier(
     notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(lost.items())]
     if without_label:
         notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
-    z, K = _stacked(used), _modes(used, modes)
+    z = _stacked(used)
+    if projection is not None:
+        if projection.shape[1:] != z.shape[1:]:
+            raise InputError(
+                f"The fits have {z.shape[1]} coefficients, this model {projection.shape[1]}; fit with all its modes."
+            )
+        z = z @ projection.T
+    K = _modes(z.shape[1], modes)
     labels = np.asarray([scan.label for scan in used])
     subjects = [scan.subject for scan in used]
     if relative:
@@ -129,7 +139,7 @@ def train_classifier(
     }
     saved = SavedClassifier(
         pipeline, classifier, model_hash, K, relative, neutral, tuple(classes.tolist()), float(confidence), temperature,
-        training, checked, software_versions(),
+        training, checked, software_versions(), projection,
     )  # fmt: skip
     return saved, notes
 
@@ -245,10 +255,9 @@ def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:
     return np.stack(rows)
 
 
-def _modes(scans: Sequence[ScanCoefficients], modes: int | None) -> int:
-    known = next(len(scan.z) for scan in scans if scan.z is not None)
+def _modes(known: int, modes: int | None) -> int:
     if modes is None:
         return known
     if not 1 <= modes <= known:
-        raise InputError(f"The fits have {known} coefficients, so a classifier cannot see {modes} of them.")
+        raise InputError(f"There are {known} coefficients, so a classifier cannot see {modes} of them.")
     return modes

@@ -33,6 +33,7 @@ FORMAT = "shapespace classifier"
 FORMAT_VERSION = 1
 FACTS = "shapespace.json"
 _SCHEMA = "schema.json"
+_PROJECTION = "projection.npy"
 
 TRUSTED = frozenset(
     {
@@ -73,7 +74,7 @@ class SavedClassifier:
         pipeline: of scikit-learn, fitted.
         classifier: its name in `CLASSIFIERS`.
         model_hash: content hash of the model whose coefficients it takes.
-        modes: K, number of leading modes that it sees.
+        modes: number of leading coefficients that it sees.
         relative_to_neutral: whether it takes coefficients relative to the subject's neutral face.
         neutral: the label of neutral faces.
         classes: C names, in the order of the probabilities.
@@ -82,6 +83,8 @@ class SavedClassifier:
         training: counts of what it was trained on and of what was left out.
         cross_validation: how it did on people left out, or why that is not known.
         versions: of the software that trained it.
+        projection: (Ke, K) from the model's coefficients to those of expression, which it then sees alone; None sees
+            the model's own.
     """
 
     pipeline: Pipeline
@@ -96,6 +99,12 @@ class SavedClassifier:
     training: Mapping[str, Any]
     cross_validation: Mapping[str, Any]
     versions: Mapping[str, str]
+    projection: FloatArray | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of the model's coefficients that it asks for."""
+        return self.modes if self.projection is None else self.projection.shape[1]
 
     def probabilities(self, z: FloatArray) -> FloatArray:
         """Return calibrated probabilities (n, C) for finite coefficients `z` (n, K or more), in standard deviations.
@@ -105,10 +114,13 @@ class SavedClassifier:
         Raises:
             InputError: fewer coefficients than the classifier sees, or values that are not finite.
         """
-        if z.ndim != 2 or z.shape[1] < self.modes or not np.isfinite(z).all():
+        enough = z.ndim == 2 and (z.shape[1] >= self.width if self.projection is None else z.shape[1] == self.width)
+        if not enough or not np.isfinite(z).all():
+            least = "at least " if self.projection is None else ""
             raise InputError(
-                f"This classifier takes (n, K) finite coefficients with K at least {self.modes}, not {z.shape}."
+                f"This classifier takes (n, K) finite coefficients with K {least}{self.width}, not {z.shape}."
             )
+        z = z if self.projection is None else z @ self.projection.T
         pipeline: Any = self.pipeline
         return calibrated(np.asarray(pipeline.predict_proba(z[:, : self.modes])), self.temperature)
 
@@ -133,6 +145,7 @@ class SavedClassifier:
             "classifier": self.classifier,
             "model_hash": self.model_hash,
             "modes": self.modes,
+            "coefficients": "all" if self.projection is None else "expression",
             "relative_to_neutral": self.relative_to_neutral,
             "neutral": self.neutral,
             "classes": list(self.classes),
@@ -154,8 +167,12 @@ class SavedClassifier:
             raise InputError(f"{path}: give the classifier's file a name that ends in .skops.")
         buffer = io.BytesIO(skops_io.dumps(self.pipeline))
         # What the pipeline answers here tells another version, or a damaged file, that it answers something else.
-        facts = {**self.facts(), "probe": self.probabilities(_probe(self.modes)).tolist()}
+        facts = {**self.facts(), "probe": self.probabilities(_probe(self.width)).tolist()}
         with zipfile.ZipFile(buffer, "a") as archive:
+            if self.projection is not None:
+                array = io.BytesIO()
+                np.save(array, self.projection, allow_pickle=False)
+                archive.writestr(_PROJECTION, array.getvalue())
             archive.writestr(FACTS, json.dumps(facts, indent=1, allow_nan=False) + "\n")
         write_bytes(path, buffer.getvalue())
 
@@ -186,11 +203,11 @@ def load_classifier(path: Path) -> SavedClassifier:
             pipeline: Any = skops_io.loads(content, trusted=_OURS)
     except Exception as error:  # a damaged schema may raise anything at all
         raise FileFormatError(f"{path} holds a classifier that cannot be read; {_AGAIN}.") from error
-    saved = _saved(path, pipeline, facts)
+    saved = _saved(path, pipeline, facts, members.get(_PROJECTION))
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            answer = saved.probabilities(_probe(saved.modes))
+            answer = saved.probabilities(_probe(saved.width))
             told = np.asarray(facts["probe"], dtype=np.float64)
             same = answer.shape == told.shape and bool(np.abs(answer - told).max() <= _PROBE_TOLERANCE)
             same = same and tuple(str(name) for name in pipeline.classes_) == saved.classes
@@ -288,9 +305,9 @@ def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
     return known
 
 
-def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any]) -> SavedClassifier:
+def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: bytes | None) -> SavedClassifier:
     try:
-        if not isinstance(pipeline, Pipeline):
+        if not isinstance(pipeline, Pipeline) or (facts["coefficients"] == "expression") != (projection is not None):
             raise TypeError
         classes = tuple(_text(name) for name in cast(Sequence[Any], facts["classes"]))
         saved = SavedClassifier(
@@ -306,10 +323,12 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any]) -> SavedClassifi
             dict(facts["training"]),
             dict(facts["cross_validation"]),
             {str(name): str(number) for name, number in dict(facts["versions"]).items()},
+            None if projection is None else _projection(projection),
         )
         good = (
             saved.classifier in CLASSIFIERS
             and 1 <= saved.modes <= 100_000
+            and (saved.projection is None or saved.modes <= len(saved.projection))
             and 0 <= saved.confidence <= 1
             and 0 < saved.temperature < math.inf
             and len(set(classes)) == len(classes) >= 2
@@ -320,6 +339,13 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any]) -> SavedClassifi
     if not good:
         raise FileFormatError(f"{path}: {FACTS} in it is damaged; {_AGAIN}.")
     return saved
+
+
+def _projection(content: bytes) -> FloatArray:
+    array = np.load(io.BytesIO(content), allow_pickle=False)
+    if array.dtype != np.float64 or array.ndim != 2 or not np.isfinite(array).all():
+        raise ValueError
+    return cast(FloatArray, array)
 
 
 def _text(value: Any) -> str:
