@@ -294,7 +294,7 @@ def _add_recognise_study(commands: Any) -> None:
                      help="folds by subject (default 4 for simulated people, 10 with --data)")  # fmt: skip
     sub.add_argument("--seed", type=_natural, metavar="S", help="of everything that is drawn")
     sub.add_argument("--shape-spaces", action="store_true",
-                     help="compare vertices with B-spline control points too (10 minutes more)")  # fmt: skip
+                     help="compare vertices with B-spline control points too (11 minutes more)")  # fmt: skip
     sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=_recognise_study)
