@@ -65,7 +65,7 @@ def _sizes(rows: list[Record], compared: ShapeSpaces) -> Part:
 def _fits(rows: list[Record], compared: ShapeSpaces) -> Part:
     return parts.table(
         "Fits of scans with noise and holes: vertex error, and distance of the surfaces",
-        [("Shape space", "text"), *((f"{name}{what}", "mm") for name in SCANS for what in ("", ", surfaces"))],
+        [("Shape space", "text"), *((f"{name}{what} (mm)", "mm") for name in SCANS for what in ("", ", surfaces"))],
         [
             (row["shape space"],
              *(row["scans"][name][key] for name in SCANS for key in ("vertex_mm", "surface_mm")))
@@ -78,7 +78,7 @@ def _fits(rows: list[Record], compared: ShapeSpaces) -> Part:
 def _training(rows: list[Record]) -> Part:
     return parts.table(
         "The same models made of damaged meshes: floor on undamaged faces of others",
-        [("Shape space", "text"), *((f"trained on {name}", "mm") for name in TRAINING)],
+        [("Shape space", "text"), *((f"trained on {name} (mm)", "mm") for name in TRAINING)],
         [(row["shape space"], *(row["trained on"][name] for name in TRAINING)) for row in rows],
         "Vertices refuse meshes with holes; control points are found without them.",
     )
