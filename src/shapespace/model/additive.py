@@ -93,8 +93,8 @@ class AdditiveModel:
     ) -> AdditiveModel:
         """Build the model of corresponding `meshes`, in mm.
 
-        The directions of the modes are those of all meshes; their variances are those that people have who took no
-        part in the modes, so that a new face is not read as an expression for want of identity.
+        The directions of the modes are those of all meshes. From 50 people on their variances are those that people
+        have who took no part in the modes, so that a new face is not read as an expression for want of identity.
 
         Args:
             meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
@@ -147,29 +147,32 @@ class AdditiveModel:
         kin_of = dict(zip(subjects, kin or subjects, strict=True))
         identity = principal_components(neutrals.reshape(len(neutrals), -1), identity_modes)
         A, centred = identity.basis, (neutrals - neutrals.mean(axis=0)).reshape(len(neutrals), -1)
-        identity_variance, identity_left = held_out_variances(
-            centred @ centred.T, [kin_of[name] for name in people], identity.variance, centred=True
-        )
         moved = shapes.reshape(len(shapes), -1)
         gram = moved @ moved.T
         B, sample = _modes_through_zero(moved, gram, expression_modes)
-        expression_variance, expression_left = held_out_variances(
-            gram, [kin_of[subjects[i]] for i in expressive], sample, centred=False
-        )
+        whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
+        a_held = held_out_variances(centred @ centred.T, whose[0], identity.variance, centred=True)
+        e_held = held_out_variances(gram, whose[1], sample, centred=False)
+        if a_held is None or e_held is None:
+            identity_variance, expression_variance, held_out = identity.variance, sample, False
+            total = identity.total_variance + float(np.trace(gram)) / len(gram)
+        else:
+            (identity_variance, a_left), (expression_variance, e_left) = a_held, e_held
+            total, held_out = float(identity_variance.sum() + expression_variance.sum()) + a_left + e_left, True
         shape, rotation = _as_shape_model(A * np.sqrt(identity_variance), B * np.sqrt(expression_variance))
         basis, stddev = shape
         model = ShapeModel(
             mean=identity.mean,
             basis=basis,
             stddev=stddev,
-            total_variance=float(identity_variance.sum() + expression_variance.sum()) + identity_left + expression_left,
+            total_variance=total,
             n_training=len(meshes),
             faces=faces,
             gauge=gauge,
             landmarks=landmarks or {},
             provenance=provenance,
             licence=licence,
-            held_out=True,
+            held_out=held_out,
         )
         return cls(model, rotation, len(identity_variance))
 
@@ -244,7 +247,9 @@ class AdditiveModel:
         """Return one identity and the expressions of several scans of one person, by all their fits together.
 
         The normal equations are block-arrow, so a is solved for first and each e after it. What identity has outside
-        the model is the same in all scans of a person and does not average out, so n scans count 1/n each.
+        the model is the same in all scans of a person and does not average out, so n scans, each with the prior of its
+        own e, count 1/n each: the same scan n times is the scan. For the same reason e is nearer the truth less the e
+        of a neutral scan tied with it.
 
         Args:
             told: what each fit told.
@@ -268,7 +273,7 @@ class AdditiveModel:
             if neutral is not None and neutral[number]:
                 solves.append(None)
                 continue
-            cross, own = precision[:k, k:], precision[k:, k:] + np.eye(self.n_expression)
+            cross, own = precision[:k, k:], precision[k:, k:] + share * np.eye(self.n_expression)
             solved = np.asarray(np.linalg.solve(own, np.column_stack([cross.T, pull[k:]])), dtype=np.float64)
             left, right = left - cross @ solved[:, :-1], right - cross @ solved[:, -1]
             solves.append(solved)

@@ -35,8 +35,9 @@ class Rows:
         expression: n names; neutral among them.
         shown: (n,) place of the scan among its person's: 0 is neutral, and the same number is the same expression.
         subject: n names.
-        e_beside: (n, Ke) expressions found together with the person's neutral scan; NaN where there is none.
-        e_together: (n, Ke) expressions found together with all the person's scans, none of them labelled.
+        e_beside: (n, Ke) expressions found together with the person's neutral scan, less that scan's; NaN where there
+            is none.
+        e_together: (n, Ke) expressions found together with all other expressive scans of the person, without labels.
     """
 
     z: FloatArray

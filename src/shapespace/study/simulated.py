@@ -127,7 +127,7 @@ class Fits:
         status: (F, N) index of `STATUSES`; -1 where none was needed.
         error_mm: (N,) mean distance of the vertices to the true ones, in the fold where the scan is tested.
         seconds: (N,) of that fit.
-        e_beside: (F, N, Ke) expressions by tying each scan with the person's neutral scan, known as such; NaN where
+        e_beside: (F, N, Ke) expressions by tying each scan with the person's neutral scan, less that scan's; NaN where
             there is none. Ke is that of the largest model and the rest is 0.
         e_together: (F, N, Ke) by tying all expressive scans of the person, none of them known as anything.
         a_together: (F, P, Ka) the identity of those.
@@ -506,8 +506,9 @@ def _tied(
         if 0 in known:
             beside[fold, rows] = 0.0
             for row in rows:
-                _, e = model.tie([known[0], known[row]], neutral=[True, False])
-                beside[fold, row, : model.n_expression] = e[1]
+                # The difference takes out what identity outside the model leaves in both.
+                _, e = model.tie([known[0], known[row]])
+                beside[fold, row, : model.n_expression] = e[1] - e[0]
     return {"e_beside": beside, "e_together": together, "a_together": identity}
 
 
