@@ -441,7 +441,8 @@ def _build(arguments: argparse.Namespace) -> int:
     else:
         _print(
             f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
-            f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of their variance, "
+            f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of "
+            f"{'the variance of people left out' if model.held_out else 'their variance'}, "
             f"gauge {facts['gauge']}"
         )
     return 0

@@ -283,6 +283,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "units": "mm",
         "extent_mm": np.ptp(model.mean_vertices, axis=0).tolist(),
         "variance_held": float(model.cumulative_variance[-1]),
+        "variance_of": "people left out" if model.held_out else "training shapes",
         "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
         "noise_variance_mm2": model.noise_variance,
@@ -475,7 +476,7 @@ def recognise_train(
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.scans import one_model
 
-    scans = labelled(read_scans(results), read_labels(labels))
+    scans = labelled(read_scans(results), read_labels(labels, of_subjects=False))
     projection: FloatArray | None = None
     if expression_of is not None:
         model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)

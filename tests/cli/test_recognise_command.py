@@ -149,6 +149,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged.skops").write_bytes(classifier.read_bytes()[:900])
     (tmp_path / "few.csv").write_text("file,label\np0_smile,smile\n")
+    (tmp_path / "people.csv").write_text("file,subject,foo\np0_smile,p0,smile\n")
     asked = [
         (("train", tmp_path / "absent", *labels, *out), "no such file"),
         (("train", tmp_path / "empty", *labels, *out), "holds no results"),
@@ -157,6 +158,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
         (("train", train, *labels, *out, "--modes", 9), "There are 4 coefficients"),
         (("train", train, "--labels", tmp_path / "few.csv", *out), "at least two classes"),
         (("train", train, "--labels", train / "p0_smile.fit.json", *out), "table of labels|CSV"),
+        (("train", train, "--labels", tmp_path / "people.csv", *out), "a column label or expression"),
         (("predict", classifier, new, "-o", tmp_path / "a.csv"), "give --labels"),
         (("predict", tmp_path / "damaged.skops", new, "-o", tmp_path / "a.csv"), "cut short"),
         (("predict", train / "labels.csv", new, "-o", tmp_path / "a.csv"), "not a classifier"),

@@ -144,3 +144,10 @@ def test_the_temperature_rises_where_directions_say_less():
 def test_settings_without_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="must"):
         wrong.fit(*three_directions())
+
+
+def test_quadratic_discriminants_of_one_sample_a_class_go_to_the_nearest():
+    X = np.array([[0.0, 1.0, 2.0], [3.0, 0.0, -1.0]])
+    rule = ShrinkageQDA().fit(X, ["a", "b"])
+    np.testing.assert_array_equal(rule.predict(X + 0.1), ["a", "b"])
+    assert np.isfinite(rule.predict_proba(1e3 * X)).all()

@@ -87,7 +87,7 @@ def test_a_classifier_of_expressions_keeps_what_parts_them(tmp_path):
     np.testing.assert_allclose(after.probabilities(z @ after.projection), plain.probabilities(z), atol=1e-12)
 
 
-@pytest.mark.parametrize("damage", ["gone", "pickled", "narrow", "not finite"])
+@pytest.mark.parametrize("damage", ["gone", "pickled", "narrow", "not finite", "header"])
 def test_a_damaged_projection_is_refused(tmp_path, damage):
     path, stream = with_projection(tmp_path), io.BytesIO()
     if damage == "pickled":
@@ -96,7 +96,8 @@ def test_a_damaged_projection_is_refused(tmp_path, damage):
         np.save(stream, np.eye(7)[:3])
     else:
         np.save(stream, np.full((5, 7), np.nan))
-    content = {} if damage == "gone" else {"projection.npy": stream.getvalue()}
+    data = stream.getvalue().replace(b"(5, 7)", b"(10**9") if damage == "header" else stream.getvalue()
+    content = {} if damage == "gone" else {"projection.npy": data}
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist() if name != "projection.npy"} | content
     with zipfile.ZipFile(path, "w") as archive:

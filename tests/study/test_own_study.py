@@ -1,6 +1,7 @@
 """The study on scans of one's own: found by their labels, fitted, classified by person, reported."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,17 @@ def test_too_few_people_are_one_sentence(world: Path, tmp_path: Path, capsys: py
     code = command("recognise", "study", "--data", str(folder), "--model", str(world / "model.h5"),
                    "-o", str(tmp_path / "o"), "--no-open")  # fmt: skip
     assert code == 2 and "at least 4 people" in capsys.readouterr().err
+
+
+def test_two_folds_do_and_one_is_refused(
+    world: Path, studied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(studied, tmp_path / "s")
+    asked = ("recognise", "study", "--data", str(world / "scans"), "--model", str(world / "model.h5"),
+             "-o", str(tmp_path / "s"), "--no-open")  # fmt: skip
+    assert command(*asked, "--folds", "2") == 0
+    assert command(*asked, "--folds", "1") == 2
+    assert "leave fewer than two to learn from" in capsys.readouterr().err
 
 
 def test_a_table_without_subjects_cannot_part_them(

@@ -32,11 +32,15 @@ class Label:
     subject: str = ""
 
 
-def read_labels(path: Path) -> dict[str, Label]:
+def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
     """Return the labels in a CSV table by the name of the scan, without folder and ending.
 
     The scan stands in the column `file`, `scan` or `name`; its class in `label`, `expression`, `class`, `group` or
     `subject`, the first that is there; `intensity` and `subject` may stand beside it.
+
+    Args:
+        path: the table.
+        of_subjects: whether subjects may stand for classes where there is no other column.
 
     Raises:
         FileError: it cannot be read.
@@ -51,7 +55,7 @@ def read_labels(path: Path) -> dict[str, Label]:
         raise FileFormatError(f"{path} is not a CSV table in UTF-8 ({error}).") from error
     heads = list(rows[0]) if rows else []
     name = next((head for head in _NAMES if head in heads), None)
-    label = next((head for head in _LABELS if head in heads), None)
+    label = next((head for head in _LABELS if head in heads and (of_subjects or head != "subject")), None)
     if name is None or label is None:
         raise FileFormatError(
             f"{path} is no table of labels; it needs rows, a column {_NAMES[0]} and a column {_LABELS[0]} or "

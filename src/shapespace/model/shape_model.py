@@ -39,7 +39,7 @@ class ShapeModel:
         mean: (D,) mm; D = 3V for vertices, 3mn for B-splines of m x n control points.
         basis: (D, K) columns that move the vertices orthonormally; for vertices they are themselves orthonormal.
         stddev: (K,) of each coefficient, mm.
-        total_variance: of all modes of the training set, kept or not, mm^2.
+        total_variance: of all modes of the training set, kept or not, mm^2; of those left out where `held_out`.
         n_training: number of training shapes.
         faces: (F, 3) int32 or None for point models.
         gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).

@@ -186,7 +186,8 @@ class ShrinkageQDA(ClassifierMixin, BaseEstimator):
         for c, count in enumerate(counts):
             mine = deviation[own == c]
             values, vectors = np.linalg.eigh((1 - self.shrinkage) * (mine.T @ mine / count) + self.shrinkage * pooled)
-            values = np.maximum(values, max(float(values[-1]), 1e-300) * 1e-12)
+            # One sample a class has no spread of its own.
+            values = np.maximum(values, max(1e-12 * float(values[-1]), 1e-12 * float(X.var(axis=0).mean()), 1e-100))
             whiten[c] = vectors / np.sqrt(values)
             offsets[c] = np.log(count / len(X)) - 0.5 * np.log(values).sum()
         self.whiten_, self.offsets_ = whiten, offsets

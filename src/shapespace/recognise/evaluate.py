@@ -341,8 +341,11 @@ def predict_probabilities(
     neighbours = int(getattr(pipeline[-1], "n_neighbors", 1))
     if neighbours > len(X):
         raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
-    pipeline.fit(X, labels)
     finite = np.isfinite(test).all(axis=1)
+    only = np.unique(np.asarray(labels, dtype=str))
+    if len(only) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
+        return np.where(finite[:, None], np.asarray(classes) == only[0], np.nan)
+    pipeline.fit(X, labels)
     answer = np.full((len(test), len(classes)), np.nan)
     if finite.any():
         columns = [classes.index(name) for name in pipeline.classes_.tolist()]

@@ -102,7 +102,7 @@ def train_classifier(
     if projection is not None:
         if projection.shape[1:] != z.shape[1:]:
             raise InputError(
-                f"The fits have {z.shape[1]} coefficients, this model {projection.shape[1]}; fit with all its modes."
+                f"The fits have {z.shape[1]} coefficients, this model {projection.shape[1]}; fit with all modes."
             )
         z = z @ projection.T
     K = _modes(z.shape[1], modes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from datetime import UTC, datetime
@@ -62,7 +63,7 @@ def run_own(
         InputError: too few people or expressions.
     """
     found = scan_set(data)
-    _check(found.scans, data)
+    _check(found.scans, data, folds)
     if on_scans is not None:
         on_scans(len(found.scans))
     model = ShapeModel.load(model_file)
@@ -81,7 +82,7 @@ def run_own(
     return path, found.summary()
 
 
-def _check(scans: Sequence[ScanEntry], data: Path) -> None:
+def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
     people = {entry.subject for entry in scans if entry.expression != NEUTRAL}
     classes = {entry.expression for entry in scans if entry.expression != NEUTRAL}
     for name in classes:
@@ -92,6 +93,11 @@ def _check(scans: Sequence[ScanEntry], data: Path) -> None:
         raise InputError(
             f"{data}: a study needs at least {_FEWEST_SUBJECTS} people and two expressions beside neutral, not "
             f"{len(people)} and {len(classes)}."
+        )
+    parted = min(folds, len(people))
+    if parted < 2 or len(people) - math.ceil(len(people) / parted) < 2:
+        raise InputError(
+            f"{data}: {folds} folds of {len(people)} people leave fewer than two to learn from; ask for more folds."
         )
 
 
@@ -135,7 +141,7 @@ def _document(
         for name, code in codes.items():
             used = _relative(code, subject, expression) if relative else code
             made = evaluate.folds_of(used[tested], labels.tolist(), subjects.tolist(), n_folds, seed)
-            nested = evaluate.nested_predictions(made, inner_folds=min(4, n_folds - 1), seed=seed, modes=(10, None))
+            nested = evaluate.nested_predictions(made, inner_folds=parts.inner_folds(made), seed=seed, modes=(10, None))
             accuracy, interval = parts.accuracy_of(labels, nested.predicted, subjects)
             chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
             rows.append((name, word, f"nested choice ({chosen})", accuracy, interval))

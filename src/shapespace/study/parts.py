@@ -114,6 +114,11 @@ def accuracy_of(
     return evaluate.macro_accuracy(some[0], some[1], classes), evaluate.subject_bootstrap(*some)
 
 
+def inner_folds(folds: Sequence[evaluate.Fold]) -> int:
+    """Return how many folds the training people are parted into: four, or fewer where there are fewer people."""
+    return min(4, *(len(set(fold.train_subjects)) for fold in folds))
+
+
 def fixed(folds: Sequence[evaluate.Fold], classifier: str) -> evaluate.Predictions | None:
     """Return the predictions of one classifier, or None where it asks for more samples than there are."""
     try:

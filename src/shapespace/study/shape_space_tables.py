@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from shapespace.errors import FileFormatError
 from shapespace.recognise import evaluate
 from shapespace.study import parts
 from shapespace.study.parts import Part
@@ -36,13 +37,16 @@ def shape_space_parts(inside: Path, compared: ShapeSpaces, seed: int) -> list[Pa
         FileFormatError: it is damaged.
     """
     rows = read_rows(inside, compared)
-    return [
-        _sizes(rows, compared),
-        _fits(rows, compared),
-        _training(rows),
-        _recognition(inside, compared, seed),
-        *_maps(read_record(inside / "maps.json")),
-    ]
+    try:
+        return [
+            _sizes(rows, compared),
+            _fits(rows, compared),
+            _training(rows),
+            _recognition(inside, compared, seed),
+            *_maps(read_record(inside / "maps.json")),
+        ]
+    except (KeyError, TypeError, IndexError, AttributeError) as error:
+        raise FileFormatError(f"A file in {inside} is damaged; delete the folder and run the study again.") from error
 
 
 def _sizes(rows: list[Record], compared: ShapeSpaces) -> Part:

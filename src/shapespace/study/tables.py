@@ -294,7 +294,7 @@ class _Maker:
         weights = weights[:, weights.std(axis=0) > 0]
         folds = [self._fold(weights, weights, fold, taught=False) for fold in range(config.folds)]
         found = evaluate.nested_predictions(
-            folds, classifiers=("lda", "logistic", "svm"), modes=(None,), inner_folds=_inner(folds)
+            folds, classifiers=("lda", "logistic", "svm"), modes=(None,), inner_folds=parts.inner_folds(folds)
         )
         self.true_weights = np.asarray(found.predicted)
         every, interval = parts.accuracy_of(self.labels, found.predicted, self.subjects)
@@ -484,7 +484,7 @@ class _Maker:
         for relative in (False, True):
             folds = self._additive_folds("known" if relative else "unknown")
             self.told("the classifier, by nested cross-validation")
-            nested = evaluate.nested_predictions(folds, modes=(10, None), inner_folds=_inner(folds))
+            nested = evaluate.nested_predictions(folds, modes=(10, None), inner_folds=parts.inner_folds(folds))
             by_neutral[relative] = nested
             chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
             word = "known" if relative else "unknown"
@@ -704,7 +704,7 @@ class _Maker:
             fold = evaluate.Fold(
                 training_codes, names.tolist(), by.tolist(), codes, labels[kept].tolist(), subject[kept].tolist()
             )
-            nested = evaluate.nested_predictions([fold], modes=(10, None), inner_folds=_inner([fold]))
+            nested = evaluate.nested_predictions([fold], modes=(10, None), inner_folds=parts.inner_folds([fold]))
             answers[how] = np.asarray(nested.predicted)
             reached[how], interval = parts.accuracy_of(labels[kept], answers[how], subject[kept])
             chosen = f"chosen inside the training people ({nested.chosen[0].classifier})"
@@ -831,11 +831,6 @@ class _Maker:
             for f in range(self.study.config.folds)
         ]
         return parts.accuracy_of(self.labels, evaluate.fixed_predictions(folds, "lda").predicted, self.subjects)[0]
-
-
-def _inner(folds: Sequence[evaluate.Fold]) -> int:
-    """Return how many folds the training people are parted into: four, or fewer where there are fewer people."""
-    return min(4, *(len(set(fold.train_subjects)) for fold in folds))
 
 
 def _same_rows(folds: Sequence[evaluate.Fold]) -> list[evaluate.Fold]:
