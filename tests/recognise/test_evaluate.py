@@ -21,6 +21,7 @@ from shapespace.recognise.evaluate import (
     nested_predictions,
     per_class,
     permutation_test,
+    predict_probabilities,
     region_shares,
     subject_bootstrap,
     subject_folds,
@@ -292,3 +293,11 @@ def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch
     nested_predictions(folds_of(z, labels, subjects, 3), classifiers=["lda"], modes=(None,), inner_folds=4)
     assert len(seen) == 3 * (4 + 3 * 4 + 1)
     assert all(not trained & tested for trained, tested in seen)
+
+
+def test_where_training_shows_one_class_alone_everything_is_that_class():
+    X = np.random.default_rng(0).standard_normal((6, 3))
+    test = np.vstack([X[:2], np.full((1, 3), np.nan)])
+    for name in ("lda", "logistic", "svm"):
+        found = predict_probabilities(X, np.array(["smile"] * 6), test, ("fear", "smile"), name, {})
+        np.testing.assert_array_equal(found, [[0, 1], [0, 1], [np.nan, np.nan]])
