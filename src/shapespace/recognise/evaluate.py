@@ -344,7 +344,10 @@ def predict_probabilities(
     finite = np.isfinite(test).all(axis=1)
     only = np.unique(np.asarray(labels, dtype=str))
     if len(only) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
-        return np.where(finite[:, None], np.asarray(classes) == only[0], np.nan)
+        answer = np.full((len(test), len(classes)), np.nan)
+        answer[finite] = 0.0
+        answer[finite, list(classes).index(str(only[0]))] = 1.0
+        return answer
     pipeline.fit(X, labels)
     answer = np.full((len(test), len(classes)), np.nan)
     if finite.any():
