@@ -81,7 +81,40 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
         return np.asarray(_directions(X) @ self.directions_.T)
 
 
-class ShrinkageLDA(ClassifierMixin, BaseEstimator):
+class _Discriminants(ClassifierMixin, BaseEstimator):
+    """What linear and quadratic discriminants share: a `shrinkage` from 0 to 1, and `_scores`, log probabilities."""
+
+    shrinkage: float
+    classes_: Any
+
+    def predict_proba(self, X: Any) -> FloatArray:
+        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
+        return np.asarray(softmax(self._checked_scores(X), axis=1))
+
+    def predict(self, X: Any) -> Any:
+        """Return the class (n,) of samples `X` (n, K)."""
+        best = self._checked_scores(X).argmax(axis=1)
+        return self.classes_[best]
+
+    def _begin(self, X: Any, y: Any) -> tuple[FloatArray, Any]:
+        """Return the samples (n, K) and the index of each one's class, after the checks that `fit` names."""
+        X, y = validate_data(self, X, y, dtype=np.float64)
+        check_classification_targets(y)
+        if not 0 <= self.shrinkage <= 1:
+            raise ValueError(f"The shrinkage must lie from 0 to 1, not {self.shrinkage!r}.")
+        self.classes_, own = np.unique(y, return_inverse=True)
+        return X, own
+
+    def _checked_scores(self, X: Any) -> FloatArray:
+        check_is_fitted(self)
+        return self._scores(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def _scores(self, X: FloatArray) -> FloatArray:
+        """Return log probabilities (n, C) up to a common term."""
+        raise NotImplementedError
+
+
+class ShrinkageLDA(_Discriminants):
     """Linear discriminant analysis in closed form, with the pooled covariance S shrunk towards a round one.
 
     S becomes (1 - a) S + a tr(S) / K I, as in scikit-learn's `LinearDiscriminantAnalysis(solver="lsqr", shrinkage=a)`,
@@ -105,26 +138,11 @@ class ShrinkageLDA(ClassifierMixin, BaseEstimator):
         Raises:
             ValueError: arrays that do not belong together, values that are not finite, shrinkage outside 0 to 1.
         """
-        X, y = validate_data(self, X, y, dtype=np.float64)
-        check_classification_targets(y)
-        if not 0 <= self.shrinkage <= 1:
-            raise ValueError(f"The shrinkage must lie from 0 to 1, not {self.shrinkage!r}.")
-        self.classes_, own = np.unique(y, return_inverse=True)
+        X, own = self._begin(X, y)
         self.coef_, self.intercept_ = linear_rule(X, np.eye(len(self.classes_))[own], X.T @ X, self.shrinkage)
         return self
 
-    def predict_proba(self, X: Any) -> FloatArray:
-        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
-        return np.asarray(softmax(self._scores(X), axis=1))
-
-    def predict(self, X: Any) -> Any:
-        """Return the class (n,) of samples `X` (n, K)."""
-        best = self._scores(X).argmax(axis=1)
-        return self.classes_[best]
-
-    def _scores(self, X: Any) -> FloatArray:
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
+    def _scores(self, X: FloatArray) -> FloatArray:
         return np.asarray(X @ self.coef_.T + self.intercept_)
 
 
@@ -147,7 +165,7 @@ def linear_rule(X: FloatArray, member: FloatArray, gram: FloatArray, shrinkage: 
     return coef, -0.5 * (coef * means).sum(axis=1) + np.log(counts / len(X))
 
 
-class ShrinkageQDA(ClassifierMixin, BaseEstimator):
+class ShrinkageQDA(_Discriminants):
     """Quadratic discriminant analysis with each class's covariance shrunk towards the pooled one (Friedman, JASA 1989).
 
     It is (1 - a) S_class + a S, where S is the pooled covariance as `ShrinkageLDA` shrinks it, so that classes with
@@ -172,11 +190,7 @@ class ShrinkageQDA(ClassifierMixin, BaseEstimator):
         Raises:
             ValueError: arrays that do not belong together, values that are not finite, shrinkage outside 0 to 1.
         """
-        X, y = validate_data(self, X, y, dtype=np.float64)
-        check_classification_targets(y)
-        if not 0 <= self.shrinkage <= 1:
-            raise ValueError(f"The shrinkage must lie from 0 to 1, not {self.shrinkage!r}.")
-        self.classes_, own = np.unique(y, return_inverse=True)
+        X, own = self._begin(X, y)
         K, counts = X.shape[1], np.bincount(own)
         self.means_ = np.stack([X[own == c].mean(axis=0) for c in range(len(counts))])
         deviation = X - self.means_[own]
@@ -193,18 +207,7 @@ class ShrinkageQDA(ClassifierMixin, BaseEstimator):
         self.whiten_, self.offsets_ = whiten, offsets
         return self
 
-    def predict_proba(self, X: Any) -> FloatArray:
-        """Return the probability of each class, (n, C), for samples `X` (n, K)."""
-        return np.asarray(softmax(self._scores(X), axis=1))
-
-    def predict(self, X: Any) -> Any:
-        """Return the class (n,) of samples `X` (n, K)."""
-        best = self._scores(X).argmax(axis=1)
-        return self.classes_[best]
-
-    def _scores(self, X: Any) -> FloatArray:
-        check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
+    def _scores(self, X: FloatArray) -> FloatArray:
         far = [(((X - mean) @ whiten) ** 2).sum(axis=1) for mean, whiten in zip(self.means_, self.whiten_, strict=True)]
         return self.offsets_ - 0.5 * np.stack(far, axis=1)
 
