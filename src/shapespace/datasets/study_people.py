@@ -119,7 +119,10 @@ class StudyPeople:
 
     def scan(self, face: Mesh, person: int, shown: int) -> SimulatedScan:
         """Return a raw scan of one of a person's faces: other triangles, any pose, noise, holes."""
-        rng = np.random.default_rng((self.seed, 2, person, shown))
+        return self.raw_scan(face, np.random.default_rng((self.seed, 2, person, shown)), self.name(person, shown))
+
+    def raw_scan(self, face: Mesh, rng: np.random.Generator, name: str) -> SimulatedScan:
+        """Return a raw scan of any face, under `name`, made as those of these people are."""
         pose = random_similarity(rng, self.max_angle_deg, (0.9, 1.1))
         return simulate_scan(
             face,
@@ -129,7 +132,7 @@ class StudyPeople:
             T_scan_model=pose,
             holes=holes_of(face, self.missing, rng),
             split=False,
-            name=self.name(person, shown),
+            name=name,
         )
 
     def _recipe(self, ict: IctFaces, name: str) -> FloatArray:

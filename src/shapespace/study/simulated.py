@@ -23,8 +23,8 @@ from shapespace.batch.workers import context, interrupts_ignored, start_loading,
 from shapespace.datasets.faces import LICENSE, Expression, FaceGenerator, load_faces
 from shapespace.datasets.fetch import present_folder
 from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
-from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
-from shapespace.datasets.study_people import StudyPeople, holes_of
+from shapespace.datasets.simulated_scan import SimulatedScan
+from shapespace.datasets.study_people import StudyPeople
 from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.settings import Level, RobustSettings
@@ -376,16 +376,7 @@ def _fit_paper(folder: Path, config: StudyConfig) -> None:
     status: list[int] = []
     for name, level in paper_shown():
         face = generator.face(person, generator.draw_expression(name, level, rng) if level else None)
-        scan = simulate_scan(
-            face,
-            rng,
-            triangles=people.triangles,
-            noise_mm=people.noise_mm,
-            T_scan_model=random_similarity(rng, people.max_angle_deg, (0.9, 1.1)),
-            holes=holes_of(face, people.missing, rng),
-            split=False,
-            name=f"{name} {round(100 * level)}",
-        )
+        scan = people.raw_scan(face, rng, f"{name} {round(100 * level)}")
         try:
             fitted = fit_scan(model, scan.scan, FitConfig(unit="mm"))
         except ShapespaceError:
@@ -416,16 +407,7 @@ def stranger_scan(generator: FaceGenerator, config: StudyConfig, person: int, sh
     rng = np.random.default_rng((people.seed, 5, person, shown))
     expression: Expression | None = generator.draw_expression(name, level, rng) if level else None
     face = generator.face(who, expression)
-    return simulate_scan(
-        face,
-        rng,
-        triangles=people.triangles,
-        noise_mm=people.noise_mm,
-        T_scan_model=random_similarity(rng, people.max_angle_deg, (0.9, 1.1)),
-        holes=holes_of(face, people.missing, rng),
-        split=False,
-        name=f"{who.name}_{name}_{round(100 * level):03d}",
-    )
+    return people.raw_scan(face, rng, f"{who.name}_{name}_{round(100 * level):03d}")
 
 
 def _fit_all(
@@ -521,11 +503,7 @@ def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
     """
     parts: list[dict[str, npt.NDArray[Any]]] = []
     for path in paths:
-        try:
-            with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
-                part = {key: np.asarray(loaded[key]) for key in _SAVED}
-        except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-            raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
+        part = _read_arrays(path, _SAVED)
         for key, rest in (("z", 0.0), ("z_stddev", 1.0)):
             whole = np.full((*part[key].shape[:2], n_modes), rest)
             whole[..., : part[key].shape[2]] = part[key]
@@ -557,13 +535,14 @@ def read_paper(path: Path) -> tuple[FloatArray, FloatArray, IntArray]:
         FileError: the file cannot be read.
         FileFormatError: it is damaged.
     """
+    found = _read_arrays(path, ("b", "stddev", "status"))
+    return found["b"].astype(np.float64), found["stddev"].astype(np.float64), found["status"].astype(np.int32)
+
+
+def _read_arrays(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
-            return (
-                np.asarray(loaded["b"], dtype=np.float64),
-                np.asarray(loaded["stddev"], dtype=np.float64),
-                np.asarray(loaded["status"], dtype=np.int32),
-            )
+            return {name: np.asarray(loaded[name]) for name in names}
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
 
