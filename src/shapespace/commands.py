@@ -28,7 +28,7 @@ from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
-from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, read_coefficients
+from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, from_record, labelled, one_model, read_coefficients
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ ABOUT = "about.json"
 """Beside simulated faces: their provenance and licence, for the models made of them."""
 
 _RECORD = ".fit.json"
-_NEUTRAL = "neutral"
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 
 
@@ -211,7 +210,7 @@ def _additive(
     return AdditiveModel.fit(
         meshes,
         [label.subject for label in own],
-        [label.text == _NEUTRAL for label in own],
+        [label.text == NEUTRAL for label in own],
         identity_modes=_IDENTITY_VARIANCE if modes == "auto" else modes,
         expression_modes=_EXPRESSION_VARIANCE if expression_variance is None else expression_variance,
         gauge=gauge,
@@ -474,7 +473,6 @@ def recognise_train(
     """
     from shapespace.model.additive import AdditiveModel
     from shapespace.recognise.predict import train_classifier
-    from shapespace.recognise.scans import one_model
 
     scans = labelled(read_scans(results), read_labels(labels, of_subjects=False))
     projection: FloatArray | None = None

@@ -23,7 +23,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import read_hdf5, write_hdf5
 from shapespace.model import model_file
 from shapespace.model.held_out import held_out_variances
-from shapespace.model.pca import principal_components
+from shapespace.model.pca import modes_for_variance, principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
@@ -355,9 +355,7 @@ def _modes_through_zero(
         raise InputError("No expression differs from its neutral face, so there is nothing to model.")
     kept = int((values > _NO_VARIANCE * values[0]).sum())
     if isinstance(wanted, float):
-        if not 0 < wanted <= 1:
-            raise InputError(f"A share of the variance lies between 0 and 1, not at {wanted}.")
-        kept = min(kept, int(np.searchsorted(np.cumsum(values) / total, wanted - 1e-12)) + 1)
+        kept = min(kept, modes_for_variance(values, wanted))
     elif wanted is not None:
         if not 1 <= wanted <= kept:
             raise InputError(f"These expressions give 1 to {kept} modes, so {wanted} cannot be had.")

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.bilinear import BilinearModel
+from shapespace.model.pca import modes_for_variance
 from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
 from shapespace.types import BoolArray, FloatArray, IntArray
@@ -82,7 +83,7 @@ def one_pca(model: AdditiveModel, training: Rows) -> Features:
     b = training.z * model.shape.stddev
     mean = b.mean(axis=0)
     _, size, rows = np.linalg.svd(b - mean, full_matrices=False)
-    kept = int(np.searchsorted(np.cumsum(size**2) / (size**2).sum(), PAPER_VARIANCE)) + 1
+    kept = modes_for_variance(size**2, PAPER_VARIANCE)
     basis, stddev = rows[:kept].T, size[:kept] / np.sqrt(len(b) - 1)
     return lambda faces: (faces.z * model.shape.stddev - mean) @ basis / stddev
 

@@ -148,9 +148,7 @@ def _document(
             for classifier in CLASSIFIERS:
                 fixed = parts.fixed(made, classifier)
                 if fixed is None:
-                    rows.append(
-                        (name, "known" if relative else "unknown", f"{classifier} (too few samples)", None, None)
-                    )
+                    rows.append((name, word, f"{classifier} (too few samples)", None, None))
                     continue
                 accuracy, interval = parts.accuracy_of(labels, fixed.predicted, subjects)
                 rows.append((name, word, classifier, accuracy, interval))
