@@ -281,7 +281,7 @@ def _fit_scan(
             **({"dense": dense_s} if config.dense else {}),
             "distances": clock[2] - ended[2][1] - dense_s,
         },
-        model_hash=model.content_hash,
+        model=model,
         scan=scan,
         find_regions=fitted.regions,
     )

@@ -17,6 +17,8 @@ REGIONS = ("followed", "rejected", "border", "unseen")
 """Codes 0 to 3: the match counted; the scan shows something else there; it ends there; it shows nothing there."""
 
 FOLLOWED, REJECTED, BORDER, UNSEEN = range(4)
+SHOWN = (FOLLOWED, REJECTED)
+"""Where the scan shows something, be it what the model follows or not."""
 _COUNTS = 0.5
 """A match that counts less than this was left out, in the main."""
 _SPACINGS = 4.0

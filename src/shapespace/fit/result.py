@@ -3,19 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.special import fdtri  # scipy.stats would cost every start half a second
 
+from shapespace.errors import InputError
+from shapespace.fit.regions import SHOWN
 from shapespace.fit.state import IcpState
-from shapespace.geometry.distance import SurfaceDistances
+from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.geometry.surface import rms_size
 from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+
+
+@dataclass(frozen=True)
+class ShownDistances:
+    """Distances over what scan and model both show, in mm: what a reader of a fit should look at first.
+
+    Args:
+        model_to_scan: over the model's vertices that the scan shows; those beyond its border or over its holes are
+            the model's guess, and say nothing of the fit.
+        scan_to_model: over the scan's vertices that the model covers.
+        model_seen_share: share of the model's vertices that the scan shows.
+        scan_covered_share: share of the scan's vertices that the model covers.
+    """
+
+    model_to_scan: DistanceSummary
+    scan_to_model: DistanceSummary
+    model_seen_share: float
+    scan_covered_share: float
+
+    def in_unit(self, length: float) -> ShownDistances:
+        """Return the same with all lengths times `length`, as for millimetres of the scan."""
+        return replace(
+            self, model_to_scan=self.model_to_scan.times(length), scan_to_model=self.scan_to_model.times(length)
+        )
+
 
 Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
@@ -81,7 +108,7 @@ class FitResult:
         evidence: what the status goes by, by name; empty for the paper's method, which goes by the distances.
         notes: what was repaired or noticed in the scan.
         seconds: by part.
-        model_hash: content hash of the model.
+        model: the model that was fitted.
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
     """
@@ -104,7 +131,7 @@ class FitResult:
     evidence: Mapping[str, float]
     notes: Sequence[str]
     seconds: Mapping[str, float]
-    model_hash: str
+    model: ShapeModel = field(repr=False)
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
 
@@ -125,16 +152,50 @@ class FitResult:
         }
 
     @property
+    def model_hash(self) -> str:
+        """Content hash of the model."""
+        return self.model.content_hash
+
+    @property
     def distances(self) -> SurfaceDistances:
-        """Distances of the final surface."""
+        """Distances of the final surface, mm of the model's frame, over all vertices."""
         return self.stages["final"].distances
 
-    def surface(self, model: ShapeModel, stage: str = "final") -> Mesh:
-        """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order."""
+    @property
+    def scan_mm_per_model_mm(self) -> float:
+        """What a mm of the model's frame is in mm of the scan: 1 where the pose has no free scale."""
+        return self.T_scan_model.scale * self.mm_per_scan_unit
+
+    @cached_property
+    def shown(self) -> ShownDistances:
+        """Distances of the final surface over what the scan shows and the model covers, mm of the model's frame."""
+        return self.shown_at("final")
+
+    def shown_at(self, stage: str) -> ShownDistances:
+        """Return the distances at `stage` over what the scan shows, as it is known at the end of the fit."""
+        distances, seen = self.stages[stage].distances, np.isin(self.regions, SHOWN)
+        forward, backward = DistanceSummary.of(distances.model_to_scan_mm, seen), distances.scan_to_model
+        return ShownDistances(forward, backward, forward.fraction, backward.fraction)
+
+    def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:
+        """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order.
+
+        Args:
+            model: the model that was fitted, which the result knows; it may be left out.
+            stage: a name of `stages`.
+
+        Raises:
+            InputError: another model than the one that was fitted.
+        """
+        if model is not None and model is not self.model and model.content_hash != self.model_hash:
+            raise InputError(
+                f"{self.scan_name} was fitted with another model than the one given, whose surface would be wrong; "
+                "leave the model out, as the result knows its own."
+            )
         at = self.stages[stage]
-        vertices = at.T_scan_model.apply(model.reconstruct(at.b)) if at.vertices is None else at.vertices
-        landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
-        return Mesh(vertices, model.faces, landmarks, name=self.scan_name)
+        vertices = at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
+        landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
+        return Mesh(vertices, self.model.faces, landmarks, name=self.scan_name)
 
 
 def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
