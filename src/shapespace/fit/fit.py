@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from shapespace import __version__
 from shapespace.errors import FitError, InputError
 from shapespace.fit.method import Ended, Limits, Method
-from shapespace.fit.methods import METHODS
+from shapespace.fit.methods import method_named
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings
@@ -66,13 +66,10 @@ class FitConfig:
     dense_settings: DenseSettings = field(default_factory=DenseSettings)
 
     def __post_init__(self) -> None:
-        known: list[tuple[str, Sequence[str], str]] = [
+        for value, choices, what in (
             (self.unit, ["auto", *MM_PER_UNIT], "unit"),
             (self.scale, ("auto", "free", "fixed"), "scale"),
-        ]
-        if isinstance(self.method, str):
-            known.append((self.method, list(METHODS), "method"))
-        for value, choices, what in known:
+        ):
             if value not in choices:
                 raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
         if self.dense and not self.fitting.goes_on_densely:
@@ -87,7 +84,7 @@ class FitConfig:
     @property
     def fitting(self) -> Method:
         """The method itself, where it was given by name too."""
-        return METHODS[self.method]() if isinstance(self.method, str) else self.method
+        return method_named(self.method) if isinstance(self.method, str) else self.method
 
     def limits(self, model: ShapeModel) -> Limits:
         """Return what the method is told; a scale that goes by the gauge is free where size was divided out."""
