@@ -72,9 +72,10 @@ class FitConfig:
         ):
             if value not in choices:
                 raise InputError(f"There is no {what} {value!r}; choose one of {', '.join(choices)}.")
-        if self.dense and not self.fitting.goes_on_densely:
+        fitting = self.fitting
+        if self.dense and not fitting.goes_on_densely:
             raise InputError(
-                f"The dense stage needs the robust method; leave out dense, or the method {self.fitting.name!r}."
+                f"The dense stage needs the robust method; leave out dense, or the method {fitting.name!r}."
             )
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
@@ -310,12 +311,14 @@ def _dense_stage(
 
     T = fitted.T_scan_model
     dense = dense_surface(model, target, fitted.vertices_scan_mm, fitted.T_scan_fitted, config.dense_settings)
+    moved = ((dense.vertices_scan_mm - fitted.vertices_scan_mm)[dense.seen] ** 2).sum(axis=1)
     return Stage(
         T_scan_mm @ T,
         fitted.b,
         partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
+        moved_mm=float(np.sqrt(moved.mean())) / fitted.T_scan_fitted.scale if len(moved) else 0.0,
     )
 
 

@@ -15,6 +15,8 @@ from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray
 
 _TANGENT_SHARE = 0.1
 """Modes of shapes lie in the tangent by less than a fiftieth; those of alignment by a third and more, unless mixed."""
+_COARSE = 2.0
+"""Rounding to one of two neighbours spreads almost twice as far as rounding over a whole step."""
 _MOST_DECIMALS = 6
 _ROUNDING = 1e-14
 
@@ -41,8 +43,8 @@ def made_by_alignment(
 
 
 def below_precision(variance: FloatArray, n: int, coordinates: int, rounding_mm: float) -> BoolArray:
-    """Return which of the variances (K,), mm^2, n shapes of that many coordinates get from their rounding alone."""
-    return variance <= (rounding_mm * (1.0 + np.sqrt(coordinates / max(n - 1, 1)))) ** 2
+    """Return which of the variances (K,), mm^2, n shapes of that many coordinates can have by rounding alone."""
+    return variance <= (_COARSE * rounding_mm * (1.0 + np.sqrt(coordinates / max(n - 1, 1)))) ** 2
 
 
 def rounding_mm(vertices: FloatArray) -> float:
