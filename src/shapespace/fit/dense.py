@@ -50,6 +50,7 @@ class DenseSurface:
         noise_mm: of the scan as found, mm of the model's frame.
         unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
         damped: how many vertices were held back so that no triangle folds.
+        stretch: how much longer or shorter edges that are seen became: |log| of the ratio that 1 % exceed.
     """
 
     vertices_scan_mm: FloatArray
@@ -57,6 +58,7 @@ class DenseSurface:
     noise_mm: float
     unexplained_mm: float
     damped: int
+    stretch: float
 
 
 def dense_surface(
@@ -115,7 +117,16 @@ def dense_surface(
         seen_at, pull_at = now.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
-    return DenseSurface(T.apply(kept), seen_at * noise_mm**2 > _SEEN, noise_mm, left_mm, int((held | held_back).sum()))
+    seen, damped = seen_at * noise_mm**2 > _SEEN, int((held | held_back).sum())
+    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, _stretch(start, kept, topology.faces, seen))
+
+
+def _stretch(before: FloatArray, after: FloatArray, faces: IntArray, seen: BoolArray) -> float:
+    corners = faces[seen[faces].all(axis=1)]
+    if len(corners) == 0:
+        return 0.0
+    lengths = [np.linalg.norm(x[corners] - x[np.roll(corners, 1, axis=1)], axis=2).ravel() for x in (before, after)]
+    return float(np.quantile(np.abs(np.log(np.maximum(lengths[1], 1e-12) / np.maximum(lengths[0], 1e-12))), 0.99))
 
 
 @dataclass(frozen=True, eq=False)

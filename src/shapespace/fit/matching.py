@@ -79,7 +79,7 @@ class Matches:
         return np.concatenate([p.residual[p.allowed], v.residual[v.allowed]])
 
     def weights(self, name: str, width_mm: float, far_mm: float, vertex_share: float) -> Weights:
-        """Return how much each counts (eq 8): residuals against a width, distances against how far is far."""
+        """Return how much each counts (eqs 8 and 9): residuals against a width, distances against how far is far."""
         p, v = self.points, self.vertices
         return Weights(
             match_weights(name, p.residual, p.distance, p.allowed, width_mm, far_mm),
@@ -99,7 +99,7 @@ class Matches:
         return Gathered(weight_at, pull_at, seen)
 
     def unexplained_variance(self, weights: Weights, faces: IntArray, vertices: int, seed: int) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 20); it can be below zero.
+        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17); it can be below zero.
 
         Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
         say of the same vertex is the variance of the shape that is left.

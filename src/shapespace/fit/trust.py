@@ -145,9 +145,9 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     if not _is_doubted(dict(evidence) | usual):
         out = math.sqrt(max(evidence["z2"], evidence["z2_leading"]))
         return [
-            f"the model is too narrow for this scan: its surface follows it, to {evidence['spread_mm']:.2f} mm where they "
-            f"match, but its coefficients lie {out:.1f} standard deviations out on average, where about 1 is usual; build "
-            "a model of more, or more different, shapes, or follow the scan by --dense and look at the result"
+            f"the model is too narrow for this scan: its surface follows it, to {evidence['spread_mm']:.2f} mm where "
+            f"they match, but its coefficients lie {out:.1f} standard deviations out on average, where about 1 is "
+            "usual; build a model of more, or more different, shapes, or follow the scan by --dense and look at it"
         ]
     parts = _contributions(evidence)
     beyond = [i for i, each in enumerate(INPUTS) if each.value(evidence) > each.most]
