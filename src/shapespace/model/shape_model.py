@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,6 @@ import numpy.typing as npt
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.hdf5 import content_hash
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.holes import fill_holes
@@ -246,7 +245,7 @@ class ShapeModel:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 of everything the model is, whatever file it stands in."""
-        return content_hash(*model_file.contents(self))
+        return model_file.hash_of(self.fields())
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
@@ -318,13 +317,17 @@ class ShapeModel:
             raise InputError(f"This model has {self.n_modes} modes, so it cannot be cut to {modes}.")
         return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes])
 
+    def fields(self) -> model_file.ModelFields:
+        """Return what the model is made of, by the names of its arguments."""
+        return cast(model_file.ModelFields, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+
     def save(self, path: Path | str) -> None:
         """Write the model to one HDF5 file, whole or not at all.
 
         Raises:
             FileError: the folder cannot be written, or the disk is full.
         """
-        model_file.save(self, Path(path))
+        model_file.save(self.fields(), Path(path))
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
