@@ -9,19 +9,22 @@ own, so that b keeps its meaning.
 
 from __future__ import annotations
 
+import hashlib
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from scipy.linalg import eigh
 
+from shapespace import __version__
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
+from shapespace.io.kept import keep, recall
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -55,14 +58,37 @@ _MADE: weakref.WeakKeyDictionary[ShapeModel, dict[ResidualSettings, ResidualMode
 
 
 def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    """Return the strongest modes outside the span of `model`, made once and kept as long as the model lives."""
+    """Return the strongest modes outside the span of `model`, made once and kept as long as the model lives.
+
+    Those of a model that stands in a file are kept between runs too.
+    """
     made = _MADE.setdefault(model, {})
     if settings not in made:
-        made[settings] = _make(model, settings)
+        extra, stddev_mm = _kept(model, settings) if model.in_file else _make(model, settings)
+        own = prepare(model).modes
+        together = np.empty((*own.shape[:2], own.shape[2] + len(stddev_mm)), dtype=np.float32)
+        together[:, :, : own.shape[2]] = own
+        together[:, :, own.shape[2] :] = extra
+        made[settings] = ResidualModes(together, stddev_mm)
     return made[settings]
 
 
-def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
+def _kept(model: ShapeModel, settings: ResidualSettings) -> tuple[Float32Array, FloatArray]:
+    # Whatever could change the modes is in the name, and so is the recipe itself.
+    made_of = f"{model.content_hash} {settings} {__version__} ".encode() + Path(__file__).read_bytes()
+    name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
+    arrays = recall(name)
+    if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
+        return arrays["modes"], arrays["stddev_mm"]
+    modes, stddev_mm = _make(model, settings)
+    keep(name, {"modes": modes, "stddev_mm": stddev_mm})
+    return modes, stddev_mm
+
+
+def _make(model: ShapeModel, settings: ResidualSettings) -> tuple[Float32Array, FloatArray]:
+    """Return the modes outside the span, (V, 3, R) float32, and their standard deviations (R,) mm."""
+    from scipy.linalg import eigh  # takes a moment, which whoever finds the modes kept need not wait for
+
     x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
@@ -94,11 +120,10 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     stddev_mm = np.sqrt(value[kept])
     mix = (vector[:, kept] / stddev_mm).astype(np.float32)
     inside = inside @ mix
-    together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
-    together[:, :, : modes.shape[2]] = modes
+    extra = np.empty((*modes.shape[:2], len(stddev_mm)), dtype=np.float32)
     for P, rows in zip(own, blocks, strict=True):
-        together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
-    return ResidualModes(together, stddev_mm)
+        extra[rows] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
+    return extra, stddev_mm
 
 
 def _strongest(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:

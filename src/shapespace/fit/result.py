@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.special import fdtri  # scipy.stats would cost every start half a second
 
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import SurfaceDistances
@@ -194,6 +193,8 @@ def _hotelling_bound(k: int, n: int) -> float:
 
     The variances come from n training shapes, so the bound is Hotelling's for a new sample, not chi-square's.
     """
+    from scipy.special import fdtri  # takes a moment; scipy.stats would take half a second
+
     if n <= k + 1:
         return float("inf")
     return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))
