@@ -64,29 +64,23 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
     """
     made = _MADE.setdefault(model, {})
     if settings not in made:
-        extra, stddev_mm = _kept(model, settings) if model.in_file else _make(model, settings)
-        own = prepare(model).modes
-        together = np.empty((*own.shape[:2], own.shape[2] + len(stddev_mm)), dtype=np.float32)
-        together[:, :, : own.shape[2]] = own
-        together[:, :, own.shape[2] :] = extra
-        made[settings] = ResidualModes(together, stddev_mm)
+        made[settings] = _kept(model, settings) if model.in_file else _make(model, settings)
     return made[settings]
 
 
-def _kept(model: ShapeModel, settings: ResidualSettings) -> tuple[Float32Array, FloatArray]:
+def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     # Whatever could change the modes is in the name, and so is the recipe itself.
     made_of = f"{model.content_hash} {settings} {__version__} ".encode() + Path(__file__).read_bytes()
     name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
     arrays = recall(name)
     if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
-        return arrays["modes"], arrays["stddev_mm"]
-    modes, stddev_mm = _make(model, settings)
-    keep(name, {"modes": modes, "stddev_mm": stddev_mm})
-    return modes, stddev_mm
+        return ResidualModes(arrays["modes"], arrays["stddev_mm"])
+    made = _make(model, settings)
+    keep(name, {"modes": made.modes, "stddev_mm": made.stddev})
+    return made
 
 
-def _make(model: ShapeModel, settings: ResidualSettings) -> tuple[Float32Array, FloatArray]:
-    """Return the modes outside the span, (V, 3, R) float32, and their standard deviations (R,) mm."""
+def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     from scipy.linalg import eigh  # takes a moment, which whoever finds the modes kept need not wait for
 
     x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
@@ -120,10 +114,11 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> tuple[Float32Array, 
     stddev_mm = np.sqrt(value[kept])
     mix = (vector[:, kept] / stddev_mm).astype(np.float32)
     inside = inside @ mix
-    extra = np.empty((*modes.shape[:2], len(stddev_mm)), dtype=np.float32)
+    together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
+    together[:, :, : modes.shape[2]] = modes
     for P, rows in zip(own, blocks, strict=True):
-        extra[rows] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
-    return extra, stddev_mm
+        together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
+    return ResidualModes(together, stddev_mm)
 
 
 def _strongest(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:

@@ -1,15 +1,14 @@
 """Arrays that a later run would otherwise make again, kept in the user's cache folder up to a bound.
 
-Each file is written whole under a name that says what it was made of, and its checksums are checked on reading. What is
-damaged, or cannot be read or written, counts as not there: whoever asks makes it again.
+Each file is written whole under a name that says what it was made of: a SHA-256 in hexadecimal, and after it the `.npz`
+that it is of. What is damaged, or cannot be read or written, counts as not there: whoever asks makes it again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from shapespace.io.files import atomic_path
 MOST_BYTES = 500_000_000
 """The files used last stay below this together."""
 _FOLDER = "kept"
+_DIGEST_BYTES = 64
 _OFF = ("no", "off", "0")
 
 
@@ -36,7 +36,7 @@ def cache_folder() -> Path:
 def _file(name: str) -> Path | None:
     if os.environ.get("SHAPESPACE_KEEP", "").lower() in _OFF:
         return None
-    return cache_folder() / _FOLDER / f"{name}.npz"
+    return cache_folder() / _FOLDER / f"{name}.kept"
 
 
 def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
@@ -45,9 +45,14 @@ def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
     if path is None:
         return None
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: np.asarray(stored[key]) for key in stored.files}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        with path.open("rb") as stream:
+            said = stream.read(_DIGEST_BYTES)
+            if hashlib.file_digest(stream, "sha256").hexdigest().encode() != said:
+                return None
+            stream.seek(_DIGEST_BYTES)
+            with np.load(stream, allow_pickle=False) as stored:
+                arrays = {key: np.asarray(stored[key]) for key in stored.files}
+    except (OSError, ValueError):
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # what is used is the last to go
@@ -61,9 +66,14 @@ def keep(name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         return
     with contextlib.suppress(OSError, FileError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
+        with atomic_path(path) as temporary, temporary.open("w+b") as stream:
+            stream.write(b"0" * _DIGEST_BYTES)
             stored: dict[str, Any] = dict(arrays)  # savez has keywords of its own type
-            np.savez(temporary, **stored)
+            np.savez(stream, **stored)
+            stream.seek(_DIGEST_BYTES)
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            stream.seek(0)
+            stream.write(digest.encode())
         _drop_oldest(path.parent)
 
 
