@@ -468,11 +468,11 @@ def _fit(arguments: argparse.Namespace) -> int:
         start_loading(tell=may_tell(quiet=arguments.quiet))
     from shapespace import commands
     from shapespace.fit.fit import FitConfig
+    from shapespace.fit.methods import method_named
 
     config = FitConfig(
-        method=arguments.method,
+        method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
         unit=arguments.unit,
-        search=arguments.search,
         scale=arguments.scale,
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,

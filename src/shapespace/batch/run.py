@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -108,10 +108,13 @@ def fit_file(
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
         record = failed_record(
-            scan_source, model_source, f"{job.scan}: not enough memory to fit it; thin the scan first.", asdict(config)
+            scan_source,
+            model_source,
+            f"{job.scan}: not enough memory to fit it; thin the scan first.",
+            config.as_dict(),
         )
     except ShapespaceError as error:
-        record = failed_record(scan_source, model_source, naming(job.scan, str(error)), asdict(config))
+        record = failed_record(scan_source, model_source, naming(job.scan, str(error)), config.as_dict())
     else:
         record = fit_record(result, scan_source, model_source, marks_source)
         write_fitted_mesh(folder / f"{job.name}.fitted.ply", result, model)
@@ -285,7 +288,7 @@ def _earlier_record(
         record = read_record(path)
         same_scan = record["scan"]["hash"] == sha256_of_file(job.scan)
         same_model = record["model"]["hash"] == model.content_hash
-        settings: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+        settings: dict[str, Any] = json.loads(json.dumps(config.as_dict()))
         settings["version"] = __version__
         same_settings = all(record["config"].get(key) == value for key, value in settings.items())
         marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None

@@ -12,8 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from shapespace.fit.start import Start
-
 _OFFSET = -3.70
 _LEAST_SHARE = 0.01
 _MOST_LOG_SCALE = 1.0
@@ -40,11 +38,6 @@ class Input:
     weight: float
     most: float
     says: Callable[[Mapping[str, float]], str]
-
-
-def start_evidence(start: Start) -> dict[str, float]:
-    """Return what the search for a start says, by name; not a number, or infinite, where nothing was searched."""
-    return {"start_score_mm": start.score_mm, "start_runner_up_score_mm": start.runner_up_score_mm}
 
 
 def _log_share(share: float) -> float:

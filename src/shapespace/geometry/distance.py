@@ -44,6 +44,13 @@ class DistanceSummary:
             len(kept) / len(distance_mm),
         )
 
+    def times(self, length: float) -> DistanceSummary:
+        """Return the same with all lengths times `length`."""
+        return DistanceSummary(
+            self.mean * length, self.median * length, self.rms * length, self.p95 * length, self.max * length,
+            self.count, self.fraction,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDistances:

@@ -23,6 +23,7 @@ from shapespace.model.choose_modes import choose_modes
 from shapespace.model.holes import fill_holes
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
+from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
@@ -51,6 +52,7 @@ class ShapeModel:
         provenance: what it was made from, in words.
         licence: licence of the training data.
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
+        left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
         InputError: arrays whose shapes do not belong together.
@@ -69,6 +71,7 @@ class ShapeModel:
     provenance: str = ""
     licence: str = ""
     held_out: bool = False
+    left_out: int = 0
 
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
@@ -149,6 +152,7 @@ class ShapeModel:
             )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
+        rounding = rounding_mm(np.nan_to_num(shapes[0]))
         if kind.takes_holes and np.isnan(shapes).any():
             _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
             fill_holes(shapes, faces, names)
@@ -162,10 +166,20 @@ class ShapeModel:
             pc = _components(coder.encode(shapes), modes, seed)
         else:
             pc = _components_of_codes(coder, shapes, modes, seed)
+        spurious = below_precision(pc.variance, len(meshes), shapes[0].size, rounding)
+        if align:
+            basis = coder.directions(pc.basis)
+            spurious |= made_by_alignment(coder.decode(pc.mean), basis, gauge, alignment_vertices)
+        if spurious.all():
+            raise InputError(
+                "The training meshes differ by no more than their alignment and their rounding make of them, so there "
+                "is no variation to model; give different ones."
+            )
         return cls(
             mean=pc.mean,
-            basis=pc.basis,
-            stddev=np.sqrt(pc.variance),
+            basis=pc.basis[:, ~spurious],
+            stddev=np.sqrt(pc.variance[~spurious]),
+            left_out=int(spurious.sum()),
             total_variance=pc.total_variance,
             n_training=pc.n_samples,
             faces=faces,
