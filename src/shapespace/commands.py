@@ -15,8 +15,6 @@ from tqdm import tqdm
 from shapespace.batch.results import read_record
 from shapespace.batch.run import fit_files, make_executor, make_jobs, naming
 from shapespace.batch.workers import cores, may_tell, start_loading
-from shapespace.datasets import faces as bundled
-from shapespace.datasets import fetch, ict
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
@@ -383,6 +381,9 @@ def write_simulated_faces(
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets import faces as bundled
+    from shapespace.datasets import ict
+
     make_folder(folder)
     total = subjects * len(expressions)
     with progress_bar(total, "writing", "face", quiet=quiet) as bar:
@@ -543,6 +544,8 @@ def recognise_predict(
 
 def data_list() -> list[dict[str, object]]:
     """Return the open data sets with licence, size, hash, and whether they are here already."""
+    from shapespace.datasets import fetch  # loads much, as the generators of faces do
+
     return fetch.data_list()
 
 
@@ -552,6 +555,8 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
     Raises:
         DataError: no such data set, no network, or content that does not match its hash.
     """
+    from shapespace.datasets import fetch
+
     return fetch.data_get(name, to=to, progress=False if quiet else None)
 
 

@@ -8,7 +8,6 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import fdtri  # scipy.stats would cost every start half a second
 
 from shapespace.errors import InputError
 from shapespace.fit.method import Ended, Limits
@@ -148,6 +147,8 @@ def _hotelling_bound(k: int, n: int) -> float:
 
     The variances come from n training shapes, so the bound is Hotelling's for a new sample, not chi-square's.
     """
+    from scipy.special import fdtri  # takes a moment; scipy.stats would take half a second
+
     if n <= k + 1:
         return float("inf")
     return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))

@@ -14,7 +14,7 @@ _OTHER_SCALE = 0.05
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
 """The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
 _STRETCHED = 0.1
-"""Dense surfaces of faces that the model is made for stretch by 5 to 6 %, of others by 11 % and more (docs/dense.md)."""
+"""Dense surfaces of faces the model is made for stretch by 5 to 6 %, of others by 11 % and more (docs/dense.md)."""
 
 
 def verdict(method: Method, ended: Ended) -> tuple[Status, str]:

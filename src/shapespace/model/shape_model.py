@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,6 +28,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
+_IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +249,11 @@ class ShapeModel:
         """SHA-256 of everything the model is, whatever file it stands in."""
         return model_file.hash_of(self.fields())
 
+    @property
+    def in_file(self) -> bool:
+        """Whether it was read from a file or saved to one: later runs will need what was made of it again."""
+        return self in _IN_FILES
+
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
 
@@ -328,6 +335,7 @@ class ShapeModel:
             FileError: the folder cannot be written, or the disk is full.
         """
         model_file.save(self.fields(), Path(path))
+        _IN_FILES.add(self)
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
@@ -339,9 +347,11 @@ class ShapeModel:
         """
         fields = model_file.load(Path(path))
         try:
-            return cls(**fields)
+            model = cls(**fields)
         except InputError as error:
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+        _IN_FILES.add(model)
+        return model
 
     def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
         array = np.atleast_1d(np.asarray(b, dtype=np.float64))
