@@ -1,4 +1,4 @@
-"""The command line: parsing, printing and exit codes; what the commands do stands in `commands.py`.
+"""The command line: parsing, printing and exit codes; what the commands do stands in `commands`.
 
 Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doubtful); 2 wrong arguments or unusable
 input; 130 stopped by Ctrl-C, files valid.
@@ -20,6 +20,10 @@ from typing import Any, cast
 from shapespace import __version__
 from shapespace.errors import ShapespaceError
 
+_LISTED = 10
+"""Scans that the terminal lists."""
+_OTHER_SIZE = 0.02
+"""Share by which a millimetre of the scan differs from one of the model where both are told."""
 _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
 
 
@@ -41,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _say("shapespace: there is not enough memory for this; give fewer or smaller meshes, or fewer --jobs.")
         return 2
     except KeyboardInterrupt:
-        _say("shapespace: stopped; the files written so far are whole.")
+        _say(f"shapespace: stopped; the files written so far are whole{getattr(arguments, 'goes_on', '')}.")
         return 130
     except BrokenPipeError:
         _drop_output()
@@ -95,6 +99,10 @@ def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool 
     return sub
 
 
+def _add_recursive(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--recursive", action="store_true", help="take what lies in folders below those given too")
+
+
 def _add_demo(commands: Any) -> None:
     sub = _add(commands, "demo", "both experiments of the paper, ending in a report", "shapespace demo --quick")
     sub.add_argument("--out", type=Path, default=Path("shapespace-demo"), metavar="DIR", help="where to write")
@@ -132,6 +140,7 @@ def _add_check(commands: Any) -> None:
     sub = _add(commands, "check", "mesh doctor: what is in it, what is wrong, what fitting will do about it",
                "shapespace check scan.obj")  # fmt: skip
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _add_recursive(sub)
     sub.set_defaults(run=_check)
 
 
@@ -140,6 +149,9 @@ def _add_build(commands: Any) -> None:
                "shapespace build faces/*.ply -o model.h5 --modes auto")  # fmt: skip
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="mesh files or folders of them")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL.h5")
+    _add_recursive(sub)
+    sub.add_argument("--with-doubtful", action="store_true",
+                     help="take surfaces of doubtful fits too, which are left out otherwise")  # fmt: skip
     how_many = sub.add_mutually_exclusive_group()
     how_many.add_argument("--variance", type=_share, metavar="SHARE", help="modes that hold this share, such as 0.98")
     how_many.add_argument("--modes", type=_modes, default="auto", metavar="K|auto|all",
@@ -178,7 +190,9 @@ def _add_fit(commands: Any) -> None:
                "         shapespace build out/*.dense.ply -o new.h5")  # fmt: skip
     sub.add_argument("model", type=Path, metavar="MODEL.h5")
     sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                     help="where to write; results that are there already stay")  # fmt: skip
+    _add_recursive(sub)
     sub.add_argument(
         "--method",
         default="robust",
@@ -199,7 +213,7 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
-    sub.set_defaults(run=_fit)
+    sub.set_defaults(run=_fit, goes_on="; the same command with --resume goes on from there")
 
 
 def _add_view(commands: Any) -> None:
@@ -297,7 +311,7 @@ def _add_recognise_study(commands: Any) -> None:
                      help="compare vertices with B-spline control points too (11 minutes more)")  # fmt: skip
     sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
-    sub.set_defaults(run=_recognise_study)
+    sub.set_defaults(run=_recognise_study, goes_on="; the same command goes on from there")
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -316,9 +330,9 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.report import write_report
 
-    report = commands.report(
+    report = write_report(
         arguments.folder, arguments.output, model=arguments.model, labels=arguments.labels, quiet=arguments.quiet
     )
     if arguments.json:
@@ -333,9 +347,9 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 def _data_list(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.data import data_list
 
-    rows = commands.data_list()
+    rows = data_list()
     if arguments.json:
         _print_json(rows)
     else:
@@ -346,9 +360,9 @@ def _data_list(arguments: argparse.Namespace) -> int:
 
 
 def _data_get(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.data import data_get
 
-    folder = commands.data_get(arguments.name, arguments.to, quiet=arguments.quiet)
+    folder = data_get(arguments.name, arguments.to, quiet=arguments.quiet)
     if arguments.json:
         _print_json({"folder": str(folder)})
     else:
@@ -357,10 +371,10 @@ def _data_get(arguments: argparse.Namespace) -> int:
 
 
 def _data_faces(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.data import write_simulated_faces
 
     names = [name.strip() for name in arguments.expressions.split(",") if name.strip()]
-    count = commands.write_simulated_faces(
+    count = write_simulated_faces(
         arguments.output,
         source=arguments.source,
         subjects=arguments.subjects,
@@ -378,9 +392,9 @@ def _data_faces(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.look import check
 
-    reports = commands.check(arguments.files)
+    reports = check(arguments.files, recursive=arguments.recursive, say=_say_of)
     if arguments.json:
         _print_json(reports)
     else:
@@ -413,29 +427,30 @@ def _print_check(report: Mapping[str, Any]) -> None:
 
 
 def _build(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.build import BuildSettings, build
+    from shapespace.commands.look import model_facts
 
     modes = arguments.variance if arguments.variance is not None else arguments.modes
-    model, notes = commands.build(
-        arguments.meshes,
-        arguments.output,
+    settings = BuildSettings(
         modes=None if modes == "all" else modes,
         gauge=arguments.gauge,
         align=not arguments.no_align,
         unit=arguments.unit,
-        landmarks=arguments.landmarks,
         representation=arguments.representation,
         control_points=arguments.control_points,
+        landmarks=arguments.landmarks,
         labels=arguments.additive,
         expression_variance=arguments.expression_variance,
         provenance=arguments.provenance,
         licence=arguments.licence,
         seed=arguments.seed,
-        quiet=arguments.quiet,
+        recursive=arguments.recursive,
+        with_doubtful=arguments.with_doubtful,
     )
+    model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
     for note in notes:
         _say(note)
-    facts = commands.model_facts(model)
+    facts = model_facts(model)
     if arguments.json:
         _print_json({"model": str(arguments.output), **facts})
     else:
@@ -449,9 +464,9 @@ def _build(arguments: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.look import info
 
-    facts = commands.info(arguments.file)
+    facts = info(arguments.file)
     if arguments.json:
         _print_json(facts)
     else:
@@ -462,11 +477,11 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _fit(arguments: argparse.Namespace) -> int:
     if arguments.jobs != 1 and (len(arguments.scans) > 1 or arguments.scans[0].is_dir()):
-        from shapespace.batch.workers import may_tell, start_loading
+        from shapespace.batch.workers import start_loading
 
         # While this process loads its own code; half of the time that many scans take to start.
-        start_loading(tell=may_tell(quiet=arguments.quiet))
-    from shapespace import commands
+        start_loading(tell=not arguments.quiet)
+    from shapespace.commands.fit import BatchSettings, fit_scans
     from shapespace.fit.fit import FitConfig
 
     config = FitConfig(
@@ -478,40 +493,29 @@ def _fit(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         dense=arguments.dense,
     )
-    records = commands.fit_scans(
-        arguments.model,
-        arguments.scans,
-        arguments.output,
-        config,
-        landmarks=arguments.landmarks,
-        jobs=arguments.jobs,
-        resume=arguments.resume,
-        stages=arguments.stages,
-        quiet=arguments.quiet,
-        say=lambda sentence: _say(f"shapespace: {sentence}"),
+    settings = BatchSettings(
+        config, arguments.landmarks, arguments.jobs, arguments.resume, arguments.stages, arguments.recursive
     )
-    counts = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
-    for record in records:
+    records = fit_scans(
+        arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=_say_of
+    )
+    counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
+    for record in records.values():
         counts[record["status"]] += 1
     if arguments.json:
-        _print_json({"folder": str(arguments.output), "scans": len(records), **counts})
+        told = [{"name": name, **_without_history(record)} for name, record in records.items()]
+        _print_json({"folder": str(arguments.output), "scans": len(records), **counts, "records": told})
     elif counts["failed"] < len(records):
-        for record in records[:10]:
-            _print_fit(record)
-        _print(
-            f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
-            + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-            + f"; results in {arguments.output}"
-        )
+        _print_fits(records, counts, arguments.output)
     if counts["failed"] == len(records):
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
 
 
 def _recognise_train(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.recognise import recognise_train
 
-    facts, notes = commands.recognise_train(
+    facts, notes = recognise_train(
         arguments.results,
         arguments.labels,
         arguments.output,
@@ -542,21 +546,21 @@ def _recognise_train(arguments: argparse.Namespace) -> int:
 
 
 def _recognise_predict(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.recognise import recognise_predict
 
-    rows, counts = commands.recognise_predict(
-        arguments.classifier, arguments.results, arguments.output, labels=arguments.labels
-    )
+    rows, counts = recognise_predict(arguments.classifier, arguments.results, arguments.output, labels=arguments.labels)
     if arguments.json:
         _print_json({"file": str(arguments.output), **counts, "answers": rows})
     else:
-        for row in rows[:10]:
+        for row in rows[:_LISTED]:
             p = max(row["probabilities"].values(), default=None)
             _print(
                 f"{row['scan']}: {row['prediction'] or 'no answer'}"
                 + (f" ({p:.2f})" if p is not None and not row["reason"] else "")
                 + (f"; {row['reason']}" if row["reason"] else "")
             )
+        if len(rows) > _LISTED:
+            _print(f"and {len(rows) - _LISTED} more; all are in {arguments.output}")
         told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
         _print(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {told}; answers in {arguments.output}")
     asked = len(rows) - counts["neutral"]
@@ -567,9 +571,9 @@ def _recognise_predict(arguments: argparse.Namespace) -> int:
 
 
 def _recognise_transfer(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.recognise import recognise_transfer
 
-    commands.recognise_transfer(arguments.model, arguments.person, arguments.expression, arguments.output)
+    recognise_transfer(arguments.model, arguments.person, arguments.expression, arguments.output)
     if arguments.json:
         _print_json({"file": str(arguments.output)})
     else:
@@ -578,9 +582,9 @@ def _recognise_transfer(arguments: argparse.Namespace) -> int:
 
 
 def _recognise_study(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
+    from shapespace.commands.recognise import recognise_study
 
-    report, targets, holds = commands.recognise_study(
+    report, targets, holds = recognise_study(
         arguments.output,
         data=arguments.data,
         model=arguments.model,
@@ -628,20 +632,57 @@ def _now(line: str) -> None:
     sys.stdout.flush()
 
 
-def _print_fit(record: Mapping[str, Any]) -> None:
-    if record["status"] == "failed":
-        return
-    final = record["distances_mm"]["final"]
+def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, int], folder: Path) -> None:
+    fitted = {name: record for name, record in records.items() if record["status"] != "failed"}
+    for name, record in list(fitted.items())[:_LISTED]:
+        _print_fit(name, record)
+    if len(fitted) > _LISTED:
+        more = len(fitted) - _LISTED
+        _print(f"and {more} more {'scan' if more == 1 else 'scans'}; all are in {folder / 'coefficients.csv'}")
     _print(
-        f"{record['scan']['name']}: {record['status']}; model to scan {final['model_to_scan']['mean']:.2f} mm mean, "
-        f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
-        f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
+        f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
+        + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+        + f"; results in {folder}"
     )
-    if "dense" in record["distances_mm"]:
-        dense = record["distances_mm"]["dense"]["model_to_scan"]
-        _print(f"  dense surface to scan: {dense['median']:.2f} mm median, {dense['mean']:.2f} mm mean")
+
+
+def _print_fit(name: str, record: Mapping[str, Any]) -> None:
+    file = str(record["scan"]["name"])
+    # A scan that shares its file's name with others goes by the name of its results.
+    called = file if Path(file).stem == name else f"{name} ({file})"
+    told = _distances(record, "shown")
+    _print(f"{called}: {record['status']}" + (f"; {told}" if told else ""))
+    if told := _distances(record, "shown_dense", measure="median"):
+        _print(f"  dense surface to scan: {told.removeprefix('model to scan ')}")
     for note in record["notes"]:
-        print(f"  {note}")
+        _print(f"  {note}")
+
+
+def _distances(record: Mapping[str, Any], key: str, measure: str = "mean") -> str:
+    """Return the distances over what scan and model both show, in words; empty where the record does not tell."""
+    shown, in_scan = record.get(key), record.get(f"{key}_scan_mm")
+    if not shown or not in_scan:
+        return ""
+    told = [shown[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    if any(value is None or not math.isfinite(value) for value in told):
+        return "scan and model show nothing in common"
+    sizes = [in_scan[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    seen, covered = (f"{100 * shown[key]:.0f} %" for key in ("model_seen_share", "scan_covered_share"))
+    words = (
+        f"model to scan {told[0]:.2f} mm {measure} over the {seen} of it that the scan shows, "
+        f"scan to model {told[1]:.2f} mm {measure} over the {covered} of it that the model covers"
+    )
+    if abs(sizes[0] - told[0]) > _OTHER_SIZE * told[0]:
+        words += f" ({sizes[0]:.2f} and {sizes[1]:.2f} mm of the scan)"
+    return words
+
+
+def _without_history(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record.items() if key != "history"}
+
+
+def _say_of(sentence: str) -> None:
+    _say(f"shapespace: {sentence}")
 
 
 def _say(sentence: str) -> None:

@@ -318,9 +318,14 @@ def test_the_table_has_one_row_a_scan_in_the_order_given(fitted: Path) -> None:
 def test_fit_prints_facts_as_json_or_a_line_a_scan(run: Run, world: World, tmp_path: Path) -> None:
     outcome = run("fit", world.model, world.scan, "-o", tmp_path / "o", "--json", "--quiet")
     assert outcome.code == 0 and outcome.err == ""
-    assert outcome.facts == {
+    facts = outcome.facts
+    (record,) = facts.pop("records")
+    assert facts == {
         "folder": str(tmp_path / "o"), "scans": 1, "converged": 1, "max_iterations": 0, "doubtful": 0, "failed": 0,
     }  # fmt: skip
+    written = record_of(tmp_path / "o")
+    assert record.pop("name") == "scan_0"
+    assert record == {key: value for key, value in written.items() if key != "history"}
     text = run("fit", world.model, world.scan, "-o", tmp_path / "o", "--resume")
     lines = text.out.splitlines()
     assert lines[0].startswith("scan_0.ply: converged; model to scan ")
@@ -461,7 +466,7 @@ def test_scans_of_one_name_keep_results_apart(run: Run, world: World, tmp_path: 
         paths.append(tmp_path / folder / "face.ply")
         paths[-1].write_bytes(source.read_bytes())
     assert run("fit", world.model, *paths, "-o", tmp_path / "o", "--max-iterations", 3).code == 0
-    records = [record_of(tmp_path / "o", name) for name in ("face", "face_2")]
+    records = [record_of(tmp_path / "o", name) for name in ("one_face", "two_face")]
     assert records[0]["scan"]["hash"] == sha256_of_file(paths[0])
     assert records[1]["scan"]["hash"] == sha256_of_file(paths[1])
     assert records[0]["b"] != records[1]["b"]
