@@ -10,6 +10,7 @@ import pytest
 
 from conftest import Run, World
 from shapespace.batch import progress
+from shapespace.batch.progress import TOLD_AFTER_S
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -192,6 +193,7 @@ def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     )
     for command, _ in commands:
         assert "..." not in run(*command).err, "short work is not worth a line"
+    assert TOLD_AFTER_S == 5.0
     monkeypatch.setattr(progress, "TOLD_AFTER_S", 0.0)
     for command, line in commands:
         assert run(*command).err.splitlines().count(line) == 1

@@ -192,7 +192,7 @@ def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
     for direction in _DIRECTIONS:
         row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
     row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
-    row |= {key: record["evidence"][key] for key in _EXPECTED if key in record["evidence"]}
+    row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
     row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
     return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
 

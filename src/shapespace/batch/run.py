@@ -161,8 +161,9 @@ def fit_files(
 
     def done(job: Job, record: dict[str, Any]) -> None:
         nonlocal saved
-        records[job.name] = record
+        # In this order, so that what an interruption keeps out of the table is caught up with.
         table.add(job.name, record)
+        records[job.name] = record
         if on_done is not None:
             on_done(job, record)
         if time.monotonic() - saved > _SAVE_EVERY_S:

@@ -18,7 +18,7 @@ from shapespace.errors import FileFormatError, InputError, MeshError, Shapespace
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder
 from shapespace.io.folders import mesh_files
-from shapespace.io.labels import read_labels
+from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import read_mesh
 from shapespace.model.representation import representation_named
@@ -263,12 +263,13 @@ def _additive(
     from shapespace.model.additive import AdditiveModel
 
     known = read_labels(labels)
-    lacking = [file.name for file in files if file.stem not in known or not known[file.stem].subject]
-    if lacking:
+    found = [label_of(known, file) for file in files]
+    own = [label for label in found if label is not None and label.subject]
+    if len(own) < len(files):
+        lacking = [file.name for file, label in zip(files, found, strict=True) if label is None or not label.subject]
         raise InputError(
             f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
         )
-    own = [known[file.stem] for file in files]
     expression_modes = settings.expression_variance
     return AdditiveModel.fit(
         meshes,

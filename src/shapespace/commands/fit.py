@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, telling_of_compiling
@@ -76,21 +79,28 @@ def fit_scans(
     if len(work) < len(files):
         say(f"Of {len(files)} scans {len(files) - len(work)} were given more than once; each is fitted once.")
     with progress(len(work), "fitting", "scan", quiet=quiet) as bar:
-
-        def show_state(state: IcpState) -> None:
-            bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
-
-        def done(job: Job, record: Mapping[str, Any]) -> None:
-            bar.update()
-            if record["status"] == "converged":
-                return
-            bar.clear()
-            # The reason of a failure names the file already.
-            failed = record["status"] == "failed"
-            say(record["reason"] if failed else f"{job.scan}: {record['status']}: {record['reason']}")
-
-        records = _fit(work, model, model_path, folder, settings, done, show_state, quiet=quiet)
+        records = _fit(work, model, model_path, folder, settings, _Watch(bar, say), quiet=quiet)
     return {job.name: record for job, record in zip(work, records, strict=True)}
+
+
+@dataclass(frozen=True)
+class _Watch:
+    """Shows how the fits go, and says which did not converge."""
+
+    bar: tqdm[Any]
+    say: Callable[[str], None]
+
+    def state(self, state: IcpState) -> None:
+        self.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
+
+    def done(self, job: Job, record: Mapping[str, Any]) -> None:
+        self.bar.update()
+        if record["status"] == "converged":
+            return
+        self.bar.clear()
+        # The reason of a failure names the file already.
+        failed = record["status"] == "failed"
+        self.say(record["reason"] if failed else f"{job.scan}: {record['status']}: {record['reason']}")
 
 
 def _fit(
@@ -99,24 +109,21 @@ def _fit(
     model_path: Path,
     folder: Path,
     settings: BatchSettings,
-    done: Callable[[Job, Mapping[str, Any]], None],
-    show_state: Callable[[IcpState], None],
+    watch: _Watch,
     *,
     quiet: bool,
 ) -> list[dict[str, Any]]:
-    config, resume, stages = settings.config, settings.resume, settings.stages
     workers = min(settings.jobs or cores(), len(work))
+    fit = partial(
+        fit_files, work, model, model_path, folder, settings.config,
+        resume=settings.resume, stages=settings.stages, on_done=watch.done,
+    )  # fmt: skip
     if workers <= 1:
         with telling_of_compiling(quiet=quiet):
-            return fit_files(
-                work, model, model_path, folder, config,
-                resume=resume, stages=stages, on_done=done, on_state=show_state,
-            )  # fmt: skip
+            return fit(on_state=watch.state)
     start_loading(tell=not quiet)
     with make_executor(model_path, workers) as executor:
-        return fit_files(
-            work, model, model_path, folder, config, executor=executor, resume=resume, stages=stages, on_done=done
-        )
+        return fit(executor=executor)
 
 
 def _scans(scans: Sequence[Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:

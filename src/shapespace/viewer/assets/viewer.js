@@ -536,12 +536,12 @@
     const { shown: told, shown_scan_mm: inScan } = facts;
     if (!told) return null;
     const rows = [
-      ["Model to scan", "model_to_scan", `the ${percent(told.model_seen_share)} of the model that the scan shows`],
-      ["Scan to model", "scan_to_model", `the ${percent(told.scan_covered_share)} of the scan that the model covers`],
-    ].map(([name, way, over]) => {
+      ["Model to scan", "model_to_scan", `the scan shows it, ${percent(told.model_seen_share)} of the model`],
+      ["Scan to model", "scan_to_model", `the model covers it, ${percent(told.scan_covered_share)} of the scan`],
+    ].map(([name, way, where]) => {
       const { mean, p95 } = told[way], own = inScan ? inScan[way].mean : mean;
       const other = Math.abs(own - mean) > OTHER_SIZE * mean ? ` (${mm(own)} of the scan)` : "";
-      return [name, `${mm(mean)}${other} mean over ${over}, 95 % within ${mm(p95)}`];
+      return [name, `${mm(mean)}${other} mean where ${where}; 95 % within ${mm(p95)}`];
     });
     return h("dl", { class: "facts", "data-testid": "shown" }, ...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
   }
