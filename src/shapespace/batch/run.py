@@ -179,17 +179,14 @@ def fit_files(
             tasks.append(task)
         else:
             done(job, earlier)
+    if executor is None:
+        running = _run_here(tasks, model, model_file, folder, on_state)
+    else:
+        running = _run_on(executor, tasks, model_file, folder)
     try:
-        if executor is None:
-            for task in tasks:
-                record = fit_file(
-                    task.job, model, model_file, folder, task.config, stages=task.stages, on_state=on_state
-                )
-                done(task.job, record)
-        else:
-            with closing(_run_on(executor, tasks, model_file, folder)) as finished:
-                for job, record in finished:
-                    done(job, record)
+        with closing(running) as ended:
+            for job, record in ended:
+                done(job, record)
     finally:
         table.catch_up([task.job.name for task in tasks if task.job.name not in records])
         table.save()
@@ -203,6 +200,21 @@ class _Task:
     job: Job
     config: FitConfig
     stages: bool
+
+
+def _run_here(
+    tasks: Sequence[_Task],
+    model: ShapeModel,
+    model_file: Path,
+    folder: Path,
+    on_state: Callable[[IcpState], None] | None,
+) -> Generator[tuple[Job, dict[str, Any]]]:
+    """Yield the job and record of each task, done one after the other in this process."""
+    for task in tasks:
+        yield (
+            task.job,
+            fit_file(task.job, model, model_file, folder, task.config, stages=task.stages, on_state=on_state),
+        )
 
 
 def _run_on(

@@ -1,0 +1,308 @@
+"""What may be written on the command line."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, cast
+
+from shapespace import __version__
+from shapespace.cli import run
+
+_UNITS = ("auto", "um", "mm", "cm", "inch", "m")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    top = argparse.ArgumentParser(
+        prog="shapespace", description="Turn any raw 3-D surface into a short vector that means something."
+    )
+    top.add_argument("--version", action="version", version=f"shapespace {__version__}")
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    _add_demo(commands)
+    _add_data(commands)
+    _add_check(commands)
+    _add_build(commands)
+    _add_info(commands)
+    _add_fit(commands)
+    _add_report(commands)
+    _add_view(commands)
+    _add_recognise(commands)
+    return top
+
+
+def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool = True) -> argparse.ArgumentParser:
+    sub = cast(
+        argparse.ArgumentParser,
+        commands.add_parser(
+            name,
+            help=what,
+            description=what[0].upper() + what[1:] + ".",
+            epilog=f"example: {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        ),
+    )
+    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+    if json_facts:
+        sub.add_argument("--json", action="store_true", help="print facts as JSON")
+    return sub
+
+
+def _add_recursive(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--recursive", action="store_true", help="take what lies in folders below those given too")
+
+
+def _add_demo(commands: Any) -> None:
+    sub = _add(commands, "demo", "both experiments of the paper, ending in a report", "shapespace demo --quick")
+    sub.add_argument("--out", type=Path, default=Path("shapespace-demo"), metavar="DIR", help="where to write")
+    sub.add_argument("--quick", action="store_true", help="coarser scans and an earlier stop, under a minute")
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=run.demo)
+
+
+def _add_data(commands: Any) -> None:
+    sub = commands.add_parser("data", help="open data sets and simulated faces").add_subparsers(
+        required=True, metavar="list|get|faces"
+    )
+    listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
+    listing.set_defaults(run=run.data_list)
+    get = _add(sub, "get", "download and verify an open data set", "shapespace data get ict-facekit")
+    get.add_argument("name", metavar="NAME")
+    get.add_argument("--to", type=Path, metavar="DIR", help="also copy it there")
+    get.set_defaults(run=run.data_get)
+    faces = _add(
+        sub, "faces", "write simulated corresponded faces (PLY) with labels.csv",
+        "shapespace data faces -o faces --subjects 100 --expressions neutral",
+    )  # fmt: skip
+    faces.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    faces.add_argument("--subjects", type=_positive, default=100, metavar="N")
+    faces.add_argument("--expressions", default="neutral", metavar="LIST", help="names with commas between them")
+    faces.add_argument("--seed", type=_natural, default=0, metavar="S")
+    faces.add_argument("--source", choices=("bundled", "ict-facekit"), default="bundled")
+    faces.add_argument("--area", choices=("face", "face_and_head"), default="face", help="of ict-facekit")
+    faces.add_argument("--raw", action="store_true",
+                       help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
+    faces.set_defaults(run=run.data_faces)
+
+
+def _add_check(commands: Any) -> None:
+    sub = _add(commands, "check", "mesh doctor: what is in it, what is wrong, what fitting will do about it",
+               "shapespace check scan.obj")  # fmt: skip
+    sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _add_recursive(sub)
+    sub.set_defaults(run=run.check)
+
+
+def _add_build(commands: Any) -> None:
+    sub = _add(commands, "build", "build a shape model from corresponding meshes: Procrustes and PCA",
+               "shapespace build faces/*.ply -o model.h5 --modes auto")  # fmt: skip
+    sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="mesh files or folders of them")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL.h5")
+    _add_recursive(sub)
+    sub.add_argument("--with-doubtful", action="store_true",
+                     help="take surfaces of doubtful fits too, which are left out otherwise")  # fmt: skip
+    how_many = sub.add_mutually_exclusive_group()
+    how_many.add_argument("--variance", type=_share, metavar="SHARE", help="modes that hold this share, such as 0.98")
+    how_many.add_argument("--modes", type=_modes, default="auto", metavar="K|auto|all",
+                          help="a number; auto for cross-validation on held-out vertices (default); all")  # fmt: skip
+    sub.add_argument("--gauge", choices=("form", "shape"), default="shape",
+                     help="form: size lives in the modes; shape: size is divided out (default)")  # fmt: skip
+    sub.add_argument("--representation", choices=("vertices", "bspline", "bspline-detail"), default="vertices",
+                     help="what the modes move: vertices (default), or control points of a B-spline surface, without "
+                          "or with the detail of the mean that it cannot hold")  # fmt: skip
+    sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
+    sub.add_argument("--additive", type=Path, metavar="LABELS.csv",
+                     help="part identity and expression: CSV of file, subject and label (one is neutral); --modes or "
+                          "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip
+    sub.add_argument("--expression-variance", type=_share, metavar="SHARE",
+                     help="with --additive: modes of expression that hold this share (default 0.99)")  # fmt: skip
+    sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
+    sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE",
+                     help="CSV of name,vertex, or points on the first mesh")  # fmt: skip
+    sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
+    sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=run.build)
+
+
+def _add_info(commands: Any) -> None:
+    sub = _add(commands, "info", "facts of a model, a mesh or a fit", "shapespace info model.h5")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.set_defaults(run=run.info)
+
+
+def _add_fit(commands: Any) -> None:
+    sub = _add(commands, "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
+               "shapespace fit model.h5 scan.obj -o out\n"
+               "         shapespace fit model.h5 scans -o out --dense\n"
+               "         shapespace build out/*.dense.ply -o new.h5")  # fmt: skip
+    sub.add_argument("model", type=Path, metavar="MODEL.h5")
+    sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                     help="where to write; results that are there already stay")  # fmt: skip
+    _add_recursive(sub)
+    sub.add_argument(
+        "--method",
+        default="robust",
+        metavar="NAME",
+        help="robust (default): pose and shape together, from both directions; paper: the paper's modified ICP",
+    )
+    sub.add_argument("--unit", choices=_UNITS, default="auto", help="of the scans (default: found)")
+    sub.add_argument("--search", choices=("auto", "vertices", "surface"), default="auto",
+                     help="for --method paper: among the scan's vertices (auto) or on its triangles")  # fmt: skip
+    sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
+                     help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
+    sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="scans at a time (default: one a core)")
+    sub.add_argument("--resume", action="store_true", help="keep results of an earlier run that still hold")
+    sub.add_argument("--dense", action="store_true",
+                     help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
+    sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
+    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=run.fit, goes_on="; the same command with --resume goes on from there")
+
+
+def _add_view(commands: Any) -> None:
+    sub = _add(commands, "view", "shape model and fits in the browser, and scans dropped there fitted",
+               "shapespace view model.h5", json_facts=False)  # fmt: skip
+    sub.add_argument("path", type=Path, metavar="MODEL.h5|DIR", help="a model, or a folder that fit wrote")
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits in DIR (default: named in them)")
+    sub.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default 127.0.0.1)")
+    sub.add_argument("--port", type=_natural, metavar="N", help="default: the first free one from 7860")
+    sub.add_argument("--no-open", action="store_true", help="do not open a browser")
+    sub.add_argument("--max-upload-mb", type=_positive, default=200, metavar="N", help="largest scan (default 200)")
+    sub.set_defaults(run=run.view)
+
+
+def _add_report(commands: Any) -> None:
+    sub = _add(commands, "report", "one HTML file on the results in a folder: summary, model, fits, settings",
+               "shapespace fit model.h5 scans -o out --stages\n         shapespace report out")  # fmt: skip
+    sub.add_argument("folder", type=Path, metavar="DIR", help="written by shapespace fit or shapespace demo")
+    sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
+    sub.add_argument("--labels", type=Path, metavar="FILE",
+                     help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=run.report)
+
+
+def _add_recognise(commands: Any) -> None:
+    sub = commands.add_parser("recognise", help="tell expressions or other classes apart by fitted coefficients")
+    sub = sub.add_subparsers(required=True, metavar="train|predict|transfer|study")
+    _add_recognise_train(sub)
+    _add_recognise_predict(sub)
+    _add_recognise_transfer(sub)
+    _add_recognise_study(sub)
+
+
+def _add_recognise_train(commands: Any) -> None:
+    sub = _add(commands, "train", "train a classifier on fitted scans with labels",
+               "shapespace recognise train out --labels labels.csv -o expressions.skops\n"
+               "         shapespace recognise train out --labels labels.csv -o expressions.skops --relative "
+               "--classifier mean-direction")  # fmt: skip
+    sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
+    sub.add_argument("--labels", type=Path, required=True, metavar="FILE",
+                     help="CSV of file and label, and of subject if known")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.skops")
+    sub.add_argument("--classifier", default="lda", metavar="NAME",
+                     help="mean-direction, knn, lda (default), qda, logistic or svm")  # fmt: skip
+    sub.add_argument("--relative", action="store_true", help="compare each scan with its subject's neutral face")
+    sub.add_argument("--neutral", default="neutral", metavar="LABEL", help="label of neutral faces (default neutral)")
+    sub.add_argument("--confidence", type=_probability, default=0.5, metavar="P",
+                     help="answer unsure below this probability (default 0.5)")  # fmt: skip
+    sub.add_argument("--modes", type=_positive, metavar="K", help="leading coefficients to see (default: all)")
+    sub.add_argument("--expression-of", type=Path, metavar="MODEL.h5",
+                     help="see the expression alone, as parted by this model of build --additive")  # fmt: skip
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=run.recognise_train)
+
+
+def _add_recognise_predict(commands: Any) -> None:
+    sub = _add(commands, "predict", "answer for fitted scans by a trained classifier, as a CSV table",
+               "shapespace recognise predict expressions.skops out -o predictions.csv")  # fmt: skip
+    sub.add_argument("classifier", type=Path, metavar="FILE.skops")
+    sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
+    sub.add_argument("--labels", type=Path, metavar="FILE",
+                     help="CSV of file, label and subject: says which scans are neutral faces, and whose")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.csv")
+    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful or an answer unsure")
+    sub.set_defaults(run=run.recognise_predict)
+
+
+def _add_recognise_transfer(commands: Any) -> None:
+    sub = _add(commands, "transfer", "put one person's expression on another, from fits by an additive model",
+               "shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply")  # fmt: skip
+    sub.add_argument("model", type=Path, metavar="MODEL.h5", help="made by build --additive LABELS.csv")
+    sub.add_argument("person", type=Path, metavar="PERSON.fit.json", help="fit of who is to be shown")
+    sub.add_argument("expression", type=Path, metavar="EXPRESSION.fit.json", help="fit of what they shall do")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.ply")
+    sub.set_defaults(run=run.recognise_transfer)
+
+
+def _add_recognise_study(commands: Any) -> None:
+    sub = _add(commands, "study", "recognition measured on unseen people, ending in a report",
+               "shapespace recognise study -o study\n"
+               "         shapespace recognise study --data BU-3DFE --model model.h5 -o study")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, default=Path("shapespace-study"), metavar="DIR",
+                     help="where to write; a study that was interrupted goes on")  # fmt: skip
+    sub.add_argument("--data", type=Path, metavar="DIR",
+                     help="labelled scans: BU-3DFE, Bosphorus, or a folder with labels.csv")  # fmt: skip
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="shape model that fits them, with --data")
+    sub.add_argument("--people", type=_positive, metavar="N", help="simulated people (default 100)")
+    sub.add_argument("--strangers", type=_natural, metavar="N", help="people of another generator (default 25)")
+    sub.add_argument("--folds", type=_positive, metavar="N",
+                     help="folds by subject (default 4 for simulated people, 10 with --data)")  # fmt: skip
+    sub.add_argument("--seed", type=_natural, metavar="S", help="of everything that is drawn")
+    sub.add_argument("--shape-spaces", action="store_true",
+                     help="compare vertices with B-spline control points too (11 minutes more)")  # fmt: skip
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
+    sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
+    sub.set_defaults(run=run.recognise_study, goes_on="; the same command goes on from there")
+
+
+def _positive(text: str) -> int:
+    value = _natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def _natural(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if value < 0:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _share(text: str) -> float:
+    value = _probability(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
+    return value
+
+
+def _probability(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError("must lie from 0 to 1")
+    return value
+
+
+def _control_points(text: str) -> tuple[int, int]:
+    counts = text.lower().split("x")
+    if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
+        raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
+    return int(counts[0]), int(counts[1])
+
+
+def _modes(text: str) -> int | str:
+    return text if text in ("auto", "all") else _positive(text)
