@@ -79,6 +79,16 @@ def test_recursive_takes_folders_below_and_tells_scans_apart_by_their_path(run: 
     assert "p1_neutral (neutral.ply): " in text and "\na.ply: " in "\n" + text
 
 
+def test_a_scan_given_by_its_folder_and_by_its_name_is_fitted_once(run: Run, world: World, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    (scans / "a.ply").write_bytes(world.scan.read_bytes())
+    outcome = run("fit", world.model, scans, scans / "a.ply", "-o", tmp_path / "o", *FAST, "--json")
+    assert outcome.code == 0 and [record["name"] for record in outcome.facts["records"]] == ["a"]
+    assert "given more than once are fitted once: 1 of 2." in outcome.err
+    assert list(rows_of(tmp_path / "o")) == ["a"]
+
+
 def test_build_takes_folders_below_too(run: Run, world: World, tmp_path: Path) -> None:
     for k, mesh in enumerate(sorted(world.meshes.glob("*.ply"))):
         folder = tmp_path / "meshes" / f"person{k // 3}"

@@ -37,6 +37,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
 _SAVE_EVERY_S = 5.0
+_SAVES_APART = 20.0
 
 
 @dataclass(frozen=True)
@@ -157,18 +158,19 @@ def fit_files(
     make_folder(folder)
     records: dict[str, dict[str, Any]] = {}
     table = CoefficientTable(folder, [job.name for job in jobs], model.n_modes)
-    saved = time.monotonic()
+    next_save = time.monotonic() + _SAVE_EVERY_S
 
     def done(job: Job, record: dict[str, Any]) -> None:
-        nonlocal saved
+        nonlocal next_save
         # In this order, so that what an interruption keeps out of the table is caught up with.
         table.add(job.name, record)
         records[job.name] = record
         if on_done is not None:
             on_done(job, record)
-        if time.monotonic() - saved > _SAVE_EVERY_S:
+        if (now := time.monotonic()) > next_save:
             table.save()
-            saved = time.monotonic()
+            # A table of very many rows takes a while itself.
+            next_save = time.monotonic() + max(_SAVE_EVERY_S, _SAVES_APART * (time.monotonic() - now))
 
     tasks: list[_Task] = []
     for job in {job.name: job for job in jobs}.values():

@@ -77,7 +77,7 @@ def fit_scans(
     remove_file(folder / ".writable")
     work = list({job.name: job for job in make_jobs(files, settings.landmarks, folder)}.values())
     if len(work) < len(files):
-        say(f"Of {len(files)} scans {len(files) - len(work)} were given more than once; each is fitted once.")
+        say(f"Scans given more than once are fitted once: {len(work)} of {len(files)}.")
     with progress(len(work), "fitting", "scan", quiet=quiet) as bar:
         records = _fit(work, model, model_path, folder, settings, _Watch(bar, say), quiet=quiet)
     return {job.name: record for job, record in zip(work, records, strict=True)}
