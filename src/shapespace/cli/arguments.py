@@ -42,7 +42,7 @@ def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool 
             formatter_class=argparse.RawDescriptionHelpFormatter,
         ),
     )
-    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+    sub.add_argument("--quiet", action="store_true", help="no progress")
     if json_facts:
         sub.add_argument("--json", action="store_true", help="print facts as JSON")
     return sub
