@@ -35,7 +35,8 @@ from tqdm import tqdm
 
 import shapespace
 from shapespace.errors import ShapespaceError
-from shapespace.fit.fit import METHODS, FitConfig, fit_scan
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.methods import METHODS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 

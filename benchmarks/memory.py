@@ -22,7 +22,7 @@ import numpy as np
 from accuracy import FIT_FIELDS, machine_facts
 from cases import Bench, run
 
-from shapespace.fit.fit import METHODS
+from shapespace.fit.methods import METHODS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 

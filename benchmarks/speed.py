@@ -32,7 +32,9 @@ from peers import paper_numpy
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from shapespace.fit.fit import METHODS, FitConfig, fit_scan
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.methods import METHODS
+from shapespace.fit.paper_method import Paper
 from shapespace.fit.result import FitResult
 from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
@@ -64,9 +66,9 @@ def contenders(model: ShapeModel, scan: Scan, turned: Scan) -> dict[str, Fit]:
 
     def loop() -> object:
         engine, T = build_engine(scan.mesh, "vertices"), start
-        for state in similarity_icp(model, engine, T, FitConfig().stop_rule()):
+        for state in similarity_icp(model, engine, T, Paper().stop_rule(500)):
             T = state.T_scan_model
-        return list(shape_icp(model, engine, T, FitConfig().stop_rule()))
+        return list(shape_icp(model, engine, T, Paper().stop_rule(500)))
 
     def ours(method: str, on: Scan = scan, **more: Any) -> Fit:
         return lambda: fit_scan(model, on.mesh, FitConfig(method=method, **more), T_scan_model=on.start)

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.settings import RobustSettings
+from shapespace.fit.robust_method import Robust
 
 CASES_SWEPT = ("complete", "holes", "outside", "outside_holes", "missing40", "coarse", "noise1", "jaw")
 VALUES: Mapping[str, tuple[Any, ...]] = {
@@ -46,8 +46,8 @@ VALUES: Mapping[str, tuple[Any, ...]] = {
 FAILED_MM = 30.0
 
 
-def settings_with(name: str, value: Any) -> RobustSettings:
-    base = RobustSettings()
+def settings_with(name: str, value: Any) -> Robust:
+    base = Robust()
     if name.startswith("residual."):
         part = dataclasses.replace(base.residual, **{name.removeprefix("residual."): value})
         return dataclasses.replace(base, residual=part)
@@ -55,20 +55,20 @@ def settings_with(name: str, value: Any) -> RobustSettings:
 
 
 def default_of(name: str) -> Any:
-    base: Any = RobustSettings()
+    base: Any = Robust()
     for part in name.split("."):
         base = getattr(base, part)
     return base
 
 
-def errors(bench: Bench, settings: RobustSettings, people: int) -> dict[str, list[float]]:
+def errors(bench: Bench, settings: Robust, people: int) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for name in CASES_SWEPT:
         model = bench.model(CASES[name].model)
         for index in range(people):
             scan = bench.scan(name, index)
             try:
-                result = fit_scan(model, scan.mesh, FitConfig(robust=settings), T_scan_model=scan.start)
+                result = fit_scan(model, scan.mesh, FitConfig(settings), T_scan_model=scan.start)
                 error = float(error_mm(result.surface(model).vertices, scan).mean())
             except ShapespaceError:
                 error = FAILED_MM
@@ -76,9 +76,9 @@ def errors(bench: Bench, settings: RobustSettings, people: int) -> dict[str, lis
     return found
 
 
-def on_james(bench: Bench, settings: RobustSettings) -> float:
+def on_james(bench: Bench, settings: Robust) -> float:
     model, scan = bench.model("ict200"), bench.scan("james", 0)
-    result = fit_scan(model, scan.mesh, FitConfig(robust=settings))
+    result = fit_scan(model, scan.mesh, FitConfig(settings))
     mm = 1.0 / result.T_scan_model.scale
     return surface_figures(result.surface(model).vertices, model, scan, mm)["m2s_median_mm"]
 
@@ -91,8 +91,8 @@ def main() -> None:
     arguments = parser.parse_args()
     names = [n for n in arguments.only.split(",") if n] or list(VALUES)
     bench = Bench("dev")
-    base = errors(bench, RobustSettings(), arguments.people)
-    james = on_james(bench, RobustSettings())
+    base = errors(bench, Robust(), arguments.people)
+    james = on_james(bench, Robust())
     rows: list[dict[str, Any]] = []
     for name in tqdm(names, desc="settings"):
         for value in VALUES[name]:

@@ -21,7 +21,7 @@ from accuracy import machine_facts
 from cases import Bench, run
 from tqdm import tqdm
 
-from shapespace.fit.fit import METHODS
+from shapespace.fit.methods import METHODS
 from shapespace.io.meshes import write_mesh
 
 LEAST = 1.8

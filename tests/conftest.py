@@ -3,6 +3,9 @@ from pathlib import Path
 
 import pytest
 
+# Tests leave nothing in the user's cache; those of what is kept there name a folder of their own.
+os.environ["SHAPESPACE_KEEP"] = "no"
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

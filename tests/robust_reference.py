@@ -7,7 +7,9 @@ normal n, by a small rotation, translation and log scale of the model and by the
 
 import numpy as np
 
-from shapespace.fit.robust import POSE, JointFit
+from shapespace.fit.equations import Estimate
+from shapespace.fit.moving_model import POSE
+from shapespace.fit.robust import Look, Problem
 from shapespace.types import FloatArray
 
 
@@ -18,11 +20,10 @@ def vertex_rows(vertices: FloatArray, normals: FloatArray, modes: FloatArray) ->
     return np.concatenate([turn, normals, size, np.einsum("vd,vdk->vk", normals, modes)], axis=1)
 
 
-def gauss_newton_step(fit: JointFit, modes: int) -> tuple[FloatArray, FloatArray]:
-    """Return the step (7 + K,) that `fit.step` takes from its matches as they are, and the Hessian of the cost."""
-    s, surface, scan, vertices = fit.settings, fit.surface, fit.scan, fit.vertices
-    assert scan is not None and vertices is not None
-    w, v = fit.weigh()
+def gauss_newton_step(problem: Problem, look: Look, at: Estimate, modes: int) -> tuple[FloatArray, FloatArray]:
+    """Return the step (7 + K,) from `at` given what the fit sees there, and the Hessian of the cost."""
+    surface, prior, scan, vertices = problem.surface, problem.prior, look.matches.points, look.matches.vertices
+    w, v = look.weights.points, look.weights.vertices
     rows = vertex_rows(surface.vertices, surface.normals, surface.modes[:, :, :modes].astype(float))
     hessian, gradient = np.zeros((POSE + modes, POSE + modes)), np.zeros(POSE + modes)
     corners = surface.topology.faces[scan.triangle]
@@ -33,9 +34,9 @@ def gauss_newton_step(fit: JointFit, modes: int) -> tuple[FloatArray, FloatArray
     for j, weight, residual in zip(vertices.vertex, v, vertices.residual, strict=True):
         hessian += weight * np.outer(rows[j], rows[j])
         gradient += weight * residual * rows[j]
-    rho = fit.prior * fit.sigma_mm**2
-    hessian[POSE:, POSE:] += np.diag(rho / fit.stddev[:modes] ** 2)
-    gradient[POSE:] += rho * fit.b[:modes] / fit.stddev[:modes] ** 2
-    hessian[6, 6] += rho / s.scale_stddev**2
-    gradient[6] += rho / s.scale_stddev**2 * np.log(fit.T.scale / fit.start_scale)
+    rho = prior.weight * look.sigma_mm**2
+    hessian[POSE:, POSE:] += np.diag(rho / prior.stddev[:modes] ** 2)
+    gradient[POSE:] += rho * at.b[:modes] / prior.stddev[:modes] ** 2
+    hessian[6, 6] += rho / prior.scale_stddev**2
+    gradient[6] += rho / prior.scale_stddev**2 * np.log(at.T_scan_model.scale / prior.start_scale)
     return -np.linalg.solve(hessian, gradient), hessian

@@ -8,7 +8,9 @@ if TYPE_CHECKING:
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
     from shapespace.fit.fit import FitConfig, fit_scan
+    from shapespace.fit.paper_method import Paper
     from shapespace.fit.result import FitResult
+    from shapespace.fit.robust_method import Robust
     from shapespace.geometry.distance import surface_distances
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
@@ -22,6 +24,8 @@ __all__ = [
     "FitConfig",
     "FitResult",
     "Mesh",
+    "Paper",
+    "Robust",
     "ShapeModel",
     "ShapeSpace",
     "ShapespaceError",
@@ -40,6 +44,8 @@ _HOMES = {
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
     "Mesh": "types",
+    "Paper": "fit.paper_method",
+    "Robust": "fit.robust_method",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",

@@ -37,6 +37,7 @@ from shapespace.datasets.simulated_scan import (
     simulate_scan,
 )
 from shapespace.fit.fit import FitConfig
+from shapespace.fit.paper_method import Paper
 from shapespace.fit.state import IcpState
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import make_folder, write_text
@@ -327,7 +328,7 @@ def _fit_all(
     make_folder(home / "scans")
     for name, scan in scans.items():
         write_mesh(home / "scans" / f"{name}.ply", scan.scan if isinstance(scan, SimulatedScan) else scan)
-    config = FitConfig(method="paper", stop_motion_mm=scale.stop_motion_mm)
+    config = FitConfig(Paper(stop_motion_mm=scale.stop_motion_mm))
 
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")

@@ -5,7 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from shapespace.fit.fit import METHODS, FitConfig
+from shapespace.fit.method import Limits
+from shapespace.fit.methods import METHODS, method_named
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.start import Start
 from shapespace.fit.state import IcpState
@@ -14,11 +15,12 @@ from synthetic_shapes import blob_model, raw_scan, similarity
 Z = np.array([1.5, -1.8, 1.3, 1.6, -1.4])
 
 
-def states(name: str, **settings: object) -> list[IcpState]:
+def states(name: str, max_iterations: int = 500, **settings: object) -> list[IcpState]:
     T = similarity(degrees=5.0, shift=2.0)
     raw = raw_scan(Z, T)
-    config = FitConfig(method=name, **settings)  # type: ignore[arg-type]
-    return list(METHODS[name](blob_model(), ScanTarget(raw.scan), Start(T, "given", np.nan), config))
+    limits = Limits(with_scale=True, modes=None, max_iterations=max_iterations)
+    method, start = method_named(name, **settings), Start(T, "given", np.nan)
+    return list(method.states(blob_model(), ScanTarget(raw.scan), start, limits))
 
 
 @pytest.mark.parametrize("name", METHODS)

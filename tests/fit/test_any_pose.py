@@ -176,3 +176,13 @@ def test_directions_of_a_cloud_without_triangles_are_across_it() -> None:
     d = sphere(2000)[0]
     n = any_pose._normals(100.0 * d)  # pyright: ignore[reportPrivateUsage]
     assert np.abs((n * d).sum(axis=1)).min() > 0.97
+
+
+def test_thinning_leaves_one_point_in_each_cell_that_has_any_and_no_lone_point_far_outside() -> None:
+    points = np.random.default_rng(1).uniform(0, 50, (3000, 3))
+    points[7] = 1e6
+    kept = any_pose._evenly(points, 9.0, 100.0)  # pyright: ignore[reportPrivateUsage]
+    cells = np.rint((points - np.delete(points, 7, axis=0).min(axis=0)) / 9.0).astype(int)
+    assert 7 not in kept
+    assert (np.diff(kept) > 0).all()
+    assert len(np.unique(cells[kept], axis=0)) == len(kept) == len(np.unique(np.delete(cells, 7, axis=0), axis=0))

@@ -7,7 +7,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from shapespace.fit.fit import FitConfig, paper_method
+from shapespace.fit.method import Limits
+from shapespace.fit.paper_method import Paper
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.start import Start
 from shapespace.types import Similarity
@@ -32,8 +33,8 @@ def test_both_take_the_same_steps_to_the_same_coefficients(plain: ModuleType, se
     z = np.random.default_rng(seed).uniform(-1.2, 1.2, 5)
     raw = raw_scan(z, similarity(seed, 12.0, 1.1), vertices=5000, model_vertices=1500, noise_mm=0.2)
     start = Similarity(1.0, np.eye(3), raw.scan.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0))
-    config = FitConfig(scale="free", max_iterations=200)
-    states = list(paper_method(model, ScanTarget(raw.scan), Start(start, "given", np.nan), config))
+    limits = Limits(with_scale=True, modes=None, max_iterations=200)
+    states = list(Paper().states(model, ScanTarget(raw.scan), Start(start, "given", np.nan), limits))
     scale, R, T, b, iterations = plain.fit(
         model.mean_vertices, model.basis, raw.scan.vertices, 1.0, np.eye(3), start.translation, max_iterations=200
     )

@@ -7,6 +7,7 @@ import pytest
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.paper_method import Paper
 from shapespace.fit.shape_icp import shape_icp
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.state import IcpState, StopRule
@@ -286,4 +287,4 @@ def test_a_scan_far_from_the_origin_and_in_metres_gives_the_same_b(model: ShapeM
 @pytest.mark.parametrize("what", ["method", "unit", "search", "scale"])
 def test_settings_that_do_not_exist_are_refused(what: str) -> None:
     with pytest.raises(InputError, match=f"no {what} 'nonsense'"):
-        FitConfig(**{what: "nonsense"})
+        Paper(search="nonsense") if what == "search" else FitConfig(**{what: "nonsense"})

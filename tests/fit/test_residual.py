@@ -1,5 +1,7 @@
 """Modes beside the model's own: outside its span, as strong as the covariance they stand for, mirrored where due."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -108,3 +110,34 @@ def test_they_are_made_once_a_model_and_settings() -> None:
     model = blob_model(400)
     assert residual_modes(model, SETTINGS) is residual_modes(model, ResidualSettings(count=30, range_share=1.2))
     assert len(residual_modes(model, ResidualSettings(count=7)).stddev) == 7
+
+
+def test_those_of_a_model_in_a_file_are_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path))
+    monkeypatch.delenv("SHAPESPACE_KEEP")
+    made, asked = residual._make, []
+    monkeypatch.setattr(residual, "_make", lambda *of: asked.append(of) or made(*of))
+
+    def ask(model: ShapeModel, settings: ResidualSettings) -> tuple[ResidualModes, bool]:
+        before = len(asked)
+        return residual_modes(model, settings), len(asked) == before
+
+    model = symmetric_model()
+    ask(model, SETTINGS)
+    assert not (tmp_path / "kept").exists(), "a model that stands in no file has no later runs"
+
+    model.save(tmp_path / "model.h5")
+    one, two, three = (ShapeModel.load(tmp_path / "model.h5") for _ in range(3))
+    first, found = ask(one, SETTINGS)
+    assert not found
+    again, found = ask(two, SETTINGS)
+    assert found and again.modes.tobytes() == first.modes.tobytes()
+    assert again.stddev.tobytes() == first.stddev.tobytes()
+
+    # Other settings, another model and a damaged file find nothing.
+    assert not ask(two, ResidualSettings(count=7))[1]
+    blob_model(400).truncate(3).save(tmp_path / "other.h5")
+    assert not ask(ShapeModel.load(tmp_path / "other.h5"), SETTINGS)[1]
+    for file in (tmp_path / "kept").iterdir():
+        file.write_bytes(file.read_bytes()[:-9])
+    assert not ask(three, SETTINGS)[1]

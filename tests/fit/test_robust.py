@@ -8,11 +8,16 @@ import pytest
 
 from robust_reference import gauss_newton_step
 from shapespace.errors import FitError, InputError
+from shapespace.fit.equations import Estimate
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.moving_model import MovingSurface, prepare
-from shapespace.fit.robust import POSE, JointFit, in_span
+from shapespace.fit.matching import Matcher
+from shapespace.fit.methods import method_named
+from shapespace.fit.moving_model import POSE, MovingSurface, prepare
+from shapespace.fit.robust import Problem
+from shapespace.fit.robust_method import Robust
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
+from shapespace.fit.span import in_span
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
@@ -23,10 +28,13 @@ Z = np.array([1.5, -1.8, 1.3, 1.6, -1.4])
 NEAR = similarity(3, 6.0, 1.0, 2.0)
 
 
-def joint_fit(scan: Mesh, T: Similarity, level: Level, model: ShapeModel | None = None) -> JointFit:
-    fit = JointFit(prepare(model or blob_model()), ScanTarget(scan), RobustSettings(), T, with_scale=True)
-    fit.begin(level)
-    return fit
+def problem_at(scan: Mesh, level: Level, b: FloatArray) -> tuple[Problem, Matcher, Estimate]:
+    """Return the fit of the blobs to `scan` about to do a step on `level` from coefficients `b`."""
+    settings = RobustSettings()
+    problem = Problem.of(prepare(blob_model()), ScanTarget(scan), settings, NEAR.scale, with_scale=True)
+    problem.surface.deform(b)
+    at = Estimate(NEAR, b)
+    return problem, problem.matcher(level, at, problem.surface.vertex_tree(), None), at
 
 
 def surface_at(b: FloatArray) -> MovingSurface:
@@ -43,18 +51,18 @@ def error_mm(result, model: ShapeModel, truth: FloatArray, scale: float = 1.0) -
 @pytest.mark.parametrize("modes", [0, 3, 5])
 @pytest.mark.parametrize("triangles", [False, True])
 def test_a_step_is_that_of_plain_numpy(modes: int, triangles: bool) -> None:
+    b = 0.3 * blob_model().stddev * (np.arange(5) < modes)
     level = Level(modes, 400, 200, triangles, 1, 0.0)
-    fit = joint_fit(raw_scan(Z, NEAR, noise_mm=0.3).scan, NEAR, level)
-    fit.b[:modes] = 0.3 * fit.stddev[:modes]
-    fit.surface.deform(fit.b)
-    fit.match()
-    expected, hessian = gauss_newton_step(fit, modes)
-    T, b = fit.T, fit.b.copy()
-    fit.step(modes)
-    np.testing.assert_allclose(fit.hessian, hessian, rtol=1e-4, atol=1e-4 * np.abs(hessian).max())
-    np.testing.assert_allclose(fit.b[:modes] - b[:modes], expected[POSE:], rtol=2e-3, atol=1e-4)
-    assert fit.T.scale / T.scale == pytest.approx(np.exp(expected[6]), rel=1e-4)
-    moved = T.inverse().apply(fit.T.translation)
+    problem, matcher, at = problem_at(raw_scan(Z, NEAR, noise_mm=0.3).scan, level, b)
+    look = problem.look(matcher, at)
+    expected, hessian = gauss_newton_step(problem, look, at, modes)
+    _, equations = problem.equations(look, at, modes)
+    whole = equations.data + np.diag(equations.prior)
+    np.testing.assert_allclose(whole, hessian, rtol=1e-4, atol=1e-4 * np.abs(hessian).max())
+    step = problem.step(matcher, at, modes)
+    np.testing.assert_allclose(step.at.b[:modes] - b[:modes], expected[POSE:], rtol=2e-3, atol=1e-4)
+    assert step.at.T_scan_model.scale / NEAR.scale == pytest.approx(np.exp(expected[6]), rel=1e-4)
+    moved = NEAR.inverse().apply(step.at.T_scan_model.translation)
     np.testing.assert_allclose(moved, expected[3:6], rtol=2e-3, atol=1e-3)
 
 
@@ -91,9 +99,10 @@ def test_walks_end_where_brute_force_does_near_the_surface() -> None:
 def test_what_lies_in_the_span_is_found_again_with_its_pose() -> None:
     model, small = blob_model(), similarity(5, 1.0, 1.01, 0.5)
     shape = model.reconstruct(Z * model.stddev)
-    T, b = in_span(prepare(model), small.apply(shape), Similarity.identity(), 5, with_scale=True)
-    np.testing.assert_allclose(T.apply(model.reconstruct(b)), small.apply(shape), atol=0.02)
-    np.testing.assert_allclose(b, Z * model.stddev, atol=0.05 * model.stddev[0])
+    at = Estimate(Similarity.identity(), np.zeros(5))
+    told = in_span(prepare(model), small.apply(shape), at, model.stddev, 0.01, 5, with_scale=True)
+    np.testing.assert_allclose(told.T_scan_model.apply(model.reconstruct(told.b)), small.apply(shape), atol=0.02)
+    np.testing.assert_allclose(told.b, Z * model.stddev, atol=0.05 * model.stddev[0])
 
 
 def test_a_complete_scan_is_recovered_to_a_tenth_of_a_millimetre() -> None:
@@ -152,10 +161,10 @@ def test_the_first_modes_reported_are_those_of_the_whole_fit() -> None:
 def test_a_shape_outside_the_span_is_met_beside_the_model() -> None:
     few = ShapeModel.fit(list(training_meshes(4, 700, seed=3)))
     raw = raw_scan(Z, NEAR, vertices=5000, noise_mm=0.1)
-    settings = RobustSettings()
+    settings = Robust()
     alone = dataclasses.replace(settings, beyond_share=1e9)
     with_more, without = (
-        fit_scan(few, raw.scan, FitConfig(unit="mm", robust=s), T_scan_model=NEAR) for s in (settings, alone)
+        fit_scan(few, raw.scan, FitConfig(s, unit="mm"), T_scan_model=NEAR) for s in (settings, alone)
     )
     assert with_more.evidence["beyond_model_mm"] > 0.2
     assert error_mm(with_more, few, raw.truth) < error_mm(without, few, raw.truth) + 0.1
@@ -180,5 +189,5 @@ def test_a_model_of_points_is_refused_in_one_sentence() -> None:
 
 
 def test_the_paper_only_search_is_refused_for_the_robust_method() -> None:
-    with pytest.raises(InputError, match="always searches the scan's surface"):
-        FitConfig(search="vertices")
+    with pytest.raises(InputError, match="'robust' has no setting 'search'"):
+        method_named("robust", search="vertices")

@@ -8,6 +8,7 @@ import pytest
 from shapespace.datasets.ict import load_ict
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.fit.fit import FitConfig, FitResult, fit_scan
+from shapespace.fit.methods import method_named
 from shapespace.fit.similarity_icp import similarity_icp
 from shapespace.fit.state import StopRule
 from shapespace.geometry.closest import build_engine
@@ -38,10 +39,10 @@ def upright_start(model: ShapeModel, scan: Mesh) -> Similarity:
 
 @pytest.mark.parametrize(
     ("method", "search", "typical_mm", "worst_mm"),
-    [("robust", "auto", 0.5, 1.0), ("paper", "vertices", 2.5, 6.0), ("paper", "surface", 0.8, 4.0)],
+    [("robust", None, 0.5, 1.0), ("paper", "vertices", 2.5, 6.0), ("paper", "surface", 0.8, 4.0)],
 )
 def test_known_blobs_are_recovered_from_noisy_scans(
-    method: str, search: str, typical_mm: float, worst_mm: float
+    method: str, search: str | None, typical_mm: float, worst_mm: float
 ) -> None:
     model, T = blob_model(vertices=1500), similarity(1, 20.0, 0.9)
     errors, b_errors = [], []
@@ -50,7 +51,7 @@ def test_known_blobs_are_recovered_from_noisy_scans(
         result = fit_scan(
             model,
             raw.scan,
-            FitConfig(method=method, unit="mm", search=search, max_iterations=150),
+            FitConfig(method_named(method, **({"search": search} if search else {})), unit="mm", max_iterations=150),
             T_scan_model=upright_start(model, raw.scan) if method == "paper" else None,
         )
         error, floor = errors_mm(model, result, raw.truth)

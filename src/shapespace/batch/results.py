@@ -99,7 +99,7 @@ def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source
         "b": result.b.tolist(),
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
-        "b_stddev_calibrated": result.z_covariance is not None,
+        "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -89,11 +89,10 @@ def fit_file(
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
-        record = failed_record(
-            scan_source, model_source, f"{job.scan}: not enough memory to fit it; thin the scan first.", asdict(config)
-        )
+        short = f"{job.scan}: not enough memory to fit it; thin the scan first."
+        record = failed_record(scan_source, model_source, short, config.as_dict())
     except ShapespaceError as error:
-        record = failed_record(scan_source, model_source, naming(job.scan, str(error)), asdict(config))
+        record = failed_record(scan_source, model_source, naming(job.scan, str(error)), config.as_dict())
     else:
         record = fit_record(result, scan_source, model_source, marks_source)
         write_fitted_mesh(folder / f"{job.name}.fitted.ply", result, model)
@@ -318,7 +317,7 @@ def _resumed(task: _Task, model: ShapeModel, folder: Path) -> tuple[_Task, dict[
 def _is_of(record: Mapping[str, Any], task: _Task, model: ShapeModel) -> bool:
     """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
     job = task.job
-    settings: dict[str, Any] = json.loads(json.dumps(asdict(task.config)))
+    settings: dict[str, Any] = json.loads(json.dumps(task.config.as_dict()))
     settings["version"] = __version__
     del settings["dense"]
     marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None

@@ -1,4 +1,4 @@
-"""Imported by the server of `workers`: loads the code of a fit, or compiles it on a machine that has none yet.
+"""Loads the code of a fit, or compiles it on a machine that has none yet.
 
 A small fit does it, since machine code is made for the arrays that it meets.
 """
@@ -6,12 +6,10 @@ A small fit does it, since machine code is made for the arrays that it meets.
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 
 import numpy as np
 
-from shapespace.batch.workers import WARM_UP
 from shapespace.compiled import on_compiling
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
@@ -54,9 +52,3 @@ def _hill(side: int, seed: int) -> Mesh:
     p, q, r, s = (corner.ravel() for corner in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
     faces = np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, s], axis=1)]).astype(np.int32)
     return Mesh(np.stack([50 * u, 50 * v, z], axis=2).reshape(-1, 3), faces)
-
-
-if how := os.environ.get(WARM_UP):
-    # What fails here is said by the fits to come, and by name.
-    with contextlib.suppress(Exception):
-        warm_up(tell=how == "tell")

@@ -56,7 +56,7 @@ def start_loading(*, tell: bool) -> None:
     os.environ.update(wanted)
     try:
         with interrupts_ignored():
-            forkserver.set_forkserver_preload(["shapespace.batch.warm"])
+            forkserver.set_forkserver_preload(["shapespace.batch.warm_server"])
             forkserver.ensure_running()
     finally:
         for name, value in before.items():

@@ -195,11 +195,11 @@ def fit(arguments: argparse.Namespace) -> int:
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.fit import BatchSettings, fit_scans
     from shapespace.fit.fit import FitConfig
+    from shapespace.fit.methods import method_named
 
     config = FitConfig(
-        method=arguments.method,
+        method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
         unit=arguments.unit,
-        search=arguments.search,
         scale=arguments.scale,
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,

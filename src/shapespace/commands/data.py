@@ -7,14 +7,14 @@ from pathlib import Path
 
 from shapespace.batch.progress import progress
 from shapespace.commands.about import write_about
-from shapespace.datasets import faces as bundled
-from shapespace.datasets import fetch, ict
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder
 
 
 def data_list() -> list[dict[str, object]]:
     """Return the open data sets with licence, size, hash, and whether they are here already."""
+    from shapespace.datasets import fetch  # loads much, as the generators of faces do
+
     return fetch.data_list()
 
 
@@ -24,6 +24,8 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
     Raises:
         DataError: no such data set, no network, or content that does not match its hash.
     """
+    from shapespace.datasets import fetch
+
     return fetch.data_get(name, to=to, progress=False if quiet else None)
 
 
@@ -45,6 +47,9 @@ def write_simulated_faces(
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
+    from shapespace.datasets import faces as bundled
+    from shapespace.datasets import ict
+
     make_folder(folder)
     total = subjects * len(expressions)
     with progress(total, "writing", "face", quiet=quiet) as bar:

@@ -1,7 +1,7 @@
 """Open data sets: where they are, what they must hash to, and how to get them.
 
 A data set is looked for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder holding `<name>/`),
-the cache folder of the platform (`pooch.os_cache`, or `SHAPESPACE_CACHE`), and then the network: the published
+the cache folder of the platform (or `SHAPESPACE_CACHE`), and then the network: the published
 repository at a pinned commit, or the server that `SHAPESPACE_DATA_URL` names, laid out like a local mirror.
 Nothing is used before it is verified, and a file that is cut short is never taken for whole.
 
@@ -43,6 +43,7 @@ from shapespace.io.files import (
     write_error,
     write_text,
 )
+from shapespace.io.kept import cache_folder
 
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
@@ -149,12 +150,6 @@ def dataset(name: str) -> Dataset:
     if name not in DATASETS:
         raise DataError(f"There is no data set {name!r}; there are: {', '.join(DATASETS)}.")
     return DATASETS[name]
-
-
-def cache_folder() -> Path:
-    """Return the folder that downloads are kept in: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
-    named = os.environ.get("SHAPESPACE_CACHE")
-    return Path(named) if named else Path(pooch.os_cache("shapespace"))
 
 
 def data_folder(name: str | Dataset, *, cache: Path | None = None) -> Path | None:

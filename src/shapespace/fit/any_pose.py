@@ -16,7 +16,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapespace.fit import rigid_kernels as kernels
+from shapespace.fit.rigid_search import NearGrid, edge_of, rigid_search
+from shapespace.fit.shape_search import ShapePoints, shape_search
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
@@ -57,9 +58,7 @@ FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, kep
 LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, kept=4)
 ROTATIONS = 96
 
-_MODEL_CELL, _SCAN_CELL, _GRID_CELL = 0.07, 0.04, 0.08
-_MARGIN = 0.5
-_MAX_CELLS = 400_000
+_MODEL_CELL, _SCAN_CELL = 0.07, 0.04
 _MAX_THINNING_CELLS = 4_000_000
 _RIGID_CAP, _CAP = 0.1, 0.06
 _PRIOR = 10.0
@@ -120,8 +119,8 @@ class _ModelSide:
 
     size: float
     spacing: float
-    shapes: dict[int, kernels.ShapePoints]
-    grid: kernels.NearGrid
+    shapes: dict[int, ShapePoints]
+    grid: NearGrid
     outward: FloatArray
     front: float
     axes: FloatArray
@@ -133,12 +132,12 @@ class _ModelSide:
         chosen = np.random.default_rng(0).permutation(_evenly(mean, _MODEL_CELL * size, size))
         points = np.ascontiguousarray(mean[chosen])
         normals = _normals(points) if model.faces is None else vertex_normals(Mesh(mean, model.faces))[chosen]
-        tree, shapes = KdTree(points).arrays, dict[int, kernels.ShapePoints]()
+        tree, shapes = KdTree(points).arrays, dict[int, ShapePoints]()
         rows = (3 * chosen[:, None] + np.arange(3)).ravel()
         for modes in {min(step.modes, model.n_modes) for step in (GLANCE, FLIPS, MIDDLE, FINE, LONG)}:
             basis = np.ascontiguousarray(model.vertex_basis[rows, :modes]).reshape(-1, 3, modes)
             precision = 1.0 / model.stddev[:modes] ** 2
-            shapes[modes] = kernels.ShapePoints(points, np.ascontiguousarray(normals), basis, precision, tree)
+            shapes[modes] = ShapePoints(points, np.ascontiguousarray(normals), basis, precision, tree)
         centre = points.mean(axis=0)
         # An open shell bulges away from the centre of the sphere that fits it best.
         columns = np.column_stack([2 * points, np.ones(len(points))])
@@ -149,7 +148,7 @@ class _ModelSide:
             size=size,
             spacing=1.2 * _MODEL_CELL * size,
             shapes=shapes,
-            grid=_near_grid(points, size),
+            grid=NearGrid.of(points, size),
             outward=outward,
             front=float(np.quantile((points - centre) @ outward, 0.95)),
             axes=np.linalg.eigh((points - centre).T @ (points - centre))[1].T,
@@ -207,26 +206,18 @@ class _Sides:
 
     def everywhere(self, upright: Pose) -> list[Pose]:
         """Return distinct poses, best first, of a search over all rotations."""
-        grid, size = _near_grid(self.scan, self.model.size), self.model.size
+        grid, size = NearGrid.of(self.scan, self.model.size), self.model.size
         R, t = self._placed(_even_rotations(ROTATIONS))
         T = upright.T_scan_model
         R, t = np.concatenate([T.rotation[None], R]), np.concatenate([T.translation[None], t])
         for step in (COARSE, RIGID):
-            score = kernels.rigid_search(
-                R,
-                t,
-                self.model.points[: step.points],
-                self.scan[: step.points],
-                self.scan,
-                grid,
-                self.model.points,
-                self.model.grid,
-                step.reaches(size),
-                _RIGID_CAP * size,
-            )
+            R, t, score = rigid_search(
+                R, t, self.model.points[: step.points], self.scan[: step.points], self.model.grid, grid,
+                step.reaches(size), _RIGID_CAP * size,
+            )  # fmt: skip
             order = np.argsort(score)
             kept = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
-            R, t = np.ascontiguousarray(R[kept]), np.ascontiguousarray(t[kept])
+            R, t = R[kept], t[kept]
         coarse = sorted((self._refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
         coarse = _distinct(coarse, len(coarse), _SAME_TURN)
         poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
@@ -276,23 +267,12 @@ class _Sides:
         if b is not None:
             free[: len(b)] = b[: len(free)]
         counts = np.array([min(step.points, len(shape.points)), min(step.points, len(self.scan))], dtype=np.int32)
-        scale = kernels.shape_search(
-            R,
-            t,
-            scale,
-            free,
-            shape,
-            self.scan,
-            self.tree.arrays,
-            counts,
-            step.reaches(self.model.size),
-            _PRIOR,
-            1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf,
-            self.slack,
-            _CAP * self.model.size,
-            out,
-        )
-        if not (np.isfinite(R).all() and np.isfinite(t).all() and np.isfinite(out).all() and np.isfinite(scale)):
+        try:
+            scale = shape_search(
+                R, t, scale, free, shape, self.scan, self.tree.arrays, counts, step.reaches(self.model.size), _PRIOR,
+                1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
             return Pose(begun, np.zeros(len(free)), math.inf, 0.0)
         return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
 
@@ -325,24 +305,17 @@ def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, s
 
 def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
     """Return the indices of one point for each cell of edge `cell`; lone points far outside are left out."""
-    some = points[:: max(1, len(points) // 4000)]
-    low, high = np.quantile(some, [0.005, 0.995], axis=0)
-    low, high = np.maximum(points.min(axis=0), low - size), np.minimum(points.max(axis=0), high + size)
-    cell = max(cell, _edge(high - low + cell, _MAX_THINNING_CELLS))
-    dims = (np.ceil((high - low) / cell) + 1).astype(np.int32)
-    return kernels.one_in_each_cell(points, low - 0.5 * cell, cell, dims)
-
-
-def _edge(sides: FloatArray, cells: int) -> float:
-    """Return the edge of the cubes of which a box of `sides` (3,) holds `cells`."""
-    return float(sides.prod() / cells) ** (1 / 3)
-
-
-def _near_grid(points: FloatArray, size: float) -> kernels.NearGrid:
-    low, high = points.min(axis=0) - _MARGIN * size, points.max(axis=0) + _MARGIN * size
-    cell = max(_GRID_CELL * size, _edge(high - low, _MAX_CELLS))
-    dims = (np.ceil((high - low) / cell) + 1).astype(np.int32)
-    return kernels.NearGrid(kernels.near_grid(points, low, cell, dims), low, cell)
+    columns = np.ascontiguousarray(points.T)
+    low, high = np.quantile(columns[:, :: max(1, len(points) // 4000)], [0.005, 0.995], axis=1)
+    low, high = np.maximum(columns.min(axis=1), low - size), np.minimum(columns.max(axis=1), high + size)
+    cell = max(cell, edge_of(high - low + cell, _MAX_THINNING_CELLS))
+    cells, dims = np.rint((columns - low[:, None]) / cell), np.rint((high - low) / cell) + 1
+    inside = np.flatnonzero(((cells >= 0) & (cells < dims[:, None])).all(axis=0))
+    at = (cells[0] * dims[1] + cells[1])[inside] * dims[2] + cells[2, inside]
+    at = at.astype(np.int64)
+    holder = np.empty(int(dims.prod()), dtype=np.int64)
+    holder[at] = inside
+    return inside[holder[at] == inside].astype(np.int32)
 
 
 def _normals(points: FloatArray) -> FloatArray:

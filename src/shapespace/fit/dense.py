@@ -20,14 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import FitError
-from shapespace.fit.field_kernels import compare_triangles, less_sag, solve_field
-from shapespace.fit.kernels import gather_into, meet_into, normals_into, walk_into
-from shapespace.fit.matching import VertexMatches, match_vertices, unexplained_variance, winding_of
-from shapespace.fit.moving_model import Topology, prepare
+from shapespace.fit.field_kernels import compare_triangles, solve_field
+from shapespace.fit.kernels import normals_into
+from shapespace.fit.matching import Matcher, Matches, Weights
+from shapespace.fit.moving_model import MovingSurface, Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
-from shapespace.fit.weights import match_weights, spread
-from shapespace.geometry.kdtree import KdTree
+from shapespace.fit.weights import spread
 from shapespace.geometry.surface import face_vectors, rms_size, vertex_areas
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
@@ -51,6 +50,7 @@ class DenseSurface:
         noise_mm: of the scan as found, mm of the model's frame.
         unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
         damped: how many vertices were held back so that no triangle folds.
+        stretch: how much longer or shorter edges that are seen became: |log| of the ratio that 1 % exceed.
     """
 
     vertices_scan_mm: FloatArray
@@ -58,6 +58,7 @@ class DenseSurface:
     noise_mm: float
     unexplained_mm: float
     damped: int
+    stretch: float
 
 
 def dense_surface(
@@ -84,126 +85,115 @@ def dense_surface(
     """
     topology, T = prepare(model).topology, T_scan_model
     start = T.inverse().apply(vertices_scan_mm)
-    matching = _Matching(topology, target, T, start, settings)
+    surface = MovingSurface(topology, start)
+    matcher = _matcher(target, surface, T, settings)
     size_mm = rms_size(model.mean_vertices)
 
-    matching.match(start)
-    noise_mm, left_mm = matching.noise_mm(), matching.unexplained_mm()
+    def look() -> Look:
+        return _look(matcher, surface, T, target, settings)
+
+    now = look()
+    noise_mm, left_mm = now.noise_mm, now.unexplained_mm
     moved = np.zeros_like(start)
     if left_mm > settings.least_unexplained_mm:
         coarse = _field(model, settings.range_share * size_mm, settings.amplitude * left_mm)
         for _ in range(settings.rounds):
-            seen_at, pull_at = matching.gathered(max(noise_mm, matching.spread_mm()))
-            want = seen_at * np.einsum("vd,vd->v", matching.normals, moved) - pull_at
-            coarse.solve(seen_at, want, matching.normals, moved, settings)
-            matching.match(start + moved)
+            seen_at, pull_at = now.gathered(max(noise_mm, now.spread_mm))
+            want = seen_at * np.einsum("vd,vd->v", surface.normals, moved) - pull_at
+            coarse.solve(seen_at, want, surface.normals, moved, settings)
+            surface.move_to(start + moved)
+            now = look()
             # Neighbours also disagree where the surface is steep beside the scan, so the last is the best.
-            noise_mm = min(noise_mm, matching.noise_mm())
+            noise_mm = min(noise_mm, now.noise_mm)
 
     fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
     base, held = unfolded(start, start, start + moved, topology, settings.turn_cosine)
-    out, along = np.zeros((len(start), 1)), np.ones((len(start), 1))
-    normals = matching.normals.copy()
+    out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals.copy()
     seen_at = np.zeros(len(start))
     for round_ in range(settings.fine_rounds):
         if round_:
-            matching.match(base + out * normals)
-        seen_at, pull_at = matching.gathered(noise_mm)
+            surface.move_to(base + out * normals)
+            now = look()
+        seen_at, pull_at = now.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
-    return DenseSurface(T.apply(kept), seen_at * noise_mm**2 > _SEEN, noise_mm, left_mm, int((held | held_back).sum()))
+    seen, damped = seen_at * noise_mm**2 > _SEEN, int((held | held_back).sum())
+    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, _stretch(start, kept, topology.faces, seen))
 
 
-class _Matching:
-    """Matches between a surface on the model's triangles and the scan, in the model's frame."""
+def _stretch(before: FloatArray, after: FloatArray, faces: IntArray, seen: BoolArray) -> float:
+    corners = faces[seen[faces].all(axis=1)]
+    if len(corners) == 0:
+        return 0.0
+    lengths = [np.linalg.norm(x[corners] - x[np.roll(corners, 1, axis=1)], axis=2).ravel() for x in (before, after)]
+    return float(np.quantile(np.abs(np.log(np.maximum(lengths[1], 1e-12) / np.maximum(lengths[0], 1e-12))), 0.99))
 
-    def __init__(
-        self, topology: Topology, target: ScanTarget, T: Similarity, start: FloatArray, settings: DenseSettings
-    ) -> None:
-        self.topology, self.target, self.T, self.settings = topology, target, T, settings
-        count = len(target.mesh.vertices)
-        if count > settings.scan_points:
-            rng = np.random.default_rng(settings.seed)
-            chosen = np.sort(rng.choice(count, settings.scan_points, replace=False))
-        else:
-            chosen = np.arange(count)
-        self._points = ((target.mesh.vertices[chosen] - T.translation) @ T.rotation) / T.scale
-        self._point_normals = target.normals[chosen] @ T.rotation
-        used = topology.used
-        self._vertex: IntArray = used[KdTree(start[used]).nearest(self._points)[0]]
-        self.triangle = np.full(len(chosen), -1, dtype=np.int32)
-        self.barycentric = np.empty((len(chosen), 3))
-        self.residual, self.distance = np.empty(len(chosen)), np.empty(len(chosen))
-        self._cosine, self._covered = np.empty(len(chosen)), np.empty(len(chosen), dtype=np.bool_)
-        self._corners = np.empty((len(topology.faces), 9))
-        self.normals = np.empty_like(start)
-        self.vertices: VertexMatches | None = None
-        self._winding = 0.0
 
-    def match(self, x: FloatArray) -> None:
-        """Match scan points to the surface with vertices `x` (V, 3), and its vertices to the scan."""
-        t, T = self.topology, self.T
-        normals_into(x, t.faces, self._corners, self.normals)
-        walk_into(
-            self._points, self._vertex, x, self._corners, t.faces, t.ring_start, t.ring, t.fan_start, t.fan,
-            self.triangle, self.barycentric,
-        )  # fmt: skip
-        meet_into(
-            self._points, self._point_normals, self.triangle, self.barycentric, x, self.normals, t.faces, t.rim,
-            self.residual, self.distance, self._cosine, self._covered,
-        )  # fmt: skip
-        less_sag(self.triangle, self.barycentric, x, self.normals, t.faces, self.residual)
-        if self._winding == 0.0:
-            self._winding = winding_of(self._cosine, self._covered)
-        self.allowed = self._covered & (self._winding * self._cosine > self.settings.normal_cosine)
-        if int(self.allowed.sum()) < _FEWEST_MATCHES:
-            raise FitError(f"{self.target.mesh.name}: too little of it matches the fitted surface to go on from there.")
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the stage sees where the surface is.
 
-        self.vertices = match_vertices(
-            self.target, self.target.engine, T, x, self.normals, t.used, self.vertices and self.vertices.near,
-            winding=self._winding, normal_cosine=self.settings.normal_cosine,
-        )  # fmt: skip
+    Args:
+        matches: both ways.
+        faces: (F, 3) of the surface,
+        vertices: how many it has.
+        settings: of the stage.
+        spread_mm: of the residuals of the scan's points.
+        noise_mm: of the scan.
+    """
 
-    def spread_mm(self) -> float:
-        """Return the spread of the residuals."""
-        return spread(self.residual[self.allowed])
+    matches: Matches
+    faces: IntArray
+    vertices: int
+    settings: DenseSettings
+    spread_mm: float
+    noise_mm: float
 
-    def noise_mm(self) -> float:
-        """Return the noise of the scan: how much points that lie next to each other disagree."""
-        points = np.flatnonzero(self.allowed)
-        points = points[np.argsort(self._vertex[points], kind="stable")]
-        pairs = self._vertex[points[1:]] == self._vertex[points[:-1]]
-        apart = np.diff(self.residual[points])[pairs]
-        noise = spread(apart) / np.sqrt(2.0) if len(apart) >= _FEWEST_PAIRS else self.spread_mm()
-        return max(noise, self.settings.least_noise_mm)
+    def _weights(self, spread_mm: float) -> Weights:
+        s = self.settings
+        width_mm = s.width * max(spread_mm, s.least_noise_mm)
+        return self.matches.weights(s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share)
 
+    @property
     def unexplained_mm(self) -> float:
-        """Return the RMS of the residuals' part that is no noise."""
-        w, _ = self._weights(self.spread_mm())
-        left = unexplained_variance(
-            self.triangle, self.barycentric, self.topology.faces, w, self.residual, len(self.normals),
-            self.settings.seed,
-        )  # fmt: skip
+        """RMS of the residuals' part that is no noise."""
+        weights = self._weights(self.spread_mm)
+        left = self.matches.unexplained_variance(weights, self.faces, self.vertices, self.settings.seed)
         return float(np.sqrt(max(left, 0.0)))
-
-    def _weights(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
-        s, vertices = self.settings, self.vertices
-        assert vertices is not None
-        width = s.width * max(spread_mm, s.least_noise_mm)
-        far = s.reach * width + s.reach_mm
-        w = match_weights(s.weight, self.residual, self.distance, self.allowed, width, far)
-        v = match_weights(s.weight, vertices.residual, vertices.distance, vertices.allowed, width, far)
-        return w, s.vertex_share * v
 
     def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
         """Return the precision (V,), mm^-2, of what the scan says of each vertex, and the same times the residual."""
-        w, v = self._weights(spread_mm)
-        seen_at, pull_at = np.zeros(len(self.normals)), np.zeros(len(self.normals))
-        gather_into(self.triangle, self.barycentric, self.topology.faces, w, self.residual, seen_at, pull_at)
-        assert self.vertices is not None
-        seen_at[self.vertices.vertex] += v
-        pull_at[self.vertices.vertex] += v * self.vertices.residual
-        return seen_at / spread_mm**2, pull_at / spread_mm**2
+        gathered = self.matches.gathered(self._weights(spread_mm), self.faces, self.vertices)
+        return gathered.weight / spread_mm**2, gathered.pull / spread_mm**2
+
+
+def _matcher(target: ScanTarget, surface: MovingSurface, T: Similarity, settings: DenseSettings) -> Matcher:
+    count = len(target.mesh.vertices)
+    chosen = np.arange(count, dtype=np.int32)
+    if count > settings.scan_points:
+        chosen = np.sort(np.random.default_rng(settings.seed).choice(chosen, settings.scan_points, replace=False))
+    return Matcher(
+        target, surface, T, chosen, surface.topology.used, target.engine, settings.normal_cosine, bulging=True
+    )
+
+
+def _look(matcher: Matcher, surface: MovingSurface, T: Similarity, target: ScanTarget, settings: DenseSettings) -> Look:
+    matches = matcher.match(surface, T)
+    points = np.flatnonzero(matches.points.allowed)
+    if len(points) < _FEWEST_MATCHES:
+        raise FitError(f"{target.mesh.name}: too little of it matches the fitted surface to go on from there.")
+    residual = matches.points.residual
+    spread_mm = spread(residual[points])
+    # How much points that lie next to each other disagree is noise.
+    nearest = matches.points.nearest
+    points = points[np.argsort(nearest[points], kind="stable")]
+    pairs = nearest[points[1:]] == nearest[points[:-1]]
+    apart = np.diff(residual[points])[pairs]
+    noise_mm = spread(apart) / np.sqrt(2.0) if len(apart) >= _FEWEST_PAIRS else spread_mm
+    return Look(
+        matches, surface.topology.faces, len(surface.vertices), settings, spread_mm,
+        max(noise_mm, settings.least_noise_mm),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,6 +158,40 @@ def meet_into(
 
 
 @compiled
+def less_sag(
+    triangle: IntArray,
+    barycentric: FloatArray,
+    vertices: FloatArray,
+    normals: FloatArray,
+    faces: IntArray,
+    residual: FloatArray,
+) -> None:
+    """Add to each residual (M,) how far the surface through the corners bulges over its flat triangle.
+
+    The tangent planes at the corners lie twice as far over a point of the triangle as a quadric with those normals
+    (Boubekeur and Alexa, ACM Trans. Graph. 27, 2008, with the share of one half).
+
+    Args:
+        triangle: (M,) of the surface,
+        barycentric: (M, 3) where on it.
+        vertices: (V, 3).
+        normals: (V, 3) unit.
+        faces: (F, 3).
+        residual: (M,) along the normals, to be added to.
+    """
+    for i in range(len(triangle)):
+        a, b, c = faces[triangle[i], 0], faces[triangle[i], 1], faces[triangle[i], 2]
+        wa, wb, wc = barycentric[i, 0], barycentric[i, 1], barycentric[i, 2]
+        over = 0.0
+        for k in range(3):
+            p = wa * vertices[a, k] + wb * vertices[b, k] + wc * vertices[c, k]
+            over += wa * normals[a, k] * (vertices[a, k] - p)
+            over += wb * normals[b, k] * (vertices[b, k] - p)
+            over += wc * normals[c, k] * (vertices[c, k] - p)
+        residual[i] += 0.5 * over
+
+
+@compiled
 def gather_into(
     triangle: IntArray,
     barycentric: FloatArray,

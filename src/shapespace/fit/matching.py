@@ -1,4 +1,8 @@
-"""What the robust fit and the dense stage share of matching: vertices to the scan, the winding, what is left."""
+"""Matches between a surface on the model's triangles and the scan, both ways: of every stage of a fit the same.
+
+Each scan point goes to the closest point of the moving surface, which a walk from the last answer finds, and each
+vertex of the surface to the closest point of the scan. Equation numbers are those of docs/robust.md.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.fit.kernels import gather_into
+from shapespace.fit.moving_model import MovingSurface
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.weights import match_weights
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, on_boundary
+from shapespace.geometry.kdtree import KdTree
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
 
 @dataclass(frozen=True, eq=False)
+class PointMatches:
+    """Scan points matched to the moving surface, (M,) each; residuals and distances in mm of the model's frame.
+
+    Args:
+        triangle: of the model, where each point is matched,
+        barycentric: (M, 3) and where on it.
+        nearest: vertex where the walk to it ended.
+        residual: how far the model lies beyond each point along the model's normal.
+        distance: to its match.
+        allowed: False where the model ends, and where the normals disagree.
+    """
+
+    triangle: IntArray
+    barycentric: FloatArray
+    nearest: IntArray
+    residual: FloatArray
+    distance: FloatArray
+    allowed: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
 class VertexMatches:
-    """Model vertices matched to the scan, (M,) each; residuals and distances in mm of the model's frame.
+    """Model vertices matched to the scan, (N,) each; residuals and distances in mm of the model's frame.
 
     Args:
         vertex: which vertices.
@@ -31,32 +59,162 @@ class VertexMatches:
     near: ClosestPoints
 
 
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What is matched at one moment of a fit, both ways.
+
+    Args:
+        points: scan points on the model (eq 4).
+        vertices: model vertices on the scan (eq 5).
+        winding: -1 where the scan's normals are reversed, else 1.
+    """
+
+    points: PointMatches
+    vertices: VertexMatches
+    winding: float
+
+    def residuals(self) -> FloatArray:
+        """Return the residuals of all matches that are allowed, both ways."""
+        p, v = self.points, self.vertices
+        return np.concatenate([p.residual[p.allowed], v.residual[v.allowed]])
+
+    def weights(self, name: str, width_mm: float, far_mm: float, vertex_share: float) -> Weights:
+        """Return how much each counts (eqs 8 and 9): residuals against a width, distances against how far is far."""
+        p, v = self.points, self.vertices
+        return Weights(
+            match_weights(name, p.residual, p.distance, p.allowed, width_mm, far_mm),
+            vertex_share * match_weights(name, v.residual, v.distance, v.allowed, width_mm, far_mm),
+            width_mm,
+            far_mm,
+        )
+
+    def gathered(self, weights: Weights, faces: IntArray, vertices: int) -> Gathered:
+        """Return weight and pull of the matches at the model vertices that carry them (eq 10)."""
+        p, v = self.points, self.vertices
+        weight_at, pull_at = np.zeros(vertices), np.zeros(vertices)
+        gather_into(p.triangle, p.barycentric, faces, weights.points, p.residual, weight_at, pull_at)
+        seen = weight_at > 0.0
+        weight_at[v.vertex] += weights.vertices
+        pull_at[v.vertex] += weights.vertices * v.residual
+        return Gathered(weight_at, pull_at, seen)
+
+    def unexplained_variance(self, weights: Weights, faces: IntArray, vertices: int, seed: int) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17); it can be below zero.
+
+        Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
+        say of the same vertex is the variance of the shape that is left.
+        """
+        p, w = self.points, weights.points
+        half = np.random.default_rng(seed).random(len(w)) < 0.5
+        seen, pull = np.zeros((2, vertices)), np.zeros((2, vertices))
+        for i, part in enumerate((half, ~half)):
+            gather_into(p.triangle, p.barycentric, faces, w * part, p.residual, seen[i], pull[i])
+        both = np.minimum(seen[0], seen[1])
+        mean = pull / np.maximum(seen, 1e-12)
+        return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """How much each match counts.
+
+    Args:
+        points: (M,) of the scan's points,
+        vertices: (N,) and of the model's vertices.
+        width_mm: scale of the residuals that made them,
+        far_mm: and of the distances.
+    """
+
+    points: FloatArray
+    vertices: FloatArray
+    width_mm: float
+    far_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The matches as the model's vertices carry them, (V,) each.
+
+    Args:
+        weight: of all matches at each vertex.
+        pull: the same times the residuals, mm.
+        seen: where a scan point that counts is matched.
+    """
+
+    weight: FloatArray
+    pull: FloatArray
+    seen: BoolArray
+
+
+class Matcher:
+    """Matches the same points of a scan and the same vertices of a surface again and again while the surface moves.
+
+    It remembers where it found them last, which makes the next search short, and nothing else.
+
+    Args:
+        target: the scan.
+        surface: as it is now.
+        T_scan_model: where it is now, in the scan's mm frame.
+        points: indices of the scan points that look for the surface.
+        vertex: indices of the vertices that look for the scan.
+        engine: the scan's search structure.
+        normal_cosine: matches whose normals disagree more than this are not allowed.
+        tree: of the surface's vertices, as they are or were a little ago; None to make one.
+        winding: of the scan where it is known; None to find it.
+        bulging: whether flat triangles stand for the smooth surface through their corners.
+    """
+
+    def __init__(
+        self, target: ScanTarget, surface: MovingSurface, T_scan_model: Similarity, points: IntArray, vertex: IntArray,
+        engine: ClosestPointEngine, normal_cosine: float, *, tree: KdTree | None = None, winding: float | None = None,
+        bulging: bool = False,
+    ) -> None:  # fmt: skip
+        self._target, self._engine, self._normal_cosine, self._bulging = target, engine, normal_cosine, bulging
+        self._points_mm, self._normals = target.mesh.vertices[points], target.normals[points]
+        self._vertex, self._winding = vertex, winding
+        self._near: ClosestPoints | None = None
+        tree = tree or surface.vertex_tree()
+        self._walks: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
+        self._triangles = np.full_like(self._walks, -1)
+
+    def _in_model(self, T: Similarity) -> FloatArray:
+        return ((self._points_mm - T.translation) @ T.rotation) / T.scale
+
+    def match(self, surface: MovingSurface, T_scan_model: Similarity) -> Matches:
+        """Return the matches of `surface` where it is now (eqs 4 to 7)."""
+        q, n = self._in_model(T_scan_model), self._normals @ T_scan_model.rotation
+        barycentric = surface.walk(q, self._walks, self._triangles)
+        triangle = self._triangles.copy()
+        residual, distance, cosine, covered = surface.meet(q, n, triangle, barycentric, bulging=self._bulging)
+        if self._winding is None:
+            self._winding = _winding_of(cosine, covered)
+        agree = self._winding * cosine > self._normal_cosine
+        points = PointMatches(triangle, barycentric, self._walks.copy(), residual, distance, covered & agree)
+        vertices = match_vertices(
+            self._target, self._engine, T_scan_model, surface, self._vertex, self._near,
+            winding=self._winding, normal_cosine=self._normal_cosine,
+        )  # fmt: skip
+        self._near = vertices.near
+        return Matches(points, vertices, self._winding)
+
+
 def match_vertices(
-    target: ScanTarget,
-    engine: ClosestPointEngine,
-    T_scan_model: Similarity,
-    vertices: FloatArray,
-    normals: FloatArray,
-    vertex: IntArray,
-    near: ClosestPoints | None,
-    *,
-    winding: float,
-    normal_cosine: float,
-) -> VertexMatches:
-    """Match some of the model's vertices to the scan.
+    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: MovingSurface, vertex: IntArray,
+    near: ClosestPoints | None, *, winding: float, normal_cosine: float,
+) -> VertexMatches:  # fmt: skip
+    """Match some of the surface's vertices to the scan (eqs 5 to 7).
 
     Args:
         target: the scan.
         engine: one of its search structures.
         T_scan_model: from the model's frame to the scan's mm frame.
-        vertices: (V, 3) in the model's frame,
-        normals: (V, 3) their unit normals.
-        vertex: (M,) which to match.
+        surface: in the model's frame.
+        vertex: (N,) which to match.
         near: what the last search for the same vertices found; None for the first.
         winding: -1 where the scan's normals are reversed, else 1.
         normal_cosine: matches whose normals disagree more than this are not allowed.
     """
-    T, x, n = T_scan_model, vertices[vertex], normals[vertex]
+    T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
     near = engine.query(T.apply(x), near)
     to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
     allowed = ~on_boundary(near, target.mesh, target.rim)
@@ -67,38 +225,6 @@ def match_vertices(
     return VertexMatches(vertex, np.einsum("md,md->m", to_scan, n), near.distance / T.scale, allowed, near)
 
 
-def winding_of(cosine: FloatArray, covered: BoolArray) -> float:
+def _winding_of(cosine: FloatArray, covered: BoolArray) -> float:
     """Return -1 where most normals of model and scan are opposed: a scan wound the wrong way round has all reversed."""
     return 1.0 if np.median(cosine[covered] if covered.any() else cosine) >= 0 else -1.0
-
-
-def unexplained_variance(
-    triangle: IntArray,
-    barycentric: FloatArray,
-    faces: IntArray,
-    w: FloatArray,
-    residual: FloatArray,
-    vertices: int,
-    seed: int,
-) -> float:
-    """Return the variance, mm^2, of the part of the residuals that is no noise; it can come out below zero.
-
-    Scan points fall into two halves at random. Noise is independent between them, so the product of what the two say
-    of the same vertex is the variance of the shape that is left.
-
-    Args:
-        triangle: (M,) of the model, where each point is matched,
-        barycentric: (M, 3) and where on it.
-        faces: (F, 3) the model's triangles.
-        w: (M,) weights of the matches,
-        residual: (M,) and their residuals, mm.
-        vertices: how many the model has.
-        seed: of the halves.
-    """
-    half = np.random.default_rng(seed).random(len(w)) < 0.5
-    seen, pull = np.zeros((2, vertices)), np.zeros((2, vertices))
-    for i, part in enumerate((half, ~half)):
-        gather_into(triangle, barycentric, faces, w * part, residual, seen[i], pull[i])
-    both = np.minimum(seen[0], seen[1])
-    mean = pull / np.maximum(seen, 1e-12)
-    return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))

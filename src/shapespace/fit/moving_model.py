@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.kernels import Float32Array, meet_into, normals_into, walk_into
+from shapespace.fit.kernels import Float32Array, less_sag, meet_into, normals_into, walk_into
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import boundary_vertices
 from shapespace.model.shape_model import ShapeModel
@@ -43,7 +43,6 @@ class Topology:
     @staticmethod
     def of(mesh: Mesh) -> Topology:
         """Return the topology of `mesh`, which must have triangles."""
-        assert mesh.faces is not None
         faces = np.array(mesh.faces)
         count = len(mesh.vertices)
         flat = faces.ravel()
@@ -115,13 +114,19 @@ def small_poses(x: FloatArray) -> FloatArray:
 
 
 class MovingSurface:
-    """The model's surface while it is fitted, in the model's frame (mm)."""
+    """The model's surface while it is fitted, in the model's frame (mm).
 
-    def __init__(self, topology: Topology, mean_vertices: FloatArray, modes: Float32Array) -> None:
+    Args:
+        topology: its triangles.
+        vertices: (V, 3) where it begins, mm; for modes, the mean.
+        modes: (V, 3, K) float32 in which it deforms; None where it is moved vertex by vertex.
+    """
+
+    def __init__(self, topology: Topology, vertices: FloatArray, modes: Float32Array | None = None) -> None:
         self.topology = topology
-        self.modes = modes
-        self._mean = mean_vertices
-        self.vertices = np.array(mean_vertices)
+        self.modes = np.empty((len(vertices), 3, 0), dtype=np.float32) if modes is None else modes
+        self._mean = vertices
+        self.vertices = np.array(vertices)
         self.normals = np.empty_like(self.vertices)
         self._corners = np.empty((len(topology.faces), 9))
         self._refresh()
@@ -137,47 +142,37 @@ class MovingSurface:
         np.add(self._mean, moved.reshape(-1, 3), out=self.vertices)
         self._refresh()
 
+    def move_to(self, vertices: FloatArray) -> None:
+        """Take the shape with `vertices` (V, 3) mm."""
+        self.vertices[:] = vertices
+        self._refresh()
+
     def vertex_tree(self) -> KdTree:
         """Return a tree of the vertices as they are now that some triangle has: entry i is vertex `used[i]`."""
         return KdTree(self.vertices[self.topology.used])
 
     def walk(self, points: FloatArray, vertex: IntArray, triangle: IntArray) -> FloatArray:
         """Bring `vertex` and `triangle` (M,) of the closest points up to date; return their weights (M, 3)."""
-        weights = np.empty((len(points), 3))
-        t = self.topology
+        weights, t = np.empty((len(points), 3)), self.topology
         walk_into(
-            points,
-            vertex,
-            self.vertices,
-            self._corners,
-            t.faces,
-            t.ring_start,
-            t.ring,
-            t.fan_start,
-            t.fan,
-            triangle,
-            weights,
-        )
+            points, vertex, self.vertices, self._corners, t.faces, t.ring_start, t.ring, t.fan_start, t.fan,
+            triangle, weights,
+        )  # fmt: skip
         return weights
 
     def meet(
-        self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray
+        self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray, *, bulging: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and what is no rim."""
+        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and what is no rim.
+
+        With `bulging` residuals are from the smooth surface through the corners of each triangle.
+        """
         residual, distance, cosine = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
         covered = np.empty(len(points), dtype=np.bool_)
         meet_into(
-            points,
-            point_normals,
-            triangle,
-            weights,
-            self.vertices,
-            self.normals,
-            self.topology.faces,
-            self.topology.rim,
-            residual,
-            distance,
-            cosine,
-            covered,
-        )
+            points, point_normals, triangle, weights, self.vertices, self.normals, self.topology.faces,
+            self.topology.rim, residual, distance, cosine, covered,
+        )  # fmt: skip
+        if bulging:
+            less_sag(triangle, weights, self.vertices, self.normals, self.topology.faces, residual)
         return residual, distance, cosine, covered

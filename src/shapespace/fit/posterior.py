@@ -4,30 +4,24 @@ At the optimum the cost of `robust` is near quadratic, so the inverse of its Hes
 coefficients and residual modes together (Laplace). The block of b in the full inverse has the pose marginalised. Taken
 as it stands it is far too small, since residuals that share a cause are counted as independent. So the data's part of
 the Hessian is divided by a temperature before the prior joins it again: what the scan does not show stays at the prior.
+Equation numbers are those of docs/robust.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from shapespace.fit.moving_model import POSE, small_poses
+from shapespace.fit.equations import SCALE, NormalEquations, Prior
+from shapespace.fit.matching import Weights
+from shapespace.fit.moving_model import POSE, MovingSurface, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Similarity
+from shapespace.types import FloatArray
 
-if TYPE_CHECKING:
-    from shapespace.fit.robust import JointFit
-
-_HALF = 0.5
-_LEADING = 10
-_NEAR = 0.05
-"""A match counts at half weight; so many modes lead; near is this share of the model's size."""
 _FEWEST_SHAPES = 10
 _ALL_KEPT = 1e-6
 
@@ -42,61 +36,89 @@ _new_shapes: WeakKeyDictionary[ShapeModel, FloatArray] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What is known of a fit's coefficients beside their values.
+    """What is known of pose and coefficients beside their values.
 
     Args:
-        b_stddev: (K,) standard deviation of each coefficient, mm; never above the model's.
-        b_covariance: (K, K) of the coefficients, mm^2.
-        shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
-        evidence: what speaks for and against the fit, by name; the unit stands in the name.
+        covariance: (7 + K + R, 7 + K + R) of turn (radians), shift (mm), log scale, the model's K coefficients and
+            those of R modes beside it (mm).
+        prior_variance: (K + R,) of the coefficients before the scan was seen, mm^2.
+        surface_mm: RMS over the vertices by which the fitted surface is expected to be off, by the darker view of what
+            the model lacks, on which the verdict was tuned.
     """
 
-    b_stddev: FloatArray
-    b_covariance: FloatArray
-    shrinkage: FloatArray
-    evidence: Mapping[str, float]
+    covariance: FloatArray
+    prior_variance: FloatArray
+    surface_mm: float
+
+    def b_covariance(self, modes: int) -> FloatArray:
+        """Return the covariance (modes, modes) of the first coefficients, mm^2."""
+        return self.covariance[POSE : POSE + modes, POSE : POSE + modes]
+
+    def b_stddev(self, modes: int) -> FloatArray:
+        """Return the standard deviations (modes,) of the first coefficients, mm; never above those of the prior."""
+        return np.sqrt(np.clip(self.b_covariance(modes).diagonal(), 0.0, self.prior_variance[:modes]))
+
+    def shrinkage(self, modes: int) -> FloatArray:
+        """Return (modes,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did."""
+        return 1.0 - self.b_stddev(modes) ** 2 / self.prior_variance[:modes]
 
 
-def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_model_mm: float) -> Posterior:
-    """Return what `fit`, at its end, knows of the coefficients it reports.
+def posterior(
+    model: ShapeModel,
+    surface: MovingSurface,
+    prior: Prior,
+    equations: NormalEquations,
+    weights: Weights,
+    sigma_mm: float,
+    *,
+    beyond_model_mm: float,
+    allowed_share: float,
+) -> Posterior:
+    """Return what is known at the end of a fit (eqs 20 to 23).
 
     Args:
-        fit: after its last step; it is not changed.
-        T_scan_model: the pose reported, to the frame of `fit.T`.
-        b: (K,) mm, the coefficients reported.
+        model: the shape space.
+        surface: where it ended, with all modes that were free.
+        prior: that the fit went by.
+        equations: there.
+        weights: of the matches there.
+        sigma_mm: spread of the residuals there.
         beyond_model_mm: RMS of what the model left of the residuals.
+        allowed_share: of the vertices whose match is no border and faces as the model does.
     """
-    model, x = fit.prepared.model, fit.surface.vertices
+    K, n = model.n_modes, POSE + len(prior.stddev)
+    variance = np.concatenate([new_shapes(model), prior.stddev[K:] ** 2])
+    data = equations.data / sigma_mm**2
+    if equations.holds_scale:
+        data[SCALE], data[:, SCALE] = 0.0, 0.0
+    matches = float(weights.points.sum()) + float(weights.vertices.sum())
+    size_mm = rms_size(model.mean_vertices)
+    # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
+    scale_stddev = prior.scale_stddev or 1.0
+    unit = np.concatenate([np.ones(3), np.full(3, size_mm), [scale_stddev], np.sqrt(variance)])
+    known_before = np.concatenate([np.full(POSE - 1, 1e-9), np.ones(n - POSE + 1)])
+
+    def covariance(patches: float) -> FloatArray:
+        # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
+        temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # eq 20
+        scaled = data / temperature * np.outer(unit, unit)
+        scaled[np.diag_indices(n)] += known_before
+        inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # eq 21
+        if equations.holds_scale:
+            inverse[SCALE], inverse[:, SCALE] = 0.0, 0.0
+        return inverse * np.outer(unit, unit)
+
+    told = covariance(max(_PATCHES * allowed_share**2, _FEWEST_PATCHES))
+    dark = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else told
+    off_mm2 = float((dark * _gram(surface)).sum()) / len(surface.vertices)  # eq 22
+    return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
+
+
+def new_shapes(model: ShapeModel) -> FloatArray:
+    """Return `variance_of_new_shapes`, found once and kept as long as the model lives."""
     if model not in _new_shapes:
         _new_shapes[model] = variance_of_new_shapes(model)
-    new_shapes = _new_shapes[model]
-    prior = np.concatenate([new_shapes, fit.stddev[model.n_modes :] ** 2])
-    w, v = fit.weigh()
-    matches, data = float(w.sum()) + float(v.sum()), data_hessian(fit)
-
-    def covariance_of(patches: float) -> FloatArray:
-        return _covariance(fit, data, prior, temperature(fit, matches, beyond_model_mm, patches))
-
-    covariance = covariance_of(_patches(fit))
-    K = len(b)
-    variance = np.clip(covariance.diagonal()[POSE : POSE + K], 0.0, prior[:K])
-    reported = (fit.T.inverse() @ T_scan_model).apply(model.reconstruct(b))
-    left_out = float(((x - reported) ** 2).sum(axis=1).mean())
-    # The verdict's weights were fitted to the darker view of what the model lacks.
-    doubted = covariance_of(_FEWEST_PATCHES) if beyond_model_mm > 0 else covariance
-    expected = float((doubted * _gram(fit)).sum()) / len(x)
-    return Posterior(
-        np.sqrt(variance),
-        covariance[POSE : POSE + K, POSE : POSE + K],
-        1.0 - variance / prior[:K],
-        {
-            **_matched(fit, v, fit.b[: model.n_modes] ** 2 / new_shapes),
-            "spread_mm": fit.sigma_mm,
-            "beyond_model_mm": beyond_model_mm,
-            "left_out_mm": float(np.sqrt(left_out)),
-            "expected_error_mm": float(np.sqrt(max(expected, 0.0) + left_out)),
-        },
-    )
+    return _new_shapes[model]
 
 
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
@@ -137,77 +159,11 @@ def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     return density, transform
 
 
-def temperature(fit: JointFit, matches: float, beyond_model_mm: float, patches: float) -> float:
-    """Return how many residuals tell as much as one independent one.
-
-    Noise is nearly independent from match to match. What the model lacks is not: all matches of a patch share it.
-    """
-    return _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / fit.sigma_mm) ** 2
-
-
-def _patches(fit: JointFit) -> float:
-    """Return into how many independent patches falls what the model lacks: fewer where less of it is seen."""
-    assert fit.vertices is not None
-    return max(_PATCHES * float(fit.vertices.allowed.mean()) ** 2, _FEWEST_PATCHES)
-
-
-def data_hessian(fit: JointFit) -> FloatArray:
-    """Return the Hessian (7 + K + R, 7 + K + R) of the data alone, divided by the residuals' variance."""
-    n = len(fit.hessian)
-    rho = fit.prior * fit.sigma_mm**2
-    own = np.array(fit.hessian)
-    index = np.arange(POSE, n)
-    own[index, index] -= rho / fit.stddev[: n - POSE] ** 2
-    if fit.with_scale:
-        own[6, 6] -= rho / fit.settings.scale_stddev**2
-    else:
-        own[6], own[:, 6] = 0.0, 0.0
-    whole = np.zeros((POSE + len(fit.stddev),) * 2)
-    whole[:n, :n] = own / fit.sigma_mm**2
-    return whole
-
-
-def _covariance(fit: JointFit, data: FloatArray, prior: FloatArray, temperature: float) -> FloatArray:
-    """Return the joint covariance (7 + K + R, 7 + K + R) of pose (radians, mm, log scale) and coefficients (mm)."""
-    precision, size_mm = data / temperature, rms_size(fit.prepared.model.mean_vertices)
-    # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
-    unit = np.concatenate([np.full(3, 1.0), np.full(3, size_mm), [fit.settings.scale_stddev], np.sqrt(prior)])
-    scaled = precision * np.outer(unit, unit)
-    scaled[np.diag_indices_from(scaled)] += np.concatenate([np.full(6, 1e-9), np.ones(len(unit) - 6)])
-    inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(len(unit))))
-    if not fit.with_scale:
-        inverse[6], inverse[:, 6] = 0.0, 0.0
-    return inverse * np.outer(unit, unit)
-
-
-def _gram(fit: JointFit) -> FloatArray:
+def _gram(surface: MovingSurface) -> FloatArray:
     """Return (7 + K + R, 7 + K + R): inner products over the surface of what each parameter moves."""
-    flat, modes = small_poses(fit.surface.vertices), fit.surface.modes
+    flat, modes = small_poses(surface.vertices), surface.modes
     gram = np.eye(POSE + modes.shape[2])
     gram[:POSE, :POSE] = flat.T @ flat
     cross = flat.astype(np.float32).T @ modes.reshape(-1, modes.shape[2])
     gram[:POSE, POSE:], gram[POSE:, :POSE] = cross, cross.T
     return gram
-
-
-def _matched(fit: JointFit, v: FloatArray, z2: FloatArray) -> dict[str, float]:
-    """Return how much of model and scan found a match, and how plausible pose and shape are.
-
-    Args:
-        fit: at its end.
-        v: (M,) weights of its vertices' matches.
-        z2: (K,) squares of its coefficients, in variances of new shapes.
-    """
-    scan, vertices, size_mm = fit.scan, fit.vertices, rms_size(fit.prepared.model.mean_vertices)
-    assert scan is not None and vertices is not None
-    return {
-        "size_mm": size_mm,
-        "seen_share": float((fit.seen_at > 0).mean()),
-        "model_matched_share": float((v > _HALF * v.max()).mean()),
-        "model_allowed_share": float(vertices.allowed.mean()),
-        "scan_allowed_share": float(scan.allowed.mean()),
-        "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
-        "z2": float(z2.mean()),
-        "z2_leading": float(z2[:_LEADING].mean()),
-        "log_scale": float(np.log(fit.T.scale)),
-    }

@@ -9,19 +9,22 @@ own, so that b keeps its meaning.
 
 from __future__ import annotations
 
+import hashlib
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from scipy.linalg import eigh
 
+from shapespace import __version__
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
+from shapespace.io.kept import keep, recall
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -55,14 +58,31 @@ _MADE: weakref.WeakKeyDictionary[ShapeModel, dict[ResidualSettings, ResidualMode
 
 
 def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    """Return the strongest modes outside the span of `model`, made once and kept as long as the model lives."""
+    """Return the strongest modes outside the span of `model`, made once and kept as long as the model lives.
+
+    Those of a model that stands in a file are kept between runs too.
+    """
     made = _MADE.setdefault(model, {})
     if settings not in made:
-        made[settings] = _make(model, settings)
+        made[settings] = _kept(model, settings) if model.in_file else _make(model, settings)
     return made[settings]
 
 
+def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
+    # Whatever could change the modes is in the name, and so is the recipe itself.
+    made_of = f"{model.content_hash} {settings} {__version__} ".encode() + Path(__file__).read_bytes()
+    name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
+    arrays = recall(name)
+    if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
+        return ResidualModes(arrays["modes"], arrays["stddev_mm"])
+    made = _make(model, settings)
+    keep(name, {"modes": made.modes, "stddev_mm": made.stddev})
+    return made
+
+
 def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
+    from scipy.linalg import eigh  # takes a moment, which whoever finds the modes kept need not wait for
+
     x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)

@@ -8,14 +8,11 @@ from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.special import fdtri  # scipy.stats would cost every start half a second
 
 from shapespace.errors import InputError
 from shapespace.fit.regions import SHOWN
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
-from shapespace.geometry.surface import rms_size
-from shapespace.model.pca import modes_for_variance
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -48,17 +45,6 @@ Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
 """Stages of every fit: centroids aligned, after phase 1, after phase 2. `dense` follows where it was asked for."""
 
-# Set on simulated scans: clean ones stay far from each bound, cut ones cross at least one.
-_SHRUNK_BY_SHAPE = 0.85
-_SHRUNK_IN_ALL = 0.7
-_LEADING_SHARE = 0.9
-_IMPLAUSIBLE = 1e-5
-_CLOSE_SHARE = 0.01
-_FAR_SHARE = 0.05
-_GAP_RATIO = 4.0
-_GAP_SHARE = 0.02
-_SEEN_SHARE = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Stage:
@@ -70,6 +56,8 @@ class Stage:
         measure: measures the distances; it holds the scan.
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where such a surface has only the model to go by; else None.
+        moved_mm: how far such a surface was moved where it was seen (RMS), mm of the model's frame.
+        stretch: how much its edges changed by that: |log| of the ratio that 1 % exceed.
     """
 
     T_scan_model: Similarity
@@ -77,6 +65,8 @@ class Stage:
     measure: Callable[[], SurfaceDistances] = field(repr=False)
     vertices: FloatArray | None = None
     seen: BoolArray | None = None
+    moved_mm: float = 0.0
+    stretch: float = 0.0
 
     @cached_property
     def distances(self) -> SurfaceDistances:
@@ -102,7 +92,8 @@ class FitResult:
         z_covariance: (K, K) of z, calibrated; None of the paper's method. It is in no file.
         stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
         history: every state the loop went through, in the scan's mm frame.
-        method: the method that ran.
+        method: name of the method that ran.
+        calibrated: whether `b_stddev` was checked against truths (docs/uncertainty.md); not of the paper's method.
         config: every setting in effect, with the software version.
         start: how the start was found.
         evidence: what the status goes by, by name; empty for the paper's method, which goes by the distances.
@@ -126,6 +117,7 @@ class FitResult:
     stages: Mapping[str, Stage]
     history: Sequence[IcpState]
     method: str
+    calibrated: bool
     config: Mapping[str, Any]
     start: str
     evidence: Mapping[str, float]
@@ -196,65 +188,3 @@ class FitResult:
         vertices = at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
         landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
         return Mesh(vertices, self.model.faces, landmarks, name=self.scan_name)
-
-
-def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
-    """Return the standard deviation (K,), mm, of the coefficients given a complete surface.
-
-    Probabilistic PCA with orthonormal modes: var_k = lam_k v / (lam_k + v) (Tipping and Bishop, 1999). It takes the
-    residuals of the coordinates for independent, which they are not, so it is too small.
-
-    Args:
-        model: gives lam_k = stddev_k^2.
-        residual_variance: v, mm^2 per coordinate.
-    """
-    variance = model.stddev**2
-    return np.sqrt(variance * residual_variance / (variance + residual_variance))
-
-
-def doubts(model: ShapeModel, stages: Mapping[str, Stage], start_scale: float) -> list[str]:
-    """Return reasons not to trust the final stage, most serious first; none where nothing speaks against it.
-
-    Args:
-        model: the shape space.
-        stages: as in `FitResult`.
-        start_scale: scale of the start, in the scan's unit per mm.
-    """
-    final, initial = stages["final"], stages["initial"]
-    forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
-    size_mm = rms_size(model.mean_vertices)
-    found: list[str] = []
-    shrunk = min(
-        final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,
-        final.T_scan_model.scale / start_scale / _SHRUNK_IN_ALL,
-    )
-    if shrunk < 1.0:
-        found.append("the model shrank while it was fitted, as it does when parts of the scan are missing")
-    if forward.rms > _FAR_SHARE * size_mm:
-        found.append(f"the model stays {forward.rms:.1f} mm (RMS) away from the scan")
-    if backward.fraction < _SEEN_SHARE:
-        found.append(f"the model covers only {100 * backward.fraction:.0f} % of the scan")
-    elif backward.median > _GAP_RATIO * forward.median and backward.median > _GAP_SHARE * size_mm:
-        found.append(
-            f"half of the scan lies over {backward.median:.1f} mm from the model, while half of the model lies within "
-            f"{forward.median:.1f} mm of the scan"
-        )
-    leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
-    z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
-    # An extreme shape that lies on the scan all over is what the scan shows.
-    if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
-        found.append(
-            f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations out "
-            "on average, where about 1 is usual"
-        )
-    return found
-
-
-def _hotelling_bound(k: int, n: int) -> float:
-    """Return the mean z^2 of k coefficients that a new shape exceeds with probability `_IMPLAUSIBLE`.
-
-    The variances come from n training shapes, so the bound is Hotelling's for a new sample, not chi-square's.
-    """
-    if n <= k + 1:
-        return float("inf")
-    return float((n**2 - 1) / (n * (n - k)) * fdtri(k, n - k, 1.0 - _IMPLAUSIBLE))

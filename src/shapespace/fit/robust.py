@@ -1,266 +1,232 @@
 """Phase 2 as we would do it: pose and shape at once, from both directions, robustly, with the prior.
 
-One iteration minimises, over a small change of the pose and over the coefficients b, in the model's frame,
+One step minimises, over a small change of the pose and over the coefficients b, in the model's frame,
 
-    sum_i w_i r_i^2 / sigma^2  +  sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2
+    sum_i w_i r_i^2 / sigma^2  +  rho (sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2)
 
-where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992). Matches go both
-ways: each scan point to the closest point of the moving surface, and each model vertex to the closest point of the
-scan. Those on a border, with normals that disagree, or far off for the spread of the rest count little or nothing
-(Zhang, Yao and Deng, PAMI 2022). The second term is the prior (Blanz et al., 2004); the third keeps a scale that the
-scan hardly shows. Few modes are free at first and all in the end; where the scan then shows a shape that the model
-cannot make, the modes of `residual` join in, so that what the model lacks does not bend what it has.
+where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992) and rho is how
+many matches tell as much as one independent one. Matches go both ways: each scan point to the closest point of the
+moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals that disagree,
+or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The second term is the
+prior (Blanz et al., 2004); the third keeps a scale that the scan hardly shows. Few modes are free at first and all in
+the end; where the scan then shows a shape that the model cannot make, the modes of `residual` join in, so that what the
+model lacks does not bend what it has. docs/robust.md derives it; equation numbers are those of that page.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
+from scipy.linalg import LinAlgError
 
 from shapespace.errors import FitError
-from shapespace.fit.kernels import Float32Array, gather_into, rows_into
-from shapespace.fit.matching import VertexMatches, match_vertices, unexplained_variance, winding_of
-from shapespace.fit.moving_model import POSE, MovingSurface, PreparedModel, prepare
-from shapespace.fit.posterior import posterior
-from shapespace.fit.regions import FinalMatches
+from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
+from shapespace.fit.final_matches import FinalMatches
+from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
+from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
+from shapespace.fit.posterior import new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
+from shapespace.fit.span import in_span
 from shapespace.fit.start import Start
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.weights import match_weights, spread, tails
-from shapespace.geometry.closest import ClosestPoints
+from shapespace.fit.weights import spread, tails
 from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
+from shapespace.types import FloatArray, IntArray
 
-_DAMPING = 1e-7
-_FIXED = 1e12
 _MOTION_STRIDE = 7
 _FEWEST_MATCHES = 30
 _FLICKER = 10.0
 _CLEARLY_BETTER = 0.95
 _FARTHEST = 5.0
-_IN_SPAN = 1e-9
-"""What is left of a pose parameter outside the modes is rounding below this share."""
+_HALF, _LEADING, _NEAR = 0.5, 10, 0.05
+"""A match counts at half weight; so many modes lead; near is this share of the model's size."""
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
-    """Scan points matched to the moving surface, (M,) each; residuals and distances in mm of the model's frame."""
+class Look:
+    """What the fit sees where it is.
 
-    triangle: IntArray
-    barycentric: FloatArray
-    residual: FloatArray
-    distance: FloatArray
-    allowed: BoolArray
+    Args:
+        matches: both ways.
+        weights: of those.
+        sigma_mm: spread of their residuals.
+    """
+
+    matches: Matches
+    weights: Weights
+    sigma_mm: float
+
+    @property
+    def rms_mm(self) -> float:
+        """RMS closest distance of the model's vertices that were looked at, mm of the model's frame."""
+        return float(np.sqrt((self.matches.vertices.distance**2).mean()))
 
 
-class JointFit:
-    """Pose and coefficients on their way, with the surface they make and its matches.
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One Gauss-Newton step.
+
+    Args:
+        look: what it went by.
+        at: where it led.
+        motion_mm: largest movement of a vertex, mm of the model's frame.
+    """
+
+    look: Look
+    at: Estimate
+    motion_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What stays the same from step to step.
 
     Args:
         prepared: the model.
         target: the scan.
         settings: of the method.
-        T_scan_model: the start, in the scan's mm frame.
-        with_scale: False holds the scale of the start.
+        prior: of pose and shape.
+        surface: the model's surface, which moves.
     """
 
-    def __init__(
-        self,
-        prepared: PreparedModel,
-        target: ScanTarget,
-        settings: RobustSettings,
-        T_scan_model: Similarity,
-        *,
-        with_scale: bool,
-    ) -> None:
-        self.prepared, self.target, self.settings, self.with_scale = prepared, target, settings, with_scale
-        self.T, self.start_scale = T_scan_model, T_scan_model.scale
-        self.stddev = np.array(prepared.model.stddev)
-        self.b = np.zeros(len(self.stddev))
-        self.surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        self.sigma_mm = self.width_mm = self.far_mm = self.rms_mm = self.motion_mm = float("inf")
-        self.hessian = np.zeros((0, 0))
-        self.seen_at = np.zeros(0)
-        self.scan: Matches | None = None
-        self.vertices: VertexMatches | None = None
-        self._winding = 0.0
-        self._asked = self._walks = self._triangles = np.zeros(0, dtype=np.int32)
-        self._points_mm = self._normals = np.zeros((0, 3))
-        self._tree: KdTree | None = None
-        self._tree_fits = False
-        self._engine = target.vertex_engine
-        self._near: ClosestPoints | None = None
+    prepared: PreparedModel
+    target: ScanTarget
+    settings: RobustSettings
+    prior: Prior
+    surface: MovingSurface
 
-    def add_modes(self, modes: Float32Array, stddev: FloatArray) -> None:
-        """Go on with `modes` (V, 3, K + R), the first K those it has, and the `stddev` (R,) mm of the others."""
-        self.stddev = np.concatenate([self.stddev, stddev])
-        self.b = np.concatenate([self.b, np.zeros(len(stddev))])
-        self.surface = MovingSurface(self.prepared.topology, self.prepared.model.mean_vertices, modes)
-        self.surface.deform(self.b)
+    @staticmethod
+    def of(
+        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool
+    ) -> Problem:
+        """Return the problem with the model's own modes."""
+        prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
+        surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
+        return Problem(prepared, target, settings, prior, surface)
 
-    def begin(self, level: Level) -> None:
-        """Draw the points that `level` matches, and say where to look for them first."""
-        rng, target = np.random.default_rng(self.settings.seed), self.target
+    def with_modes_beside(self) -> Problem:
+        """Return the problem with the modes that the model lacks, weighed as `beyond_prior` says."""
+        prepared, s = self.prepared, self.settings
+        extra = residual_modes(prepared.model, s.residual)
+        prior = replace(self.prior, stddev=np.concatenate([self.prior.stddev, extra.stddev]), weight=s.beyond_prior)
+        surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, extra.modes)
+        return replace(self, prior=prior, surface=surface)
+
+    def matcher(self, level: Level, at: Estimate, tree: KdTree, winding: float | None) -> Matcher:
+        """Return what matches the points that `level` draws, from where the fit is."""
+        s, target, rng = self.settings, self.target, np.random.default_rng(self.settings.seed)
         points = target.draw(level.scan_points, rng)
-        self._points_mm, self._normals = target.mesh.vertices[points], target.normals[points]
-        self._asked = _some(self.surface.topology.used, level.vertices, rng)
-        self._engine, self._near = target.engine if level.triangles else target.vertex_engine, None
-        # The surface changes little from level to level, and what it does the walks make up for.
-        if self._tree is None or (level.modes is None and not self._tree_fits):
-            self._tree, self._tree_fits = self.surface.vertex_tree(), level.modes is None
-        self._walks = self.surface.topology.used[self._tree.nearest(self._in_model()[0])[0]]
-        self._triangles = np.full_like(self._walks, -1)
+        vertex = _some(self.prepared.topology.used, level.vertices, rng)
+        engine = target.engine if level.triangles else target.vertex_engine
+        return Matcher(
+            target, self.surface, at.T_scan_model, points, vertex, engine, s.normal_cosine, tree=tree, winding=winding
+        )
 
-    def free_modes(self, level: Level) -> int:
-        """Return how many modes are free on `level`."""
-        return len(self.b) if level.modes is None else min(level.modes, len(self.b))
+    def look(self, matcher: Matcher, at: Estimate) -> Look:
+        """Return the matches and how much each counts.
 
-    def _in_model(self) -> tuple[FloatArray, FloatArray]:
-        """Return the drawn points of the scan in the model's frame with their normals."""
-        T = self.T
-        return ((self._points_mm - T.translation) @ T.rotation) / T.scale, self._normals @ T.rotation
-
-    def match(self) -> None:
-        """Match scan points to the moving surface, and its vertices to the scan."""
-        q, n = self._in_model()
-        triangle = self._triangles
-        weights = self.surface.walk(q, self._walks, triangle)
-        residual, distance, cosine, covered = self.surface.meet(q, n, triangle, weights)
-        if self._winding == 0.0:
-            self._winding = winding_of(cosine, covered)
-        agree = self._winding * cosine > self.settings.normal_cosine
-        self.scan = Matches(triangle, weights, residual, distance, covered & agree)
-
-        surface = self.surface
-        self.vertices = match_vertices(
-            self.target, self._engine, self.T, surface.vertices, surface.normals, self._asked, self._near,
-            winding=self._winding, normal_cosine=self.settings.normal_cosine,
-        )  # fmt: skip
-        self._near, near = self.vertices.near, self.vertices.distance[self.vertices.allowed]
-        self.rms_mm = float(np.sqrt((near**2).mean())) if len(near) else float("inf")
-
-    def weigh(self) -> tuple[FloatArray, FloatArray]:
-        """Return the weights of the matches of scan points and of vertices, by the spread of the residuals."""
-        s, scan, vertices = self.settings, self.scan, self.vertices
-        assert scan is not None and vertices is not None
-        counted = np.concatenate([scan.residual[scan.allowed], vertices.residual[vertices.allowed]])
-        if len(counted) < _FEWEST_MATCHES:
+        Raises:
+            FitError: hardly anything matches.
+        """
+        s = self.settings
+        matches = matcher.match(self.surface, at.T_scan_model)  # eqs 4 to 6
+        residual = matches.residuals()
+        if len(residual) < _FEWEST_MATCHES:
             raise FitError(
                 f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks, or "
                 "check that it shows what the model does."
             )
-        self.sigma_mm = max(spread(counted), s.least_spread_mm)
-        width = self.sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(counted, self.sigma_mm) ** 2))
-        far = s.reach * width + s.reach_mm
-        self.width_mm, self.far_mm = width, far
-        w = match_weights(s.weight, scan.residual, scan.distance, scan.allowed, width, far)
-        v = match_weights(s.weight, vertices.residual, vertices.distance, vertices.allowed, width, far)
+        sigma_mm = max(spread(residual), s.least_spread_mm)
+        width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
         fineness = min(1.0, len(self.target.mesh.vertices) / len(self.surface.vertices))
-        return w, s.vertex_share * fineness**2 * v
+        weights = matches.weights(
+            s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share * fineness**2
+        )  # eqs 8, 9
+        return Look(matches, weights, sigma_mm)
 
-    def step(self, modes: int) -> None:
-        """Do one Gauss-Newton step on the pose and the first `modes` coefficients."""
-        self.match()
-        w, v = self.weigh()
-        s, surface, scan, vertices = self.settings, self.surface, self.scan, self.vertices
-        assert scan is not None and vertices is not None
-        # Each vertex collects the weight and pull of the matches it carries; the Hessian is lumped there.
-        seen_at, pull_at = np.zeros(len(surface.vertices)), np.zeros(len(surface.vertices))
-        gather_into(scan.triangle, scan.barycentric, surface.topology.faces, w, scan.residual, seen_at, pull_at)
-        self.seen_at = seen_at.copy()
-        seen_at[vertices.vertex] += v
-        pull_at[vertices.vertex] += v * vertices.residual
+    def equations(self, look: Look, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
+        """Return what each vertex carries of the matches, and the equations of a step from there."""
+        gathered = look.matches.gathered(look.weights, self.prepared.topology.faces, len(self.surface.vertices))
+        return gathered, normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
 
-        rows, gradient = np.empty((len(seen_at), POSE + modes), dtype=np.float32), np.zeros(POSE + modes)
-        count = rows_into(surface.vertices, surface.normals, surface.modes, modes, seen_at, pull_at, rows, gradient)
-        hessian = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)
-        rho = self.prior * self.sigma_mm**2
-        precision = rho / self.stddev[:modes] ** 2
-        index = np.arange(POSE, POSE + modes)
-        hessian[index, index] += precision
-        gradient[POSE:] += precision * self.b[:modes]
-        if self.with_scale:
-            hessian[6, 6] += rho / s.scale_stddev**2
-            gradient[6] += rho / s.scale_stddev**2 * np.log(self.T.scale / self.start_scale)
-        else:
-            hessian[6, 6], gradient[6] = _FIXED * (hessian[6, 6] + 1.0), 0.0
-        self.hessian = hessian
-        self._take(-_solve(hessian, gradient, self.target.mesh.name), modes)
+    def step(self, matcher: Matcher, at: Estimate, modes: int) -> Step:
+        """Return one Gauss-Newton step on the pose and the first `modes` coefficients; the surface moves with it.
 
-    @property
-    def prior(self) -> float:
-        """How many matches tell as much as one independent one."""
-        return self.settings.prior if len(self.b) == self.prepared.model.n_modes else self.settings.beyond_prior
-
-    def _take(self, delta: FloatArray, modes: int) -> None:
-        T, x = self.T, self.surface.vertices
-        before = T.apply(x[::_MOTION_STRIDE])
-        turn = np.asarray(Rotation.from_rotvec(delta[:3]).as_matrix())
-        self.T = Similarity(
-            T.scale * float(np.exp(delta[6])), T.rotation @ turn, T.scale * (T.rotation @ delta[3:6]) + T.translation
-        )
+        Raises:
+            FitError: hardly anything matches, or the fit diverged.
+        """
+        look = self.look(matcher, at)  # eqs 4 to 9
+        _, equations = self.equations(look, at, modes)  # eqs 10 to 14
+        try:
+            delta = equations.step()  # eq 15
+        except LinAlgError as error:
+            raise FitError(
+                f"{self.target.mesh.name}: the fit diverged; give landmarks, or crop the scan to what the model shows."
+            ) from error
+        some = slice(None, None, _MOTION_STRIDE)
+        before, at = at.T_scan_model.apply(self.surface.vertices[some]), at.moved_by(delta)  # eq 16
         if modes:
-            self.b[:modes] += delta[POSE:]
-            self.surface.deform(self.b)
-        after = self.T.apply(self.surface.vertices[::_MOTION_STRIDE])
-        self.motion_mm = float(np.linalg.norm(after - before, axis=1).max()) / T.scale
+            self.surface.deform(at.b)  # eq 1
+        moved = at.T_scan_model.apply(self.surface.vertices[some]) - before
+        return Step(look, at, float(np.linalg.norm(moved, axis=1).max()) / at.T_scan_model.scale)
 
-    def prefer(self, start: Start, level: Level) -> None:
-        """Do `level` again from `start` with its coefficients, and go on from there if that matches clearly better."""
-        free = self.free_modes(level)
-        own, own_cost = (self.T, self.b.copy()), self.mismatch()
-        b = np.zeros(len(self.b))
-        b[: min(len(start.b), free)] = start.b[:free]
-        self._place(start.T_scan_model, b)
-        self.begin(level)
+    def descent(self, matcher: Matcher, at: Estimate, level: Level) -> Generator[Step]:
+        """Yield steps with the modes that are free on `level`, until hardly anything moves.
+
+        Raises:
+            FitError: hardly anything matches, or the fit diverged.
+        """
+        modes = len(at.b) if level.modes is None else min(level.modes, len(at.b))
         for _ in range(level.iterations):
-            self.step(free)
-            if self.motion_mm < level.stop_motion_mm:
-                break
-        if self.mismatch() > _CLEARLY_BETTER * own_cost:
-            self._place(*own)
+            step = self.step(matcher, at, modes)
+            at = step.at
+            yield step
+            if step.motion_mm < level.stop_motion_mm:
+                return
 
-    def _place(self, T: Similarity, b: FloatArray) -> None:
-        self.T, self.b = T, b
-        self.surface.deform(b)
+    def unexplained_variance(self, look: Look) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17)."""
+        return look.matches.unexplained_variance(
+            look.weights, self.prepared.topology.faces, len(self.surface.vertices), self.settings.seed
+        )
 
-    def mismatch(self) -> float:
+    def told(self, at: Estimate, surface_mm: float, modes: int) -> Estimate:
+        """Return the surface at `at` in the first `modes` of the model's own modes; `surface_mm` is its uncertainty."""
+        own = self.prepared.model.n_modes
+        if len(at.b) == modes == own:
+            return at
+        return in_span(
+            self.prepared, self.surface.vertices, at, np.sqrt(new_shapes(self.prepared.model)), surface_mm, modes,
+            with_scale=not self.prior.holds_scale,
+        )  # fmt: skip
+
+    def mismatch_mm(self, matcher: Matcher, at: Estimate) -> float:
         """Return the mean distance both ways, mm, of which none counts more than the reach."""
-        self.match()
-        scan, vertices, most = self.scan, self.vertices, _FARTHEST * self.settings.reach_mm
-        assert scan is not None and vertices is not None
-        return float(np.minimum(scan.distance, most).mean() + np.minimum(vertices.distance, most).mean())
+        matches, most = matcher.match(self.surface, at.T_scan_model), _FARTHEST * self.settings.reach_mm
+        return sum(float(np.minimum(way.distance, most).mean()) for way in (matches.points, matches.vertices))
 
-    def state(self, phase: int, iteration: int, stopped: str | None = None) -> IcpState:
-        """Return where the fit is."""
-        b = self.b[: self.prepared.model.n_modes].copy()
-        return IcpState(phase, iteration, self.T, b, self.rms_mm, self.motion_mm, stopped)
-
-    def final_matches(self) -> FinalMatches:
-        """Return what tells, later, which vertices followed the scan."""
-        s, surface = self.settings, self.surface
-        return FinalMatches(
-            self.target, self.T, surface.vertices.copy(), surface.normals.copy(), self._winding, s.normal_cosine,
-            s.weight, self.width_mm, self.far_mm,
-        )  # fmt: skip
-
-    def unexplained(self) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise."""
-        self.match()
-        w, _ = self.weigh()
-        scan, surface = self.scan, self.surface
-        assert scan is not None
-        return unexplained_variance(
-            scan.triangle, scan.barycentric, surface.topology.faces, w, scan.residual, len(surface.vertices),
-            self.settings.seed,
-        )  # fmt: skip
+    def preferred(self, at: Estimate, matcher: Matcher, start: Start, level: Level, tree: KdTree) -> Estimate:
+        """Return where `level` leads from `start` and its coefficients if that matches clearly better, else `at`."""
+        limit_mm = _CLEARLY_BETTER * self.mismatch_mm(matcher, at)
+        free = len(at.b) if level.modes is None else min(level.modes, len(at.b))
+        b = np.zeros(len(at.b))
+        b[: min(len(start.b), free)] = start.b[:free]
+        other = Estimate(start.T_scan_model, b)
+        self.surface.deform(b)
+        matcher = self.matcher(level, other, tree, None)
+        for step in self.descent(matcher, other, level):
+            other = step.at
+        if self.mismatch_mm(matcher, other) <= limit_mm:
+            return other
+        self.surface.deform(at.b)
+        return at
 
 
 def robust_icp(
@@ -273,13 +239,12 @@ def robust_icp(
     modes: int | None = None,
     max_iterations: int = 500,
 ) -> Generator[IcpState, None, Fitted]:
-    """Yield the start and each iteration, and return where they ended.
+    """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together.
 
     Args:
-        model: mean and modes, with triangles.
-        target: the scan in its mm frame.
-        start: where to begin; where it has coefficients, such as those of an open mouth, there is a second start with
-            them, and the one of the two that matches better after the first modes goes on.
+        model: the shape space, with triangles.
+        target: the scan.
+        start: a pose of the mean near the scan, and coefficients where it has some.
         settings: of the method.
         with_scale: False holds the scale of the start.
         modes: how many coefficients to report; None for all. The fit uses all in any case: modes left out of the fit
@@ -291,101 +256,114 @@ def robust_icp(
         FitError: hardly anything matches, or the fit diverged.
     """
     prepared = prepare(model)
-    fit = JointFit(prepared, target, settings, start.T_scan_model, with_scale=with_scale)
-    fit.begin(settings.levels[0])
-    fit.match()
-    left_mm2 = 0.0
-    first = next(number for number, level in enumerate(settings.levels) if level.modes != 0)
-    phase, iteration, state = 1, 0, fit.state(1, 0)
-    for number, level in enumerate((*settings.levels, settings.beyond)):
-        if number == len(settings.levels):
-            left_mm2 = fit.unexplained()
-            if left_mm2 < max(settings.beyond_share * fit.sigma_mm**2, settings.beyond_mm**2):
-                break
-            extra = residual_modes(model, settings.residual)
-            fit.add_modes(extra.modes, extra.stddev)
-        free = fit.free_modes(level)
-        if free and phase == 1:
+    problem = Problem.of(prepared, target, settings, start.T_scan_model.scale, with_scale=with_scale)
+    at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
+    tree, tree_fits = problem.surface.vertex_tree(), False
+    matcher = problem.matcher(settings.levels[0], at, tree, None)
+    look = problem.look(matcher, at)
+    state, winding = IcpState(1, 0, at.T_scan_model, at.b, look.rms_mm, float("inf")), look.matches.winding
+    for level in settings.levels:
+        begins = level.modes != 0 and state.phase == 1
+        if begins:
             yield replace(state, stopped=state.stopped or "rate")
-            phase, iteration, state = 2, 0, fit.state(2, 0)
-        fit.begin(level)
-        for _ in range(level.iterations):
-            if iteration >= max_iterations:
-                state = replace(state, stopped="cap")
-                break
-            yield replace(state, stopped=None)
-            fit.step(free)
-            iteration += 1
-            settled = fit.motion_mm < level.stop_motion_mm
-            # Where parts of the scan match now one way and now another, the last bit of motion never ends.
-            still = fit.motion_mm < _FLICKER * level.stop_motion_mm
-            state = fit.state(phase, iteration, "rate" if still else "cap")
-            if settled:
-                break
-        if number == first and len(start.b) and iteration < max_iterations:
-            fit.prefer(start, level)
+            state = replace(state, phase=2, iteration=0, stopped=None)
+        # The surface changes little from level to level, and what it does the walks make up for.
+        if level.modes is None and not tree_fits:
+            tree, tree_fits = problem.surface.vertex_tree(), True
+        matcher = problem.matcher(level, at, tree, winding)
+        at, state = yield from _states(problem.descent(matcher, at, level), at, state, level, max_iterations)
+        if begins and len(start.b) and state.iteration < max_iterations:
+            at = problem.preferred(at, matcher, start, level, tree)
+
+    look = problem.look(matcher, at)
+    left_mm2 = problem.unexplained_variance(look)  # eq 17
+    more = left_mm2 >= max(settings.beyond_share * look.sigma_mm**2, settings.beyond_mm**2)
+    if more and state.iteration < max_iterations:
+        problem = problem.with_modes_beside()
+        at = Estimate(at.T_scan_model, np.pad(at.b, (0, len(problem.prior.stddev) - len(at.b))))
+        problem.surface.deform(at.b)
+        matcher = problem.matcher(settings.beyond, at, tree, winding)
+        steps = problem.descent(matcher, at, settings.beyond)
+        at, state = yield from _states(steps, at, state, settings.beyond, max_iterations)
+        look = problem.look(matcher, at)
     yield state
-    T, b = fit.T, fit.b
-    if len(b) > model.n_modes:
-        T, b = in_span(prepared, fit.surface.vertices, T, model.n_modes, with_scale=with_scale)
+
+    gathered, equations = problem.equations(look, at, len(at.b))
+    surface, vertices = problem.surface, look.matches.vertices
+    known = posterior(
+        model, surface, problem.prior, equations, look.weights, look.sigma_mm,
+        beyond_model_mm=float(np.sqrt(max(left_mm2, 0.0))), allowed_share=float(vertices.allowed.mean()),
+    )  # fmt: skip
     # Modes that nobody asked for are no reason to doubt the fit, so the verdict is on all of them.
-    known = posterior(fit, T, b, float(np.sqrt(max(left_mm2, 0.0))))
+    every = told = problem.told(at, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     if wanted < model.n_modes:
-        T, b = in_span(prepared, fit.surface.vertices, fit.T, wanted, with_scale=with_scale)
+        told = problem.told(at, known.surface_mm, wanted)
+    reported = (at.T_scan_model.inverse() @ every.T_scan_model).apply(model.reconstruct(every.b))
+    left_out_mm2 = float(((surface.vertices - reported) ** 2).sum(axis=1).mean())
     return Fitted(
-        T_scan_model=T,
-        b=b,
-        b_stddev=known.b_stddev[:wanted],
-        b_covariance=known.b_covariance[:wanted, :wanted],
-        shrinkage=known.shrinkage[:wanted],
-        vertices_scan_mm=fit.T.apply(fit.surface.vertices),
-        rms_mm=fit.rms_mm,
-        regions=fit.final_matches(),
-        evidence=known.evidence,
-    )
+        T_scan_model=told.T_scan_model,
+        b=told.b,
+        b_stddev=known.b_stddev(wanted),
+        b_covariance=known.b_covariance(wanted),
+        shrinkage=known.shrinkage(wanted),
+        T_scan_fitted=at.T_scan_model,
+        vertices_scan_mm=at.T_scan_model.apply(surface.vertices),
+        outside_mm=float(np.linalg.norm(at.b[wanted:]) / np.sqrt(len(surface.vertices))),
+        regions=FinalMatches(
+            target, at.T_scan_model, MovingSurface(prepared.topology, surface.vertices), winding,
+            settings.normal_cosine, settings.weight, look.weights.width_mm, look.weights.far_mm,
+        ),
+        evidence={
+            **_matched(look, gathered, at, model, known.prior_variance[: model.n_modes]),
+            "beyond_model_mm": float(np.sqrt(max(left_mm2, 0.0))),
+            "left_out_mm": float(np.sqrt(left_out_mm2)),
+            "expected_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
+        },
+    )  # fmt: skip
 
 
-def in_span(
-    prepared: PreparedModel, vertices: FloatArray, T_scan_model: Similarity, modes: int, *, with_scale: bool
-) -> tuple[Similarity, FloatArray]:
-    """Return pose and first `modes` coefficients of the model's surface nearest to `vertices`, in least squares.
+def _matched(look: Look, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray) -> dict[str, float]:
+    """Return how much of model and scan found a match, and how plausible pose and shape are.
 
     Args:
-        prepared: the model.
-        vertices: (V, 3) in the model's order, in its frame.
-        T_scan_model: pose of that frame in the scan's; changed by what the modes left out would have done.
-        modes: how many.
-        with_scale: False keeps the scale.
+        look: at the end,
+        gathered: what of that each vertex carries.
+        at: where that is.
+        model: the shape space.
+        variance: (K,) of the coefficients of new shapes, mm^2.
     """
-    model, free = prepared.model, POSE if with_scale else POSE - 1
-    pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
-    moved = (vertices - model.mean_vertices).ravel()
-    # The modes are orthonormal, so they drop out of the normal equations and the pose is left.
-    normal = pose.T @ pose - inside.T @ inside
-    unit = 1.0 / np.linalg.norm(pose, axis=0)
-    pull = pose.T @ moved - inside.T @ (model.vertex_basis[:, :modes].T @ moved)
-    value, vector = np.linalg.eigh(normal * np.outer(unit, unit))
-    kept = value > _IN_SPAN
-    turn = unit * (vector[:, kept] @ ((vector[:, kept].T @ (unit * pull)) / value[kept]))
-    small = Similarity(
-        float(np.exp(turn[6])) if with_scale else 1.0, np.asarray(Rotation.from_rotvec(turn[:3]).as_matrix()), turn[3:6]
-    )
-    return T_scan_model @ small, model.project(small.inverse().apply(vertices), align=False)[:modes]
+    points, vertices, v = look.matches.points, look.matches.vertices, look.weights.vertices
+    size_mm, z2 = rms_size(model.mean_vertices), at.b[: model.n_modes] ** 2 / variance
+    return {
+        "size_mm": size_mm,
+        "seen_share": float(gathered.seen.mean()),
+        "model_matched_share": float((v > _HALF * v.max()).mean()),
+        "model_allowed_share": float(vertices.allowed.mean()),
+        "scan_allowed_share": float(points.allowed.mean()),
+        "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
+        "z2": float(z2.mean()),
+        "z2_leading": float(z2[:_LEADING].mean()),
+        "log_scale": float(np.log(at.T_scan_model.scale)),
+        "spread_mm": look.sigma_mm,
+    }
 
 
-def _solve(hessian: FloatArray, gradient: FloatArray, name: str) -> FloatArray:
-    """Solve the normal equations, scaled to a unit diagonal and hardly damped."""
-    diagonal = np.sqrt(np.maximum(hessian.diagonal(), 1e-30))
-    scaled = hessian / np.outer(diagonal, diagonal)
-    scaled[np.diag_indices_from(scaled)] += _DAMPING
-    try:
-        factor = cho_factor(scaled, lower=True, overwrite_a=True)
-        return np.asarray(cho_solve(factor, gradient / diagonal)) / diagonal
-    except (LinAlgError, ValueError) as error:
-        raise FitError(
-            f"{name}: the fit diverged; give landmarks, or crop the scan to what the model shows."
-        ) from error
+def _states(
+    steps: Iterator[Step], at: Estimate, state: IcpState, level: Level, max_iterations: int
+) -> Generator[IcpState, None, tuple[Estimate, IcpState]]:
+    """Yield each state when the next is there; return the last one, which is not yielded, and where it is."""
+    left = max_iterations - state.iteration
+    for step in islice(steps, left):
+        yield replace(state, stopped=None)
+        at = step.at
+        # Where parts of the scan match now one way and now another, the last bit of motion never ends.
+        still = step.motion_mm < _FLICKER * level.stop_motion_mm
+        state = IcpState(
+            state.phase, state.iteration + 1, at.T_scan_model, at.b[: len(state.b)].copy(), step.look.rms_mm,
+            step.motion_mm, "rate" if still else "cap",
+        )  # fmt: skip
+    return at, state if left > 0 else replace(state, stopped="cap")
 
 
 def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:

@@ -20,7 +20,8 @@ class IcpState:
         iteration: from 0, the start, counted by phase.
         T_scan_model: similarity from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm; zero throughout phase 1.
-        rms_mm: RMS distance of the model's vertices from their closest scan points, mm of the model's frame.
+        rms_mm: RMS distance of the model's vertices that the method looks at, in both methods whether they count or
+            not, from their closest scan points, mm of the model's frame.
         motion_mm: largest movement of a model vertex in this iteration, mm of the model's frame.
         stopped: None while running, else why: `rate`, or `cap`.
     """
@@ -43,8 +44,9 @@ class Fitted:
         b: (K,) coefficients, mm.
         b_stddev: (K,) their standard deviation, mm.
         shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
-        vertices_scan_mm: (V, 3) the fitted surface in the scan's mm frame; it may leave the span of the model.
-        rms_mm: RMS distance of the matched vertices from the scan, mm of the model's frame.
+        T_scan_fitted: pose of the surface that was fitted, before it was told in the model's coefficients.
+        vertices_scan_mm: (V, 3) that surface in the scan's mm frame; it may leave the span of the model,
+        outside_mm: by this (RMS), mm of the model's frame.
         regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
         evidence: what the verdict goes by, by name.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
@@ -54,8 +56,9 @@ class Fitted:
     b: FloatArray
     b_stddev: FloatArray
     shrinkage: FloatArray
+    T_scan_fitted: Similarity
     vertices_scan_mm: FloatArray
-    rms_mm: float
+    outside_mm: float
     regions: Callable[[], IntArray] = field(repr=False)
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
     b_covariance: FloatArray | None = None

@@ -12,8 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from shapespace.fit.start import Start
-
 _OFFSET = -3.70
 _LEAST_SHARE = 0.01
 _MOST_LOG_SCALE = 1.0
@@ -40,11 +38,6 @@ class Input:
     weight: float
     most: float
     says: Callable[[Mapping[str, float]], str]
-
-
-def start_evidence(start: Start) -> dict[str, float]:
-    """Return what the search for a start says, by name; not a number, or infinite, where nothing was searched."""
-    return {"start_score_mm": start.score_mm, "start_runner_up_score_mm": start.runner_up_score_mm}
 
 
 def _log_share(share: float) -> float:
@@ -146,10 +139,18 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     Args:
         evidence: of `posterior` and `start_evidence`; lengths in mm of the model's frame.
     """
+    if not _is_doubted(evidence):
+        return []
+    usual = {name: min(evidence[name], 1.0) for name in ("z2", "z2_leading")}
+    if not _is_doubted(dict(evidence) | usual):
+        out = math.sqrt(max(evidence["z2"], evidence["z2_leading"]))
+        return [
+            f"the model is too narrow for this scan: its surface follows it, to {evidence['spread_mm']:.2f} mm where "
+            f"they match, but its coefficients lie {out:.1f} standard deviations out on average, where about 1 is "
+            "usual; build a model of more, or more different, shapes, or follow the scan by --dense and look at it"
+        ]
     parts = _contributions(evidence)
     beyond = [i for i, each in enumerate(INPUTS) if each.value(evidence) > each.most]
-    if score(evidence) <= 0.0 and not beyond:
-        return []
     found = sorted(range(len(INPUTS)), key=lambda i: (i in beyond, parts[i]), reverse=True)
     least = _TOLD_SHARE * parts[found[0]]
     return [INPUTS[i].says(evidence) for i in found[:_TOLD] if i in beyond or parts[i] >= least]
@@ -157,3 +158,7 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
 
 def _contributions(evidence: Mapping[str, float]) -> list[float]:
     return [each.weight * (max(each.value(evidence), each.least) - each.usual) for each in INPUTS]
+
+
+def _is_doubted(evidence: Mapping[str, float]) -> bool:
+    return score(evidence) > 0.0 or any(each.value(evidence) > each.most for each in INPUTS)

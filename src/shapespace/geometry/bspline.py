@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
@@ -66,16 +65,20 @@ class SplineSquare:
         Raises:
             InputError: fewer than three values with weight, or all on a line.
         """
+        from scipy.linalg import cho_solve
+
         if weights is None:
             return np.asarray(cast(Any, cho_solve)(self._factor, self.matrix.T @ values))
         return np.asarray(cast(Any, cho_solve)(self._factored(weights), self.matrix.T @ (weights[:, None] * values)))
 
     def _factored(self, weights: FloatArray | None) -> Any:
+        from scipy.linalg import cho_factor
+
         B = self.matrix if weights is None else self.matrix.multiply(weights[:, None]).tocsr()
         normal = np.asarray((B.T @ self.matrix).todense()) + self._penalty
         try:
             return cast(Any, cho_factor)(normal, lower=True)
-        except LinAlgError:
+        except np.linalg.LinAlgError:
             raise InputError("Too few vertices are there to fit a B-spline surface to them.") from None
 
 

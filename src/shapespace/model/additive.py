@@ -20,7 +20,7 @@ from scipy.linalg import eigh
 from shapespace.errors import InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.hdf5 import read_hdf5, write_hdf5
+from shapespace.io.hdf5 import read_hdf5
 from shapespace.model import model_file
 from shapespace.model.held_out import held_out_variances
 from shapespace.model.pca import modes_for_variance, principal_components
@@ -287,12 +287,8 @@ class AdditiveModel:
         Raises:
             FileError: the folder cannot be written, or the disk is full.
         """
-        arrays, attributes = model_file.contents(self.shape)
-        write_hdf5(
-            Path(path),
-            {**arrays, "split_rotation": self.rotation},
-            {**attributes, "split_identity": self.n_identity, **model_file.made_by(self.shape)},
-        )
+        more = {"split_rotation": self.rotation}, {"split_identity": self.n_identity}
+        model_file.save(self.shape.fields(), Path(path), *more)
 
     @classmethod
     def load(cls, path: Path | str) -> AdditiveModel:

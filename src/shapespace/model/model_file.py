@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, TypedDict, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace import __version__
 from shapespace.errors import FileFormatError, ModelFileError
-from shapespace.io.hdf5 import Attribute, read_hdf5, write_hdf5
-
-if TYPE_CHECKING:
-    from shapespace.model.shape_model import ShapeModel
+from shapespace.geometry.procrustes import Gauge
+from shapespace.io.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
+from shapespace.types import FloatArray, IntArray
 
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
@@ -23,40 +23,64 @@ _EVERY_MODEL = ("mean", "basis", "stddev", "faces")
 """What is not of one representation."""
 
 
-def contents(model: ShapeModel) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
+class ModelFields(TypedDict):
+    """The fields of a `ShapeModel`, which says what they are."""
+
+    mean: FloatArray
+    basis: FloatArray
+    stddev: FloatArray
+    total_variance: float
+    n_training: int
+    faces: IntArray | None
+    gauge: Gauge
+    landmarks: Mapping[str, int]
+    representation: str
+    coding: Mapping[str, npt.NDArray[Any]]
+    provenance: str
+    licence: str
+    held_out: bool
+
+
+def hash_of(model: ModelFields) -> str:
+    """Return the SHA-256 of everything that `model` is, whatever file it stands in."""
+    return content_hash(*_contents(model))
+
+
+def save(
+    model: ModelFields,
+    path: Path,
+    more_arrays: Mapping[str, npt.NDArray[Any]] | None = None,
+    more_attributes: Mapping[str, Attribute] | None = None,
+) -> None:
+    """Write `model`, and what a larger model adds to it, to `path`, whole or not at all."""
+    arrays, attributes = _contents(model)
+    made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
+    write_hdf5(path, {**arrays, **(more_arrays or {})}, {**attributes, **(more_attributes or {}), **made_by})
+
+
+def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
     """Return the arrays and attributes that make up `model`; the software version is not part of them."""
-    arrays: dict[str, npt.NDArray[Any]] = {"mean": model.mean, "basis": model.basis, "stddev": model.stddev}
-    if model.faces is not None:
-        arrays["faces"] = model.faces
-    arrays.update(model.coding)
+    arrays: dict[str, npt.NDArray[Any]] = {name: model[name] for name in ("mean", "basis", "stddev")}
+    if model["faces"] is not None:
+        arrays["faces"] = model["faces"]
+    arrays.update(model["coding"])
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
         "format_version": FORMAT_VERSION,
         "units": "mm",
-        "variance_divisor": _HELD_OUT if model.held_out else "N - 1",
-        "gauge": model.gauge,
-        "representation": model.representation,
-        "total_variance": model.total_variance,
-        "n_training": model.n_training,
-        "landmarks": json.dumps(dict(model.landmarks)),
-        "provenance": model.provenance,
-        "licence": model.licence,
+        "variance_divisor": _HELD_OUT if model["held_out"] else "N - 1",
+        "gauge": model["gauge"],
+        "representation": model["representation"],
+        "total_variance": model["total_variance"],
+        "n_training": model["n_training"],
+        "landmarks": json.dumps(dict(model["landmarks"])),
+        "provenance": model["provenance"],
+        "licence": model["licence"],
     }
     return arrays, attributes
 
 
-def save(model: ShapeModel, path: Path) -> None:
-    """Write `model` to `path`, whole or not at all."""
-    arrays, attributes = contents(model)
-    write_hdf5(path, arrays, {**attributes, **made_by(model)})
-
-
-def made_by(model: ShapeModel) -> dict[str, Attribute]:
-    """Return what a file says beside the contents of `model`."""
-    return {"model_hash": model.content_hash, "software_version": __version__}
-
-
-def load(path: Path) -> dict[str, Any]:
+def load(path: Path) -> ModelFields:
     """Return the fields of the `ShapeModel` in `path`.
 
     Raises:
@@ -83,7 +107,7 @@ def load(path: Path) -> dict[str, Any]:
             "faces": arrays["faces"].astype(np.int32) if "faces" in arrays else None,
             "total_variance": float(attributes["total_variance"]),
             "n_training": int(attributes["n_training"]),
-            "gauge": str(attributes["gauge"]),
+            "gauge": cast(Gauge, str(attributes["gauge"])),
             "landmarks": {str(name): int(vertex) for name, vertex in stored.items()},
             "representation": str(attributes["representation"]),
             "coding": {name: array for name, array in arrays.items() if name not in _EVERY_MODEL},

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import blas, eigh, solve_triangular
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
@@ -68,6 +67,8 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
             for than the samples can give.
     """
     n, d = data.shape
+    from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
+
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
     if isinstance(modes, np.integer):
@@ -100,6 +101,8 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
 
 def _syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
     """Return the lower triangle of block @ block.T, (N, N) Fortran-ordered, added to `onto` where given."""
+    from scipy.linalg import blas
+
     dsyrk = cast(Any, blas).dsyrk
     # block.T is Fortran-ordered, so BLAS reads it in place.
     if onto is None:
@@ -149,6 +152,8 @@ def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, 
     # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
     overlap = rows @ rows.T
     if np.abs(overlap - np.eye(k)).max() > 1e-12:
+        from scipy.linalg import solve_triangular
+
         factor = np.linalg.cholesky(overlap)
         for start in range(0, rows.shape[1], _BLOCK):
             part = slice(start, start + _BLOCK)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,17 +17,18 @@ import numpy.typing as npt
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.hdf5 import content_hash
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.holes import fill_holes
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
+from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
+_IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,7 @@ class ShapeModel:
         provenance: what it was made from, in words.
         licence: licence of the training data.
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
+        left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
         InputError: arrays whose shapes do not belong together.
@@ -67,6 +70,7 @@ class ShapeModel:
     provenance: str = ""
     licence: str = ""
     held_out: bool = False
+    left_out: int = 0
 
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
@@ -147,6 +151,7 @@ class ShapeModel:
             )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
+        rounding = rounding_mm(np.nan_to_num(shapes[0]))
         if kind.takes_holes and np.isnan(shapes).any():
             _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
             fill_holes(shapes, faces, names)
@@ -160,10 +165,20 @@ class ShapeModel:
             pc = _components(coder.encode(shapes), modes, seed)
         else:
             pc = _components_of_codes(coder, shapes, modes, seed)
+        spurious = below_precision(pc.variance, len(meshes), shapes[0].size, rounding)
+        if align:
+            basis = coder.directions(pc.basis)
+            spurious |= made_by_alignment(coder.decode(pc.mean), basis, gauge, alignment_vertices)
+        if spurious.all():
+            raise InputError(
+                "The training meshes differ by no more than their alignment and their rounding make of them, so there "
+                "is no variation to model; give different ones."
+            )
         return cls(
             mean=pc.mean,
-            basis=pc.basis,
-            stddev=np.sqrt(pc.variance),
+            basis=pc.basis[:, ~spurious],
+            stddev=np.sqrt(pc.variance[~spurious]),
+            left_out=int(spurious.sum()),
             total_variance=pc.total_variance,
             n_training=pc.n_samples,
             faces=faces,
@@ -232,7 +247,12 @@ class ShapeModel:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 of everything the model is, whatever file it stands in."""
-        return content_hash(*model_file.contents(self))
+        return model_file.hash_of(self.fields())
+
+    @property
+    def in_file(self) -> bool:
+        """Whether it was read from a file or saved to one: later runs will need what was made of it again."""
+        return self in _IN_FILES
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
@@ -304,13 +324,18 @@ class ShapeModel:
             raise InputError(f"This model has {self.n_modes} modes, so it cannot be cut to {modes}.")
         return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes])
 
+    def fields(self) -> model_file.ModelFields:
+        """Return what the model is made of, by the names of its arguments."""
+        return cast(model_file.ModelFields, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+
     def save(self, path: Path | str) -> None:
         """Write the model to one HDF5 file, whole or not at all.
 
         Raises:
             FileError: the folder cannot be written, or the disk is full.
         """
-        model_file.save(self, Path(path))
+        model_file.save(self.fields(), Path(path))
+        _IN_FILES.add(self)
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
@@ -322,9 +347,11 @@ class ShapeModel:
         """
         fields = model_file.load(Path(path))
         try:
-            return cls(**fields)
+            model = cls(**fields)
         except InputError as error:
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+        _IN_FILES.add(model)
+        return model
 
     def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
         array = np.atleast_1d(np.asarray(b, dtype=np.float64))

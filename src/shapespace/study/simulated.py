@@ -27,7 +27,8 @@ from shapespace.datasets.simulated_scan import SimulatedScan
 from shapespace.datasets.study_people import StudyPeople
 from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.settings import Level, RobustSettings
+from shapespace.fit.robust_method import Robust
+from shapespace.fit.settings import Level
 from shapespace.geometry.mirror import mirror_vertices, mirrored
 from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel, Told
@@ -43,7 +44,7 @@ Progress: TypeAlias = Callable[[str, int, int], None]
 Job: TypeAlias = tuple[Callable[..., None], tuple[Any, ...]]
 Stage: TypeAlias = tuple[str, Sequence[Job], Sequence[Path]]
 
-SETTINGS = RobustSettings(
+SETTINGS = Robust(
     levels=(
         Level(0, 1_500, 1_000, False, 3, 1.0),
         Level(10, 1_500, 1_000, False, 4, 1.0),
@@ -432,7 +433,7 @@ def _fit_all(
         T: Similarity | None = None
         for fold in order if taught is None or taught[row] else order[:1]:
             shape = models[fold].shape
-            config = FitConfig(unit="mm", robust=SETTINGS)
+            config = FitConfig(SETTINGS, unit="mm")
             since = time.perf_counter()
             # Fits with the models of other folds start at the pose found first; shape and pose are then found anew.
             try:

@@ -1,0 +1,79 @@
+"""What a fitting method is: an object that owns its settings, its loop, its doubts and its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from shapespace.fit.result import Stage
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.start import Start
+from shapespace.fit.state import Fitted, IcpState
+from shapespace.model.shape_model import ShapeModel
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What every method is told of a fit.
+
+    Args:
+        with_scale: whether the pose has a free scale.
+        modes: how many coefficients to report, from the first; None for all.
+        max_iterations: cap of each phase.
+    """
+
+    with_scale: bool
+    modes: int | None
+    max_iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """A fit at its end, to be judged.
+
+    Args:
+        model: the shape space.
+        start: where it began, in the scan's mm frame.
+        fitted: where it ended, in that frame.
+        stages: the surface at each stage, with its distances when they are asked for.
+        phases: the last state of each phase, by its number.
+        size_mm: of the model: RMS distance of its mean from its centre, mm.
+    """
+
+    model: ShapeModel
+    start: Start
+    fitted: Fitted
+    stages: Mapping[str, Stage]
+    phases: Mapping[int, IcpState]
+    size_mm: float
+
+
+class Method(Protocol):
+    """A way to fit a placed model; a frozen dataclass whose fields are its settings."""
+
+    name: ClassVar[str]
+    """By which it is chosen, and called in results."""
+    calibrated: ClassVar[bool]
+    """Whether `b_stddev` was checked against truths (docs/uncertainty.md)."""
+    goes_on_densely: ClassVar[bool]
+    """Whether the surface it ends with can be taken the rest of the way to the scan."""
+
+    def states(
+        self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
+    ) -> Generator[IcpState, None, Fitted]:
+        """Yield the states it goes through, the last of each phase being where that phase ended; return the end.
+
+        Raises:
+            InputError: model or scan lack what it needs.
+            FitError: the fit diverged.
+        """
+        ...
+
+    def doubts(self, ended: Ended) -> list[str]:
+        """Return its own reasons not to trust the fit, most serious first; none where nothing speaks against it."""
+        ...
+
+    def reason(self, ended: Ended) -> str:
+        """Return one sentence on why it ended where it did, of a fit that nothing speaks against."""
+        ...

@@ -1,0 +1,50 @@
+"""The robust fit as a method: its settings, and what is doubted and said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from shapespace.fit.method import Ended, Limits
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.settings import RobustSettings
+from shapespace.fit.start import Start
+from shapespace.fit.state import Fitted, IcpState
+from shapespace.fit.trust import doubts_of_robust
+from shapespace.model.shape_model import ShapeModel
+
+
+@dataclass(frozen=True)
+class Robust(RobustSettings):
+    """Pose and shape at once, from both directions, robustly, with the prior (docs/robust.md).
+
+    Its settings are those of `RobustSettings`.
+    """
+
+    name: ClassVar[str] = "robust"
+    calibrated: ClassVar[bool] = True
+    goes_on_densely: ClassVar[bool] = True
+
+    def states(
+        self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
+    ) -> Generator[IcpState, None, Fitted]:
+        """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
+        from shapespace.fit.robust import robust_icp  # compiled
+
+        return robust_icp(
+            model, scan, start, self,
+            with_scale=limits.with_scale, modes=limits.modes, max_iterations=limits.max_iterations,
+        )  # fmt: skip
+
+    def doubts(self, ended: Ended) -> list[str]:
+        """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""
+        return doubts_of_robust(ended.fitted.evidence)
+
+    def reason(self, ended: Ended) -> str:
+        """Return that it stood still, and how near."""
+        e = ended.fitted.evidence
+        return (
+            f"Pose and shape stood still: what matches lies {e['spread_mm']:.2f} mm apart (robust standard deviation), "
+            f"at {100 * e['model_matched_share']:.0f} % of the model's vertices."
+        )

@@ -1,0 +1,209 @@
+"""The last steps of the search for a start: two-way Gauss-Newton over pose and leading modes, from one pose.
+
+Matches are exact. Residuals have no side, so the winding of triangles does not matter. Weights are those of
+`rigid_search`. The normal equations are its own: those of `robust` find the same poses, at 1.6 times the CPU time of a
+search (docs/architecture.md).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapespace.compiled import compiled
+from shapespace.geometry.kdtree import STACK_SIZE, KdArrays, nearest_one
+from shapespace.types import FloatArray, IntArray
+
+
+class ShapePoints(NamedTuple):
+    """What the shape ICP knows of the model, in the model's frame.
+
+    Args:
+        points: (M, 3) of the mean, mm.
+        normals: (M, 3) unit normals of either side; zero where there is none.
+        modes: (M, 3, K) rows of the basis.
+        precision: (K,) 1 / stddev^2, mm^-2.
+        tree: of `points`.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    modes: FloatArray
+    precision: FloatArray
+    tree: KdArrays
+
+
+@compiled
+def _turn(v: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) about `v` by its length, rad, by Rodrigues' formula."""
+    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    angle = max(np.sqrt((v * v).sum()), 1e-9)
+    return np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * (K @ K)
+
+
+@compiled
+def shape_search(
+    R: FloatArray,
+    t: FloatArray,
+    scale: float,
+    b: FloatArray,
+    shape: ShapePoints,
+    scan: FloatArray,
+    tree: KdArrays,
+    counts: IntArray,
+    reaches: FloatArray,
+    prior: float,
+    scale_precision: float,
+    slack: FloatArray,
+    cap: float,
+    out: FloatArray,
+) -> float:
+    """Run two-way Gauss-Newton over pose and leading modes from one pose, in place, and return the scale it ends at.
+
+    All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
+    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior reach^2 (sum b_k^2 / lam_k + c
+    log(scale)^2), w Geman and McClure's.
+
+    Args:
+        R: (3, 3) rotation from the model's frame to the scan's, replaced.
+        t: (3,) translation, replaced.
+        scale: where it begins.
+        b: (K,) coefficients, replaced, mm.
+        shape: the model.
+        scan: (N, 3) points of the scan, in any order.
+        tree: of the scan's points.
+        counts: (2,) how many of the first points of the model and of the scan look for the other.
+        reaches: (I,) of the weights, for each iteration, mm.
+        prior: weight of the prior.
+        scale_precision: c; infinity holds the scale.
+        slack: (2,) how far a match may lie sideways, model to scan and back, mm.
+        cap: distance beyond which a match counts no more in the score, mm.
+        out: (3,) replaced by: score of the model to the scan, of the scan to the model, mm, and the share of the
+            model's points that have the scan where they are.
+    """
+    n_modes = len(b)
+    size = 7 + n_modes
+    A, g, J, W = np.empty((size, size)), np.empty(size), np.empty((3, size)), np.empty((3, size))
+    stack = np.empty(STACK_SIZE)
+    n_model, n_scan = counts[0], counts[1]
+    guess = np.full(n_model + n_scan, -1, dtype=np.int32)
+    x, q, e, n, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    held = not np.isfinite(scale_precision)
+    for step in range(len(reaches) + 1):
+        last = step == len(reaches)
+        nu = reaches[len(reaches) - 1] ** 2 if last else reaches[step] ** 2
+        A[:], g[:], out[:] = 0.0, 0.0, 0.0
+        seen = 0
+        for i in range(n_model + n_scan):
+            forward = i < n_model
+            if forward:
+                at = i
+                for k in range(3):
+                    x[k] = shape.points[at, k]
+                    for m in range(n_modes):
+                        x[k] += shape.modes[at, k, m] * b[m]
+                for k in range(3):
+                    y[k] = scale * (R[k, 0] * x[0] + R[k, 1] * x[1] + R[k, 2] * x[2]) + t[k]
+                j, _ = nearest_one(tree, y[0], y[1], y[2], guess[i], stack)
+                guess[i] = j
+                for k in range(3):
+                    y[k] = tree.points[tree.place[j], k] - t[k]
+                for k in range(3):
+                    q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
+            else:
+                for k in range(3):
+                    y[k] = scan[i - n_model, k] - t[k]
+                for k in range(3):
+                    q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
+                for k in range(3):
+                    y[k] = q[k]
+                # The tree is of the mean, so the query goes back by the last match's displacement.
+                at = guess[i]
+                if at >= 0:
+                    for k in range(3):
+                        for m in range(n_modes):
+                            y[k] -= shape.modes[at, k, m] * b[m]
+                at, _ = nearest_one(shape.tree, y[0], y[1], y[2], at, stack)
+                guess[i] = at
+                for k in range(3):
+                    x[k] = shape.points[at, k]
+                    for m in range(n_modes):
+                        x[k] += shape.modes[at, k, m] * b[m]
+            along, whole, facing = 0.0, 0.0, 0.0
+            for k in range(3):
+                n[k] = shape.normals[at, k]
+                e[k] = x[k] - q[k]
+                along += n[k] * e[k]
+                whole += e[k] * e[k]
+                facing += n[k] * n[k]
+            if facing == 0.0:
+                along = np.sqrt(whole)
+            sideways = np.sqrt(max(whole - along * along, 0.0))
+            allowed = slack[0] if forward else slack[1]
+            if last:
+                covered = sideways <= allowed
+                d = min(abs(along), cap)
+                if forward:
+                    out[0] += d if covered else cap
+                    out[2] += 1.0 if covered and d < cap else 0.0
+                elif covered:
+                    seen += 1
+                    out[1] += d
+                continue
+            beyond = max(sideways - allowed, 0.0)
+            w = (nu / (nu + along * along + beyond * beyond * 4.0)) ** 2
+            for m in range(n_modes):
+                for k in range(3):
+                    J[k, 7 + m] = shape.modes[at, k, m]
+            J[0, 0], J[0, 1], J[0, 2] = 0.0, q[2], -q[1]
+            J[1, 0], J[1, 1], J[1, 2] = -q[2], 0.0, q[0]
+            J[2, 0], J[2, 1], J[2, 2] = q[1], -q[0], 0.0
+            for k in range(3):
+                for m in range(3):
+                    J[k, 3 + m] = 1.0 if k == m else 0.0
+                J[k, 6] = q[k]
+            eta = 0.1 if facing > 0 else 1.0
+            for p in range(size):
+                dot = n[0] * J[0, p] + n[1] * J[1, p] + n[2] * J[2, p]
+                if facing == 0.0:
+                    dot = 0.0
+                for k in range(3):
+                    W[k, p] = w * (dot * n[k] + eta * J[k, p])
+                g[p] += W[0, p] * e[0] + W[1, p] * e[1] + W[2, p] * e[2]
+            for p in range(size):
+                for r in range(p + 1):
+                    A[p, r] += W[0, p] * J[0, r] + W[1, p] * J[1, r] + W[2, p] * J[2, r]
+        if last:
+            out[0] /= n_model
+            out[2] /= n_model
+            out[1] = out[1] / seen if seen > 0 else cap
+            break
+        for m in range(n_modes):
+            A[7 + m, 7 + m] += prior * nu * shape.precision[m]
+            g[7 + m] += prior * nu * shape.precision[m] * b[m]
+        if held:
+            A[6, :7], A[7:, 6], A[6, 6], g[6] = 0.0, 0.0, 1.0, 0.0
+        else:
+            A[6, 6] += prior * nu * scale_precision
+            g[6] += prior * nu * scale_precision * np.log(scale)
+        for p in range(6):
+            A[p, p] += 1e-6 * (A[p, p] + 1.0)
+        for p in range(size):
+            for r in range(p):
+                A[r, p] = A[p, r]
+        g[:] = np.linalg.solve(A, g)
+        angle = np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2)
+        # A step of Gauss-Newton is only good nearby.
+        shrink = min(1.0, 0.35 / max(angle, 1e-12))
+        R[:] = R @ _turn(-shrink * g[:3])
+        if not held:
+            scale *= np.exp(max(min(-g[6] * shrink, 0.1), -0.1))
+            scale = max(min(scale, 1.6), 0.6)
+        for k in range(3):
+            t[k] -= shrink * scale * (R[k, 0] * g[3] + R[k, 1] * g[4] + R[k, 2] * g[5])
+        for m in range(n_modes):
+            b[m] -= shrink * g[7 + m]
+            limit = 3.0 / np.sqrt(shape.precision[m])
+            b[m] = max(min(b[m], limit), -limit)
+    return scale

@@ -1,0 +1,91 @@
+"""Arrays that a later run would otherwise make again, kept in the user's cache folder up to a bound.
+
+Each file is written whole under a name that says what it was made of: a SHA-256 in hexadecimal, and after it the `.npz`
+that it is of. What is damaged, or cannot be read or written, counts as not there: whoever asks makes it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from platformdirs import user_cache_path
+
+from shapespace.errors import FileError
+from shapespace.io.files import atomic_path
+
+MOST_BYTES = 500_000_000
+"""The files used last stay below this together."""
+_FOLDER = "kept"
+_DIGEST_BYTES = 64
+_OFF = ("no", "off", "0")
+
+
+def cache_folder() -> Path:
+    """Return the folder of downloads and kept arrays: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
+    named = os.environ.get("SHAPESPACE_CACHE")
+    return Path(named) if named else user_cache_path("shapespace")
+
+
+def _file(name: str) -> Path | None:
+    if os.environ.get("SHAPESPACE_KEEP", "").lower() in _OFF:
+        return None
+    return cache_folder() / _FOLDER / f"{name}.kept"
+
+
+def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
+    """Return the arrays kept as `name`; None where there are none, or none that are whole."""
+    path = _file(name)
+    if path is None:
+        return None
+    try:
+        with path.open("rb") as stream:
+            said = stream.read(_DIGEST_BYTES)
+            if hashlib.file_digest(stream, "sha256").hexdigest().encode() != said:
+                return None
+            stream.seek(_DIGEST_BYTES)
+            with np.load(stream, allow_pickle=False) as stored:
+                arrays = {key: np.asarray(stored[key]) for key in stored.files}
+    except (OSError, ValueError):
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # what is used is the last to go
+    return arrays
+
+
+def keep(name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Keep `arrays` as `name`, and drop what was used longest ago beyond `MOST_BYTES`; no folder is no error."""
+    path = _file(name)
+    if path is None or sum(array.nbytes for array in arrays.values()) > MOST_BYTES:
+        return
+    with contextlib.suppress(OSError, FileError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary, temporary.open("w+b") as stream:
+            stream.write(b"0" * _DIGEST_BYTES)
+            stored: dict[str, Any] = dict(arrays)  # savez has keywords of its own type
+            np.savez(stream, **stored)
+            stream.seek(_DIGEST_BYTES)
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            stream.seek(0)
+            stream.write(digest.encode())
+        _drop_oldest(path.parent)
+
+
+def _drop_oldest(folder: Path) -> None:
+    found: list[tuple[float, int, Path]] = []
+    for file in folder.iterdir():
+        with contextlib.suppress(OSError):  # another process dropped it first
+            about = file.stat()
+            found.append((about.st_mtime, about.st_size, file))
+    total = 0
+    for _, size, file in sorted(found, reverse=True):
+        total += size
+        if total > MOST_BYTES:
+            with contextlib.suppress(OSError):
+                file.unlink()

@@ -1,0 +1,67 @@
+"""Modes that no shape made: what the alignment left of itself, and what is finer than the meshes are written.
+
+Procrustes takes out of the shapes what a similarity does to the mean, to first order. What remains to second order
+comes out of PCA as faint modes that lie in the tangent of the similarity group at the mean: there a fit cannot tell
+them from its pose. Sources: Goodall, JRSS B 53(2), 1991, section 4; for the edge of a spectrum of pure noise Marchenko
+and Pastur, Math. USSR-Sbornik 1(4), 1967.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.geometry.procrustes import Gauge
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray
+
+_TANGENT_SHARE = 0.1
+"""Modes of shapes lie in the tangent by less than a fiftieth; those of alignment by a third and more, unless mixed."""
+_COARSE = 2.0
+"""Rounding to one of two neighbours spreads almost twice as far as rounding over a whole step."""
+_MOST_DECIMALS = 6
+_ROUNDING = 1e-14
+
+
+def made_by_alignment(
+    mean_vertices: FloatArray, vertex_basis: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None
+) -> BoolArray:
+    """Return which modes (K,) lie in the tangent of the group that the shapes were aligned by.
+
+    Args:
+        mean_vertices: (V, 3) mm.
+        vertex_basis: (3V, K), orthonormal.
+        gauge: `form`, rigid motions; `shape`, similarities.
+        alignment_vertices: indices of those that carried the alignment; None for all.
+    """
+    used = np.arange(len(mean_vertices)) if alignment_vertices is None else np.unique(alignment_vertices)
+    x = mean_vertices[used]
+    moves = [np.cross(axis, x) for axis in np.eye(3)] + [np.broadcast_to(axis, x.shape) for axis in np.eye(3)]
+    if gauge == "shape":
+        moves.append(x - x.mean(axis=0))
+    tangent = np.linalg.qr(np.stack([move.ravel() for move in moves], axis=1))[0]
+    rows = (3 * used[:, None] + np.arange(3)).ravel()
+    return ((tangent.T @ vertex_basis[rows]) ** 2).sum(axis=0) > _TANGENT_SHARE
+
+
+def below_precision(variance: FloatArray, n: int, coordinates: int, rounding_mm: float) -> BoolArray:
+    """Return which of the variances (K,), mm^2, n shapes of that many coordinates can have by rounding alone."""
+    return variance <= (_COARSE * rounding_mm * (1.0 + np.sqrt(coordinates / max(n - 1, 1)))) ** 2
+
+
+def rounding_mm(vertices: FloatArray) -> float:
+    """Return the standard deviation of the rounding with which coordinates (V, 3), mm, were written; 0 if not seen.
+
+    They may have been written in any unit, as decimals or in single precision.
+    """
+    found = 0.0
+    for mm in MM_PER_UNIT.values():
+        y = vertices / mm
+        near = np.maximum(np.abs(y), 1e-300) * _ROUNDING
+        for decimals in range(_MOST_DECIMALS + 1):
+            step = 10.0**-decimals
+            if (np.abs(y - np.rint(y / step) * step) <= near + _ROUNDING).all():
+                found = max(found, step * mm / np.sqrt(12.0))
+                break
+        single = y.astype(np.float32)
+        if (np.abs(y - single) <= near).all():
+            found = max(found, float(np.sqrt((np.spacing(np.abs(single)).astype(np.float64) ** 2).mean() / 12.0)) * mm)
+    return found

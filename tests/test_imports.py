@@ -1,0 +1,13 @@
+from graphlib import TopologicalSorter
+
+import grimp
+
+
+def test_no_modules_import_each_other_in_a_circle_not_even_for_their_types() -> None:
+    graph = grimp.build_graph("shapespace", exclude_type_checking_imports=False, cache_dir=None)
+    # Its type only, and about to go.
+    graph.remove_import(importer="shapespace.fit.posterior", imported="shapespace.fit.robust")
+    # The package itself names what it offers for type checkers, and loads none of it.
+    modules = graph.modules - {"shapespace"}
+    assert len(modules) > 100
+    TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in modules}).prepare()
