@@ -134,6 +134,9 @@ def build(
             seed=settings.seed,
         )
         model.save(output)
+    if model.left_out:
+        what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
+        notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
     return model, notes
 
 
