@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from shapespace.batch.results import (
     Source,
@@ -101,6 +102,57 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
     assert header[-1] == "model_hash"
     assert {row["model_hash"] for row in rows} == {MODEL.content_hash}
     assert all(not rows[1][name] for name in header[3:-1])
+
+
+def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Path) -> None:
+    half = raw_scan(np.array([0.5, -0.5, 1.0, 0.0, 0.3]), similarity(2, 10.0, 1.3), keep=0.0, noise_mm=0.1).scan
+    fit = fit_scan(blob_model(), half, FitConfig())
+    record = fit_record(fit, SCAN, MODEL)
+    shown, in_scan = record["shown"], record["shown_scan_mm"]
+    assert 0.3 < shown["model_seen_share"] < 0.7 and shown["scan_covered_share"] > 0.8
+    # Half of the model lies where the scan shows nothing, which is no fault of the fit.
+    every = record["distances_mm"]["final"]["model_to_scan"]
+    assert shown["model_to_scan"]["mean"] < 0.2 * every["mean"] and shown["model_to_scan"]["count"] < every["count"]
+    size = fit.T_scan_model.scale * fit.mm_per_scan_unit
+    assert not 0.95 < size < 1.05
+    for direction in ("model_to_scan", "scan_to_model"):
+        assert set(shown[direction]) == {*SUMMARY, "fraction"}
+        for length in SUMMARY - {"count"}:
+            assert in_scan[direction][length] == pytest.approx(size * shown[direction][length])
+        assert in_scan[direction]["count"] == shown[direction]["count"]
+    row = coefficient_row("one", record)
+    for direction in ("model_to_scan", "scan_to_model"):
+        for measure in ("mean", "median"):
+            assert row[f"shown_{direction}_{measure}_mm"] == shown[direction][measure]
+        assert row[f"shown_{direction}_mean_scan_mm"] == in_scan[direction]["mean"]
+    assert row["model_seen_share"] == shown["model_seen_share"]
+    write_coefficients(tmp_path / "c.csv", [row], 5)
+    with (tmp_path / "c.csv").open(newline="") as stream:
+        (cells,) = csv.DictReader(stream)
+    assert set(row) == set(cells)
+    assert all(cells[key] == str(value) for key, value in row.items() if key != "reason")
+
+
+def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp_path: Path) -> None:
+    record = fit_record(result, Source.at(tmp_path / "scans" / "raw.ply", "a", tmp_path / "out"), MODEL)
+    row = coefficient_row("one", record)
+    turn = np.radians([row[f"rotation_{axis}_deg"] for axis in "xyz"])
+    assert np.allclose(Rotation.from_rotvec(turn).as_matrix(), result.T_scan_model.rotation)
+    assert [row[f"translation_{axis}"] for axis in "xyz"] == result.T_scan_model.translation.tolist()
+    assert row["scale"] == result.T_scan_model.scale
+    surface = result.surface().vertices * result.mm_per_scan_unit
+    assert row["size_mm"] == pytest.approx(np.sqrt(((surface - surface.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    assert row["path"] == "../scans/raw.ply"
+    for key in ("expected_error_mm", "beyond_model_mm"):
+        assert row[key] == result.evidence[key]
+
+
+def test_a_record_of_an_earlier_version_still_makes_a_row(result: FitResult) -> None:
+    record = fit_record(result, SCAN, MODEL)
+    for key in ("shown", "shown_scan_mm", "size_mm"):
+        del record[key]
+    row = coefficient_row("one", record)
+    assert row["b1"] == result.b[0] and "model_seen_share" not in row
 
 
 def test_names_that_look_like_formulas_are_made_harmless(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 import csv
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from shapespace.batch import run
 from shapespace.batch.run import EXECUTORS, Job, fit_files, make_executor, make_jobs
-from shapespace.errors import FileError
+from shapespace.errors import FileError, FitError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -137,12 +138,182 @@ def test_a_worker_without_a_model_says_so(model: ShapeModel, scans: list[Path], 
         fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, executor=executor)
 
 
-def test_scans_of_the_same_name_get_names_of_their_own() -> None:
-    scans = [Path(p) for p in ("a/face.ply", "b/face.obj", "face_2.ply", "c/face.ply", "x.tar.ply", ".ply")]
-    names = [job.name for job in make_jobs(scans)]
-    assert len(set(names)) == len(names)
-    assert names[:2] == ["face", "face_2"]
+def test_each_scan_is_called_by_its_file_where_no_other_has_that_name() -> None:
+    scans = [Path(p) for p in ("a/face.ply", "b/other.obj", "face_2.ply", "x.tar.ply", ".ply")]
+    assert [job.name for job in make_jobs(scans)] == ["face", "other", "face_2", "x.tar", ".ply"]
     assert [job.scan for job in make_jobs(scans)] == scans
+
+
+SAME = (
+    "a/face.ply",
+    "b/face.ply",
+    "b/face.obj",
+    "x/b/Face.ply",
+    "x_b/face.ply",
+    "y/b/hand.ply",
+    "y/c/hand.ply",
+    "z/y_c_hand.ply",
+    "b_hand.ply",
+)
+
+
+def test_scans_of_the_same_name_are_told_apart_by_their_path_in_any_order(tmp_path: Path) -> None:
+    scans = [tmp_path / name for name in SAME]
+    names = dict(zip(scans, (job.name for job in make_jobs(scans)), strict=True))
+    assert len({name.casefold() for name in names.values()}) == len(names)
+    assert all(name.endswith(("face", "Face", "face.ply", "Face.ply", "face.obj")) for name in list(names.values())[:5])
+    assert (names[scans[-1]], names[scans[-2]]) == ("b_hand", "y_c_hand"), "a name that stands alone keeps it"
+    assert all(name.endswith(("_y_b_hand", "_y_c_hand")) for name in list(names.values())[5:7])
+    for order in (reversed(scans), np.random.default_rng(0).permutation(np.array(scans, dtype=object)).tolist()):
+        again = list(order)
+        assert dict(zip(again, (job.name for job in make_jobs(again)), strict=True)) == names
+    # The same file by another way is the same scan.
+    assert [job.name for job in make_jobs([scans[0], scans[0].parent / ".." / "a" / "face.ply"])] == ["face", "face"]
+
+
+def test_names_do_not_change_when_scans_of_the_same_name_are_added(
+    model: ShapeModel, scans: list[Path], tmp_path: Path
+) -> None:
+    paths = [tmp_path / folder / "face.ply" for folder in ("a", "b", "c")]
+    for path, scan in zip(paths, scans, strict=True):
+        path.parent.mkdir()
+        path.write_bytes(scan.read_bytes())
+    out = tmp_path / "out"
+    for given in ([paths[0]], [paths[1], paths[0]], [paths[2], paths[1], paths[0]], paths):
+        fit_files(make_jobs(given, folder=out), model, Path("m"), out, CONFIG, resume=True)
+    assert sorted(row["scan"] for row in table(out)) == ["b_face", "c_face", "face"]
+    assert {row["scan"]: row["path"] for row in table(out)} == {
+        "face": "../a/face.ply", "b_face": "../b/face.ply", "c_face": "../c/face.ply",
+    }  # fmt: skip
+    # A scan that was moved is still the same.
+    paths[0].rename(tmp_path / "face.ply")
+    assert [job.name for job in make_jobs([tmp_path / "face.ply"], folder=out)] == ["face"]
+    # Another one in its place is not, though the name would be free.
+    (tmp_path / "face.ply").write_bytes(scans[1].read_bytes())
+    assert [job.name for job in make_jobs([tmp_path / "face.ply"], folder=out)] != ["face"]
+
+
+def test_a_scan_given_twice_is_fitted_once(
+    model: ShapeModel, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = count_fits(monkeypatch)
+    records = fit_files(make_jobs([scans[0], scans[1], scans[0]]), model, Path("m"), tmp_path, CONFIG)
+    assert calls == ["scan0", "scan1"]
+    assert [record["scan"]["name"] for record in records] == ["scan0.ply", "scan1.ply", "scan0.ply"]
+    assert [row["scan"] for row in table(tmp_path)] == ["scan0", "scan1"]
+
+
+def count_fits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    calls: list[str] = []
+    original = run.fit_file
+    monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
+    return calls
+
+
+@pytest.mark.parametrize("resume", [True, False])
+def test_further_scans_are_added_to_the_table_and_the_same_replaced(
+    resume: bool, model: ShapeModel, scans: list[Path], tmp_path: Path
+) -> None:
+    fit_files(make_jobs(scans[1:]), model, Path("m"), tmp_path, CONFIG)
+    before = {row["scan"]: row for row in table(tmp_path)}
+    assert list(before) == ["scan1", "scan2"]
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, resume=resume)
+    after = {row["scan"]: row for row in table(tmp_path)}
+    assert list(after) == ["scan1", "scan2", "scan0"]
+    assert {name: after[name] for name in before} == before
+    fit_files(make_jobs(scans[1:2]), model, Path("m"), tmp_path, FitConfig(max_iterations=2), resume=resume)
+    replaced = {row["scan"]: row for row in table(tmp_path)}
+    assert list(replaced) == ["scan0", "scan2", "scan1"]
+    assert replaced["scan1"]["b1"] != before["scan1"]["b1"] and replaced["scan2"] == before["scan2"]
+    # A row whose record is gone goes too.
+    (tmp_path / "scan2.fit.json").unlink()
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, resume=resume)
+    assert [row["scan"] for row in table(tmp_path)] == ["scan1", "scan0"]
+    assert len(table(tmp_path)) == len(list(tmp_path.glob("*.fit.json")))
+
+
+def test_fits_of_a_smaller_model_do_not_cut_the_table(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG)
+    fit_files(make_jobs(scans[1:2]), model.truncate(3), Path("m"), tmp_path, CONFIG)
+    rows = {row["scan"]: row for row in table(tmp_path)}
+    assert rows["scan0"]["b5"] and rows["scan1"]["b3"] and not rows["scan1"]["b4"]
+    assert rows["scan0"]["model_hash"] != rows["scan1"]["model_hash"]
+
+
+def test_damaged_records_of_earlier_runs_do_not_stop_a_fit(
+    model: ShapeModel, scans: list[Path], tmp_path: Path
+) -> None:
+    for name, content in (("x", "{"), ("y", '{"format": "shapespace fit", "scan": 3, "b": [1]}')):
+        (tmp_path / f"{name}.fit.json").write_text(content)
+    fit_files(make_jobs(scans[:1], folder=tmp_path), model, Path("m"), tmp_path, CONFIG)
+    assert [row["scan"] for row in table(tmp_path)] == ["scan0"]
+
+
+def test_an_interruption_waits_for_what_runs_and_the_table_has_it(
+    model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
+) -> None:
+    def stop(job: Job, record: Mapping[str, Any]) -> None:
+        raise KeyboardInterrupt
+
+    many = [tmp_path / f"s{k}.ply" for k in range(12)]
+    for k, path in enumerate(many):
+        path.write_bytes(scans[k % 3].read_bytes())
+    out = tmp_path / "out"
+    with make_executor(model_path, 3, "threads") as executor, pytest.raises(KeyboardInterrupt):
+        fit_files(make_jobs(many), model, model_path, out, CONFIG, executor=executor, on_done=stop)
+    records = {path.name.removesuffix(".fit.json") for path in out.glob("*.fit.json")}
+    assert 2 <= len(records) < 12, "the others were running when it stopped"
+    assert {row["scan"] for row in table(out)} == records
+
+
+class KillsOne(ThreadPoolExecutor):
+    """Runs all fits, and then has lost the first worker."""
+
+    def submit(self, *arguments: Any, **options: Any) -> Any:
+        future = super().submit(*arguments, **options)
+        future.result()
+        lost: Future[Any] = Future()
+        lost.set_exception(BrokenExecutor("A process was terminated abruptly."))
+        return lost
+
+
+def test_what_was_written_before_a_worker_was_killed_is_in_the_table(
+    model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
+) -> None:
+    run._load_model(model_path)
+    with KillsOne(1) as executor, pytest.raises(FitError, match="--resume"):
+        fit_files(make_jobs(scans), model, model_path, tmp_path, CONFIG, executor=executor)
+    assert [row["scan"] for row in table(tmp_path)] == ["scan0", "scan1", "scan2"]
+
+
+DENSE = replace(CONFIG, dense=True)
+
+
+@pytest.mark.parametrize(("first", "then", "refitted"), [
+    ((DENSE, False), (CONFIG, True), True),
+    ((CONFIG, True), (DENSE, False), True),
+    ((DENSE, True), (CONFIG, False), False),
+    ((DENSE, False), (CONFIG, False), False),
+    ((CONFIG, False), (CONFIG, True), True),
+])  # fmt: skip
+def test_resume_takes_nothing_away_that_still_holds(
+    first: tuple[FitConfig, bool], then: tuple[FitConfig, bool], refitted: bool, model: ShapeModel,
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    jobs = make_jobs(scans[:1])
+    fit_files(jobs, model, Path("m"), tmp_path, first[0], stages=first[1])
+    before = {path.name for path in tmp_path.iterdir()}
+    calls = count_fits(monkeypatch)
+    (record,) = fit_files(jobs, model, Path("m"), tmp_path, then[0], stages=then[1], resume=True)
+    after = {path.name for path in tmp_path.iterdir()}
+    assert bool(calls) == refitted and before <= after
+    assert ("scan0.dense.ply" in after) == record["config"]["dense"] == (first[0].dense or then[0].dense)
+    assert ("scan0.stages.npz" in after) == (first[1] or then[1])
+    # Of another scan it would be wrong.
+    scan = tmp_path / "scan0.ply"
+    scan.write_bytes(scans[1].read_bytes())
+    fit_files([Job("scan0", scan)], model, Path("m"), tmp_path, CONFIG, resume=True)
+    assert not (tmp_path / "scan0.dense.ply").exists() and not (tmp_path / "scan0.stages.npz").exists()
 
 
 def test_a_folder_that_cannot_be_made_is_named(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:

@@ -5,12 +5,16 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
+import numba
 import pytest
 
 from shapespace.batch import workers
-from shapespace.batch.warm import COMPILING, warm_up
+from shapespace.batch.progress import telling_of_compiling
+from shapespace.batch.warm import COMPILING
 from shapespace.compiled import on_compiling
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="workers are copies of a server on Linux alone")
@@ -129,8 +133,16 @@ def test_code_is_kept_elsewhere_or_nowhere_where_its_folder_cannot_be_written(tm
         assert any(home.rglob("*.nbi")) if home.parent == tmp_path else not home.exists()
 
 
-def test_quiet_or_without_a_terminal_nothing_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert not workers.may_tell(quiet=True) and not workers.may_tell(quiet=False)
-    warm_up(tell=True)
-    said = capsys.readouterr().err
-    assert said in ("", COMPILING + "\n")
+def test_compiling_is_told_in_a_log_too_unless_asked_not_to(capsys: pytest.CaptureFixture[str]) -> None:
+    assert not sys.stderr.isatty()
+    with telling_of_compiling(quiet=False):
+        fresh()(1.0)
+    assert capsys.readouterr().err == COMPILING + "\n"
+    with telling_of_compiling(quiet=True):
+        fresh()(1.0)
+    assert capsys.readouterr().err == ""
+
+
+def fresh() -> Callable[[float], float]:
+    """Return a loop that no cache has."""
+    return cast(Any, numba).njit(lambda x: x + 1.0)

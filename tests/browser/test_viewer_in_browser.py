@@ -197,6 +197,8 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     assert "broken" in tab.page.get_by_test_id("fit-detail").inner_text()
     tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
     tab.page.wait_for_timeout(800)
+    told = tab.page.get_by_test_id("fit-detail").get_by_test_id("shown").inner_text()
+    assert "mean where the scan shows it" in told and "mean where the model covers it" in told
     shown = view(tab)
     assert drawn_share(shown) > 0.1
     tab.shot("holes")

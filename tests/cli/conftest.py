@@ -9,6 +9,8 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
+from shapespace.batch import progress
+from shapespace.batch.warm import COMPILING
 from shapespace.cli import main
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
@@ -53,8 +55,9 @@ Run = Callable[..., Outcome]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run one command line in this process."""
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run one command line in this process, with no word on what takes long: machines differ in that."""
+    monkeypatch.setattr(progress, "TOLD_AFTER_S", 3600.0)
 
     def run(*arguments: object) -> Outcome:
         capsys.readouterr()
@@ -64,7 +67,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
             code = int(stop.code or 0)
         printed = capsys.readouterr()
         assert "Traceback" not in printed.out + printed.err
-        return Outcome(code, printed.out, printed.err)
+        return Outcome(code, printed.out, printed.err.replace(f"{COMPILING}\n", ""))
 
     return run
 
@@ -112,6 +115,11 @@ def raw(z: FloatArray = Z[0], *, seed: int = 0, degrees: float = 8.0) -> Mesh:
 def scan_mesh() -> Mesh:
     """The first scan of the world as it was written."""
     return raw(Z[0], seed=0)
+
+
+def without_waiting(said: str) -> str:
+    """Return standard error without lines on what is waited for, which depend on the machine."""
+    return "".join(line for line in said.splitlines(keepends=True) if not line.endswith(" ...\n"))
 
 
 def leftovers(folder: Path) -> list[str]:

@@ -136,7 +136,7 @@ class _Killed(Executor):
 def test_workers_that_are_killed_end_in_one_sentence(
     run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.commands.make_executor", lambda *_: _Killed())
+    monkeypatch.setattr("shapespace.commands.fit.make_executor", lambda *_: _Killed())
     outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--jobs", 2)
     assert outcome.code == 2
     assert "fewer --jobs" in outcome.sentence() and "--resume" in outcome.err
@@ -162,7 +162,7 @@ def test_too_little_memory_to_build_ends_in_one_sentence(
     def exhausted(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("shapespace.commands.ShapeModel.fit", exhausted)
+    monkeypatch.setattr("shapespace.commands.build.ShapeModel.fit", exhausted)
     outcome = run("build", world.meshes, "-o", tmp_path / "m.h5")
     assert outcome.code == 2 and "not enough memory" in outcome.err
     assert not list(tmp_path.iterdir())
@@ -182,7 +182,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
             raise KeyboardInterrupt
         return read_mesh(path)
 
-    for module in ("shapespace.commands", "shapespace.batch.run"):
+    for module in ("shapespace.commands.build", "shapespace.commands.look", "shapespace.batch.run"):
         monkeypatch.setattr(f"{module}.read_mesh", interrupted)
     arguments: dict[str, tuple[object, ...]] = {
         "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),
@@ -191,7 +191,8 @@ def test_ctrl_c_ends_with_130_and_whole_files(
     }
     outcome = run(*arguments[command])
     assert outcome.code == 130
-    assert outcome.err.splitlines()[-1] == "shapespace: stopped; the files written so far are whole."
+    goes_on = "; the same command with --resume goes on from there" if command == "fit" else ""
+    assert outcome.err.splitlines()[-1] == f"shapespace: stopped; the files written so far are whole{goes_on}."
     assert leftovers(tmp_path) == []
     if command == "fit":
         assert {path.name for path in tmp_path.iterdir()} == {

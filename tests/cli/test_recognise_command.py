@@ -37,7 +37,8 @@ def make_results(folder: Path, people: int, seed: int, model_hash: str = HASH) -
             record = {
                 "format": "shapespace fit", "format_version": 1, "scan": {"name": f"{fit}.ply", "hash": "x"},
                 "model": {"name": "m.h5", "hash": model_hash}, "status": "converged", "reason": "Fine.",
-                "b": z.tolist(), "z": z.tolist(), "b_stddev": [0.1] * 4, "T_scan_model": {"scale": 1.0},
+                "b": z.tolist(), "z": z.tolist(), "b_stddev": [0.1] * 4,
+                "T_scan_model": {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0] * 3},
                 "mm_per_scan_unit": 1.0, "distances_mm": {"final": final},
             }  # fmt: skip
             write_record(folder / f"{fit}.fit.json", record)

@@ -337,6 +337,21 @@ def test_the_reference_lists_every_key_of_a_fit_record() -> None:
     assert sorted(written) == sorted(record)
 
 
+def test_the_reference_lists_every_column_of_the_table(tmp_path: Path) -> None:
+    from shapespace.batch.results import write_coefficients
+
+    write_coefficients(tmp_path / "c.csv", [], 2)
+    header = (tmp_path / "c.csv").read_text().strip().split(",")
+    written: list[str] = []
+    for row in rows(ROOT / "docs" / "cli.md", "coefficients.csv"):
+        for name in code_in(row[0]):
+            if name.startswith("..."):
+                written += [f"{way}{name.removeprefix('...')}" for way in ("model_to_scan", "scan_to_model")]
+            else:
+                written.append(name.replace("K", "2"))
+    assert sorted(written) == sorted(header)
+
+
 def test_the_model_file_holds_what_its_document_lists(tmp_path: Path) -> None:
     import h5py
 

@@ -11,6 +11,7 @@ from shapespace.errors import CorrespondenceError, FileError, InputError, ModelF
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.hdf5 import write_hdf5
 from shapespace.model.choose_modes import choose_modes
+from shapespace.model.pca import principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, similarity, training_meshes
@@ -449,6 +450,33 @@ def test_the_choice_of_modes_is_the_smallest_within_one_standard_error_of_the_be
     # Hidden vertices cannot be told better than their own noise, sqrt(8 / pi) of its deviation in three dimensions.
     assert 0.5 * np.sqrt(8 / np.pi) < choice.error_mm[best] < 1.3
     assert choice.error_mm[0] > 2 * choice.error_mm[best]
+
+
+def plain_error_curve(data: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """Return the mean error of hidden vertices by one model a fold, written out."""
+    (n, d), rng = data.shape, np.random.default_rng(0)
+    errors = np.zeros((n, len(candidates)))
+    for held_out in np.array_split(rng.permutation(n), 5):
+        pc = principal_components(np.delete(data, held_out, axis=0))
+        shown = np.zeros(d // 3, dtype=bool)
+        shown[rng.permutation(d // 3)[: d // 6]] = True
+        seen = np.repeat(shown, 3)
+        for column, k in enumerate(np.minimum(candidates, len(pc.variance))):
+            noise = max((pc.total_variance - pc.variance[:k].sum()) / (d - k), 1e-6 * pc.variance[0] / d)
+            P = pc.basis[seen, :k]
+            for i in held_out:
+                b = np.linalg.solve(P.T @ P + noise * np.diag(1 / pc.variance[:k]), P.T @ (data[i] - pc.mean)[seen])
+                wrong = (data[i] - pc.mean - pc.basis[:, :k] @ b)[~seen].reshape(-1, 3)
+                errors[i, column] = np.linalg.norm(wrong, axis=1).mean()
+    return errors.mean(axis=0)
+
+
+@pytest.mark.parametrize("rank", [4, 40])
+def test_the_errors_that_choose_the_modes_are_those_of_one_model_a_fold(rank: int) -> None:
+    rng = np.random.default_rng(7)
+    data = 30.0 + rng.standard_normal((27, rank)) * np.geomspace(50, 0.5, rank) @ rng.standard_normal((rank, 300))
+    choice = choose_modes(data)
+    np.testing.assert_allclose(choice.error_mm, plain_error_curve(data, choice.candidates), rtol=1e-6, atol=1e-9)
 
 
 def test_modes_for_a_share_that_the_kept_modes_do_not_reach_are_none():

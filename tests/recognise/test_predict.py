@@ -198,7 +198,8 @@ def record(name, status="converged", z=(1.0, 2.0)):
         return failed_record(Source(f"{name}.ply", "x"), Source("m.h5", HASH), "It is empty.", {})
     return {
         "scan": {"name": f"{name}.ply"}, "model": {"hash": HASH}, "status": status, "reason": "Fine.", "b": list(z),
-        "z": list(z), "b_stddev": list(z), "T_scan_model": {"scale": 1.0}, "mm_per_scan_unit": 1.0,
+        "z": list(z), "b_stddev": list(z), "mm_per_scan_unit": 1.0,
+        "T_scan_model": {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0] * 3},
         "distances_mm": {"final": {d: dict.fromkeys(("mean", "median", "rms", "p95", "max", "count"), 0.0)
                                    for d in ("model_to_scan", "scan_to_model")}},
     }  # fmt: skip

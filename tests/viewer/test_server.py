@@ -61,6 +61,8 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_does(
     assert set(kinds[3:-2]) == {"state"} and len(kinds) > 8
     verdict = events[-2]
     assert verdict["status"] == "converged" and verdict["pictured"]
+    assert 0 < verdict["shown"]["model_to_scan"]["mean"] < 1 and verdict["shown"]["model_seen_share"] > 0.9
+    assert verdict["shown_scan_mm"]["scan_to_model"]["mean"] > 0
 
     fit_file(Job("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
     expected = json.loads((tmp_path / "cli.fit.json").read_text())
@@ -348,6 +350,20 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("d", "unreadable"),
         ("e", "unreadable"),
     ]
+
+
+def test_the_list_of_fits_tells_what_scan_and_model_both_show(fits: Path) -> None:
+    record = json.loads((fits / "a.fit.json").read_text())
+    older = {key: value for key, value in record.items() if key not in ("shown", "shown_scan_mm")}
+    (fits / "older.fit.json").write_text(json.dumps(older))
+    (fits / "odd.fit.json").write_text(json.dumps(record | {"shown": {"model_to_scan": 3}}))
+    rows = {row["name"]: row for row in Shown.open(fits).fit_list()}
+    for key in ("shown", "shown_scan_mm"):
+        for way in ("model_to_scan", "scan_to_model"):
+            assert rows["a"][key][way] == {name: record[key][way][name] for name in ("mean", "p95")}
+        assert rows["a"][key]["model_seen_share"] == record["shown"]["model_seen_share"]
+    assert rows["older"]["shown"] is None and rows["older"]["status"] == "converged"
+    assert rows["odd"]["status"] == "unreadable" and rows["c"]["shown"] is None
 
 
 def test_doubt_comes_first_and_then_the_error_a_fit_expects(fits: Path, model: ShapeModel) -> None:

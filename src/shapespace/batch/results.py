@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,6 +18,7 @@ from shapespace import __version__
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
+from shapespace.geometry.surface import rms_size
 from shapespace.io.files import atomic_path, read_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -25,7 +26,22 @@ from shapespace.model.shape_model import ShapeModel
 RECORD_FORMAT = "shapespace fit"
 RECORD_VERSION = 1
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
+_SHARES = ("model_seen_share", "scan_covered_share")
+_EXPECTED = ("expected_error_mm", "beyond_model_mm")
+_AXES = "xyz"
+_TOLD_OF_FITS = (
+    *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
+    *_SHARES,
+    *(f"shown_{direction}_mean_scan_mm" for direction in _DIRECTIONS),
+    "path",
+    *_EXPECTED,
+    "size_mm",
+    *(f"rotation_{axis}_deg" for axis in _AXES),
+    *(f"translation_{axis}" for axis in _AXES),
+)
+"""Columns that stand before the last, `model_hash`, so that those that were there earlier keep their order."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +84,7 @@ def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source
         "landmarks": landmarks.as_dict() if landmarks else None,
         "status": result.status,
         "reason": result.reason,
+        **_shown(result),
         "method": result.method,
         "config": dict(result.config),
         "start": result.start,
@@ -78,6 +95,7 @@ def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source
             "translation": T.translation.tolist(),
         },
         "mm_per_scan_unit": result.mm_per_scan_unit,
+        "size_mm": rms_size(result.surface().vertices) * result.mm_per_scan_unit,
         "b": result.b.tolist(),
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
@@ -99,6 +117,16 @@ def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source
         "seconds": dict(result.seconds),
         "version": __version__,
     }
+
+
+def _shown(result: FitResult) -> dict[str, Any]:
+    """Return the distances over what scan and model both show, in mm of the model's frame and of the scan."""
+    told: dict[str, Any] = {}
+    for key, stage in (("shown", "final"), ("shown_dense", "dense")):
+        if stage in result.stages:
+            shown = result.shown_at(stage)
+            told |= {key: asdict(shown), f"{key}_scan_mm": asdict(shown.in_unit(result.scan_mm_per_model_mm))}
+    return told
 
 
 def failed_record(scan: Source, model: Source, reason: str, config: Mapping[str, Any]) -> dict[str, Any]:
@@ -153,22 +181,45 @@ def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
 
 
 def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of coefficients.csv for `record`; a failed scan has its reason and no numbers."""
+    """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers."""
     row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
-    row["model_hash"] = record["model"]["hash"]
+    row |= {"model_hash": record["model"]["hash"], "path": record["scan"].get("path", "")}
     if "b" not in record:
         return row
     for letter in ("b", "z"):
         row |= {f"{letter}{k}": value for k, value in enumerate(record[letter], 1)}
     final = record["distances_mm"]["final"]
-    for direction in ("model_to_scan", "scan_to_model"):
-        for measure in _DISTANCE_COLUMNS:
-            unit = "" if measure == "count" else "_mm"
-            row[f"{direction}_{measure}{unit}"] = final[direction][measure]
-    row["scale"] = record["T_scan_model"]["scale"]
-    row["mm_per_scan_unit"] = record["mm_per_scan_unit"]
+    for direction in _DIRECTIONS:
+        row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
+    row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
+    row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
     row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
-    return row
+    return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
+
+
+def _distance_column(direction: str, measure: str) -> str:
+    return f"{direction}_{measure}" + ("" if measure == "count" else "_mm")
+
+
+def _shown_cells(record: Mapping[str, Any]) -> dict[str, Any]:
+    if "shown" not in record:  # of a fit by an earlier version
+        return {}
+    shown, in_scan = record["shown"], record["shown_scan_mm"]
+    cells = {key: shown[key] for key in _SHARES}
+    for direction in _DIRECTIONS:
+        cells |= {f"shown_{direction}_{measure}_mm": shown[direction][measure] for measure in ("mean", "median")}
+        cells[f"shown_{direction}_mean_scan_mm"] = in_scan[direction]["mean"]
+    return cells
+
+
+def _pose_cells(pose: Mapping[str, Any]) -> dict[str, float]:
+    """Return scale, rotation vector (its direction the axis, its length the angle in degrees) and translation."""
+    from scipy.spatial.transform import Rotation  # a tenth of a second that only those who fit should wait
+
+    turn = Rotation.from_matrix(np.asarray(pose["rotation"], dtype=np.float64)).as_rotvec(degrees=True)
+    cells = {"scale": float(pose["scale"])}
+    cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
+    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose["translation"], strict=True)}
 
 
 def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: int) -> None:
@@ -178,14 +229,12 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
         FileError: the folder cannot be written, or the disk is full.
     """
     modes = range(1, n_modes + 1)
-    columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes)]
-    for direction in ("model_to_scan", "scan_to_model"):
-        columns += [f"{direction}_{m}" + ("" if m == "count" else "_mm") for m in _DISTANCE_COLUMNS]
-    # The two means come first: they are what a reader looks for.
-    lead = ["model_to_scan_mean_mm", "scan_to_model_mean_mm"]
-    start = 3 + 2 * n_modes
-    columns = columns[:start] + lead + [c for c in columns[start:] if c not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), "model_hash"]
+    # The two means come first: older readers look for them there.
+    lead = [_distance_column(direction, "mean") for direction in _DIRECTIONS]
+    every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
+    columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
+    columns += [column for column in every if column not in lead]
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS, "model_hash"]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
     writer.writeheader()

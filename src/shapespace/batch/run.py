@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
+from shapespace.batch.folder import CoefficientTable, names_for
 from shapespace.batch.results import (
     Source,
     coefficient_row,
     failed_record,
     fit_record,
     read_record,
-    write_coefficients,
     write_fitted_mesh,
     write_record,
     write_stages,
@@ -37,9 +36,8 @@ from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
-COEFFICIENTS = "coefficients.csv"
 _SAVE_EVERY_S = 5.0
-_LONGEST_NAME = 200
+_SAVES_APART = 20.0
 
 
 @dataclass(frozen=True)
@@ -57,25 +55,9 @@ class Job:
     landmarks: Path | None = None
 
 
-def make_jobs(scans: Sequence[Path], landmarks: Path | None = None) -> list[Job]:
-    """Return one job a scan; scans of the same name get _2, _3 and so on in the order given."""
-    taken: dict[str, int] = {}
-    jobs: list[Job] = []
-    for scan in scans:
-        stem = _shortened(scan.stem or scan.name)
-        count = taken[stem] = taken.get(stem, 0) + 1
-        name = stem
-        while count > 1 and (name := f"{stem}_{count}") in taken:
-            count += 1
-        taken.setdefault(name, 1)
-        jobs.append(Job(name, scan, landmarks))
-    return jobs
-
-
-def _shortened(stem: str) -> str:
-    # File names end at 255 bytes, and the results add theirs.
-    content = os.fsencode(stem)
-    return stem if len(content) <= _LONGEST_NAME else content[:_LONGEST_NAME].decode("utf-8", "ignore")
+def make_jobs(scans: Sequence[Path], landmarks: Path | None = None, folder: Path | None = None) -> list[Job]:
+    """Return one job a scan, named by `names_for` for results in `folder`; a scan given twice is one job twice."""
+    return [Job(name, scan, landmarks) for name, scan in zip(names_for(scans, folder), scans, strict=True)]
 
 
 def fit_file(
@@ -107,12 +89,8 @@ def fit_file(
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
-        record = failed_record(
-            scan_source,
-            model_source,
-            f"{job.scan}: not enough memory to fit it; thin the scan first.",
-            config.as_dict(),
-        )
+        short = f"{job.scan}: not enough memory to fit it; thin the scan first."
+        record = failed_record(scan_source, model_source, short, config.as_dict())
     except ShapespaceError as error:
         record = failed_record(scan_source, model_source, naming(job.scan, str(error)), config.as_dict())
     else:
@@ -158,6 +136,8 @@ def fit_files(
 ) -> list[dict[str, Any]]:
     """Fit all `jobs` and keep coefficients.csv in `folder` current, also when interrupted; return the records.
 
+    The table holds all records in the folder: those of earlier runs too, as long as they are there.
+
     Args:
         jobs: the scans.
         model: the shape space.
@@ -165,7 +145,8 @@ def fit_files(
         folder: where results go; made if absent.
         config: settings of all fits.
         executor: from `EXECUTORS`, or anything with its face; None fits one after the other here.
-        resume: keep results that are there already for the same scan, model and settings.
+        resume: keep results that are there already for the same scan, model and settings. Where such a fit has to be
+            done again, for the stages say, it has the dense surface and the stages that it had.
         stages: also write the surfaces at each stage, for figures.
         on_done: called with each job and its record.
         on_state: called with each state of the loop when fits run here.
@@ -175,49 +156,78 @@ def fit_files(
     """
     make_folder(folder)
     records: dict[str, dict[str, Any]] = {}
-    saved = time.monotonic()
-
-    def save() -> None:
-        rows = [coefficient_row(job.name, records[job.name]) for job in jobs if job.name in records]
-        write_coefficients(folder / COEFFICIENTS, rows, model.n_modes)
+    table = CoefficientTable(folder, [job.name for job in jobs], model.n_modes)
+    next_save = time.monotonic() + _SAVE_EVERY_S
 
     def done(job: Job, record: dict[str, Any]) -> None:
-        nonlocal saved
+        nonlocal next_save
+        # In this order, so that what an interruption keeps out of the table is caught up with.
+        table.add(job.name, record)
         records[job.name] = record
         if on_done is not None:
             on_done(job, record)
-        if time.monotonic() - saved > _SAVE_EVERY_S:
-            save()
-            saved = time.monotonic()
+        if (now := time.monotonic()) > next_save:
+            table.save()
+            # A table of very many rows takes a while itself.
+            next_save = time.monotonic() + max(_SAVE_EVERY_S, _SAVES_APART * (time.monotonic() - now))
 
-    open_jobs: list[Job] = []
-    for job in jobs:
-        earlier = _earlier_record(job, model, folder, config, stages) if resume else None
+    tasks: list[_Task] = []
+    for job in {job.name: job for job in jobs}.values():
+        task, earlier = _Task(job, config, stages), None
+        if resume:
+            task, earlier = _resumed(task, model, folder)
         if earlier is None:
-            open_jobs.append(job)
+            tasks.append(task)
         else:
             done(job, earlier)
+    if executor is None:
+        running = _run_here(tasks, model, model_file, folder, on_state)
+    else:
+        running = _run_on(executor, tasks, model_file, folder)
     try:
-        if executor is None:
-            for job in open_jobs:
-                done(job, fit_file(job, model, model_file, folder, config, stages=stages, on_state=on_state))
-        else:
-            for job, record in _run_on(executor, open_jobs, model_file, folder, config, stages):
+        with closing(running) as ended:
+            for job, record in ended:
                 done(job, record)
     finally:
-        save()
+        table.catch_up([task.job.name for task in tasks if task.job.name not in records])
+        table.save()
     return [records[job.name] for job in jobs]
 
 
+@dataclass(frozen=True)
+class _Task:
+    """What to do with one scan: its job, the settings, and whether to write the stages too."""
+
+    job: Job
+    config: FitConfig
+    stages: bool
+
+
+def _run_here(
+    tasks: Sequence[_Task],
+    model: ShapeModel,
+    model_file: Path,
+    folder: Path,
+    on_state: Callable[[IcpState], None] | None,
+) -> Generator[tuple[Job, dict[str, Any]]]:
+    """Yield the job and record of each task, done one after the other in this process."""
+    for task in tasks:
+        yield (
+            task.job,
+            fit_file(task.job, model, model_file, folder, task.config, stages=task.stages, on_state=on_state),
+        )
+
+
 def _run_on(
-    executor: Executor, jobs: Sequence[Job], model_file: Path, folder: Path, config: FitConfig, stages: bool
-) -> Iterator[tuple[Job, dict[str, Any]]]:
-    with ExitStack() as stack:
-        with interrupts_ignored():
-            futures = {
-                executor.submit(_fit_with_loaded_model, job, model_file, folder, config, stages): job for job in jobs
-            }
-        stack.callback(lambda: [future.cancel() for future in futures])
+    executor: Executor, tasks: Sequence[_Task], model_file: Path, folder: Path
+) -> Generator[tuple[Job, dict[str, Any]]]:
+    """Yield the job and record of each task as it ends; closed earlier, it waits for those that run already."""
+    with interrupts_ignored():
+        futures = {
+            executor.submit(_fit_with_loaded_model, task.job, model_file, folder, task.config, task.stages): task.job
+            for task in tasks
+        }
+    try:
         for future in as_completed(futures):
             try:
                 record = future.result()
@@ -227,6 +237,8 @@ def _run_on(
                     "run again with --resume and fewer --jobs."
                 ) from error
             yield futures[future], record
+    finally:
+        wait([future for future in futures if not future.cancel()])
 
 
 _model: ShapeModel | None = None
@@ -275,27 +287,43 @@ def make_executor(model: Path, workers: int, kind: str = "processes") -> Executo
     return EXECUTORS[kind](model, workers)
 
 
-def _earlier_record(
-    job: Job, model: ShapeModel, folder: Path, config: FitConfig, stages: bool
-) -> dict[str, Any] | None:
-    """Return the record of an earlier run if it is good for the same scan, model and settings."""
-    path = folder / f"{job.name}.fit.json"
-    wanted = {"fitted.ply": True, "dense.ply": config.dense, "stages.npz": stages}
-    needed = [path, *(folder / f"{job.name}.{ending}" for ending, want in wanted.items() if want)]
-    if not all(file.is_file() for file in needed):
-        return None
+def _resumed(task: _Task, model: ShapeModel, folder: Path) -> tuple[_Task, dict[str, Any] | None]:
+    """Return what is left to do, and the record of an earlier fit if it holds what is asked for, or more.
+
+    A fit that has to be done again for the stages, say, keeps the dense surface that it had.
+    """
+    there = {
+        ending: (folder / f"{task.job.name}.{ending}").is_file()
+        for ending in ("fit.json", "fitted.ply", "dense.ply", "stages.npz")
+    }
+    if not there["fit.json"]:
+        return task, None
     try:
-        record = read_record(path)
-        same_scan = record["scan"]["hash"] == sha256_of_file(job.scan)
-        same_model = record["model"]["hash"] == model.content_hash
-        settings: dict[str, Any] = json.loads(json.dumps(config.as_dict()))
-        settings["version"] = __version__
-        same_settings = all(record["config"].get(key) == value for key, value in settings.items())
-        marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
-        same_marks = bool(record["landmarks"] == marks)
-        whole = bool(len(record["b"]) == model.n_modes and record["status"] in get_args(Status))
-        coefficient_row(job.name, record)
-    except (ShapespaceError, KeyError, TypeError, AttributeError):
-        return None
-    good = same_scan and same_model and same_settings and same_marks and whole
-    return record if good and record["status"] != "failed" else None
+        record = read_record(folder / f"{task.job.name}.fit.json")
+        if not _is_of(record, task, model):
+            return task, None
+        dense = bool(record["config"]["dense"]) and there["dense.ply"]
+        enough = there["fitted.ply"] and dense >= task.config.dense and there["stages.npz"] >= task.stages
+        whole = len(record["b"]) == model.n_modes and record["status"] in get_args(Status)
+        coefficient_row(task.job.name, record)
+    except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
+        return task, None
+    if enough and whole and record["status"] != "failed":
+        return task, record
+    also = replace(task.config, dense=task.config.dense or dense)
+    return _Task(task.job, also, task.stages or there["stages.npz"]), None
+
+
+def _is_of(record: Mapping[str, Any], task: _Task, model: ShapeModel) -> bool:
+    """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
+    job = task.job
+    settings: dict[str, Any] = json.loads(json.dumps(task.config.as_dict()))
+    settings["version"] = __version__
+    del settings["dense"]
+    marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
+    return bool(
+        record["scan"]["hash"] == sha256_of_file(job.scan)
+        and record["model"]["hash"] == model.content_hash
+        and record.get("landmarks") == marks
+        and all(record["config"].get(key) == value for key, value in settings.items())
+    )

@@ -29,11 +29,6 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def may_tell(*, quiet: bool) -> bool:
-    """Return whether progress may be told on standard error: somebody is there, and has not asked for quiet."""
-    return not quiet and sys.stderr.isatty()
-
-
 def context() -> ForkServerContext | SpawnContext:
     """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
     # Apple's BLAS does not survive a fork, and Windows has none.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
@@ -35,6 +36,9 @@ class Label:
 def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
     """Return the labels in a CSV table by the name of the scan, without folder and ending.
 
+    Scans of the same name in different folders, with different labels, are called by their folders too, as their fits
+    are: `anna/smile.ply` is `anna_smile`, and no scan is `smile`.
+
     The scan stands in the column `file`, `scan` or `name`; its class in `label`, `expression`, `class`, `group` or
     `subject`, the first that is there; `intensity` and `subject` may stand beside it.
 
@@ -61,13 +65,27 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
             f"{path} is no table of labels; it needs rows, a column {_NAMES[0]} and a column {_LABELS[0]} or "
             f"{_LABELS[1]}."
         )
-    found: dict[str, Label] = {}
+    named: dict[str, dict[PurePath, Label]] = {}
     for row in rows:
         text = _printable(row[label] or "")
         subject = _printable(row.get("subject") or "")
         if row[name] and (text or subject):
-            found[PurePath(row[name]).stem] = Label(text, _intensity(row.get("intensity")), subject)
+            place = PurePath(row[name].replace("\\", "/")).with_suffix("")
+            named.setdefault(place.name, {})[place] = Label(text, _intensity(row.get("intensity")), subject)
+    found: dict[str, Label] = {}
+    for stem, group in named.items():
+        if len(set(group.values())) == 1:
+            found[stem] = next(iter(group.values()))
+        else:
+            found |= {"_".join(place.parts): one for place, one in group.items()}
     return found
+
+
+def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
+    """Return the label of the scan in `file`, from `labels` as `read_labels` gives them; None if they have none."""
+    parts = file.resolve().parent.parts[1:]
+    names = ("_".join((*parts[len(parts) - depth :], file.stem)) for depth in range(len(parts) + 1))
+    return next((labels[name] for name in names if name in labels), None)
 
 
 def _intensity(text: str | None) -> float | None:

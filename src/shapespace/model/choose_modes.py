@@ -8,12 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from shapespace.errors import InputError
-from shapespace.model.pca import principal_components
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray
 
 _LEAST_NOISE = 1e-6
+_NO_VARIANCE = 1e-10
+"""Of the first mode's, as in `pca`."""
+_ALL_EQUAL = 1e-24
+"""Of the variance of all shapes: what rounding leaves of shapes that are equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,29 +59,82 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoi
         )
     folds = min(folds, n)
     rng = np.random.default_rng(seed)
-    parts = np.array_split(rng.permutation(n), folds)
+    parts = np.array_split(rng.permutation(n).astype(np.int32), folds)
     most = n - max(len(part) for part in parts) - 1
     spaced = {round(most ** (step / 23)) for step in range(24)}
     candidates: IntArray = np.array(sorted(spaced), dtype=np.int32)
+    # Coordinate by coordinate, so that what is summed over the three lies in whole runs.
+    centred = np.ascontiguousarray((data - data.mean(axis=0)).reshape(n, -1, 3).transpose(0, 2, 1))
+    gram = _gram(centred.reshape(n, d))
     errors = np.zeros((n, len(candidates)))
     for held_out in parts:
-        pc = principal_components(np.delete(data, held_out, axis=0))
         shown = np.zeros(d // 3, dtype=np.bool_)
         shown[rng.permutation(d // 3)[: d // 6]] = True
-        shown_coordinates = np.repeat(shown, 3)
-        seen, hidden = pc.basis[shown_coordinates], pc.basis[~shown_coordinates]
-        overlap = seen.T @ seen
-        residual = data[held_out] - pc.mean
-        evidence = residual[:, shown_coordinates] @ seen
-        for column, k in enumerate(candidates):
-            kept = min(int(k), len(pc.variance))
-            noise = max((pc.total_variance - pc.variance[:kept].sum()) / (d - kept), _LEAST_NOISE * pc.variance[0] / d)
-            system = overlap[:kept, :kept] + noise * np.diag(1.0 / pc.variance[:kept])
-            b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :kept].T), dtype=np.float64)
-            wrong: FloatArray = residual[:, ~shown_coordinates] - (hidden[:, :kept] @ b).T
-            errors[held_out, column] = np.linalg.norm(wrong.reshape(len(held_out), -1, 3), axis=2).mean(axis=1)
+        errors[held_out] = _errors_of_hidden(centred, gram, held_out, shown, candidates)
     mean = errors.mean(axis=0)
     standard_error = errors.std(axis=0, ddof=1) / np.sqrt(n)
     best = int(mean.argmin())
     choice = int(np.flatnonzero(mean <= mean[best] + standard_error[best])[0])
     return ModeChoice(int(candidates[choice]), candidates, mean, standard_error)
+
+
+def _at(centred: FloatArray, vertices: BoolArray) -> FloatArray:
+    return centred.take(np.flatnonzero(vertices), axis=2).reshape(len(centred), -1)
+
+
+def _gram(rows: FloatArray) -> FloatArray:
+    return np.asarray(rows @ rows.T, dtype=np.float64)
+
+
+def _errors_of_hidden(
+    centred: FloatArray, gram: FloatArray, held_out: IntArray, shown: BoolArray, candidates: IntArray
+) -> FloatArray:
+    """Return the mean error (H, C), mm, of the hidden vertices of the shapes `held_out` (H,), a column a candidate.
+
+    A mode is a sum of training shapes, so all but the prediction itself is worked out among the (N, N) products.
+
+    Args:
+        centred: (N, 3, V) all shapes less their mean.
+        gram: (N, N) their products over all coordinates.
+        held_out: (H,) indices of the shapes that the model does not know.
+        shown: (V,) True where a vertex is shown.
+        candidates: (C,) numbers of modes.
+    """
+    n, d = len(centred), centred[0].size
+    known = np.setdiff1d(np.arange(n), held_out)
+    shares = np.zeros((n, n))
+    shares[:, known] = 1.0 / len(known)
+    from_mean = np.eye(n) - shares
+    within = from_mean @ gram @ from_mean.T
+    within = within[np.ix_(known, known)]
+    variance, sums = _modes_as_sums(within, float(gram.trace()))
+    total = float(within.trace()) / (len(known) - 1)
+
+    in_shown = from_mean @ _gram(_at(centred, shown)) @ from_mean.T
+    overlap = sums.T @ in_shown[np.ix_(known, known)] @ sums
+    evidence = in_shown[np.ix_(held_out, known)] @ sums
+    hidden = _at(centred, ~shown)
+    mean = hidden[known].mean(axis=0)
+    # The sums of each column are zero in all but rounding, so the mean need not be taken off first.
+    modes = sums.T @ hidden[known]
+    residual = hidden[held_out] - mean
+    errors = np.empty((len(held_out), len(candidates)))
+    for column, k in enumerate(candidates):
+        kept = min(int(k), len(variance))
+        noise = max((total - variance[:kept].sum()) / (d - kept), _LEAST_NOISE * variance[0] / d)
+        system = overlap[:kept, :kept] + noise * np.diag(1.0 / variance[:kept])
+        b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :kept].T), dtype=np.float64)
+        wrong = (residual - b.T @ modes[:kept]).reshape(len(held_out), 3, -1)
+        errors[:, column] = np.sqrt(wrong[:, 0] ** 2 + wrong[:, 1] ** 2 + wrong[:, 2] ** 2).mean(axis=1)
+    return errors
+
+
+def _modes_as_sums(products: FloatArray, of_all: float) -> tuple[FloatArray, FloatArray]:
+    """Return the variances (R,) and modes (N, R) of shapes with centred `products` (N, N), as sums of these shapes."""
+    n = len(products)
+    if float(products.trace()) <= _ALL_EQUAL * of_all:
+        raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
+    values, vectors = eigh(products, check_finite=False)
+    variance = np.asarray(values[::-1], dtype=np.float64) / (n - 1)
+    variance = variance[variance > _NO_VARIANCE * variance[0]][: n - 1]
+    return variance, np.asarray(vectors[:, ::-1][:, : len(variance)]) / np.sqrt(variance * (n - 1))

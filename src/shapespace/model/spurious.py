@@ -61,7 +61,8 @@ def rounding_mm(vertices: FloatArray) -> float:
             if (np.abs(y - np.rint(y / step) * step) <= near + _ROUNDING).all():
                 found = max(found, step * mm / np.sqrt(12.0))
                 break
-        single = y.astype(np.float32)
+        with np.errstate(over="ignore"):  # absurd coordinates are in no single precision
+            single = y.astype(np.float32)
         if (np.abs(y - single) <= near).all():
             found = max(found, float(np.sqrt((np.spacing(np.abs(single)).astype(np.float64) ** 2).mean() / 12.0)) * mm)
     return found

@@ -32,6 +32,11 @@ NAME = "fit"
 LARGEST_SHOWN = 300_000
 """Triangles of a scan that are sent to the page; the fit uses all."""
 _LARGEST_MESSAGE = 2**24
+_TOLD = (
+    "status", "reason", "shown", "shown_scan_mm", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
+    "distances_mm",
+)  # fmt: skip
+"""What the page is told of a record."""
 _LOOK_EVERY_S = 0.05
 
 DIED = "The fit ended unexpectedly, most likely for lack of memory; thin the scan and try again."
@@ -110,8 +115,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
             pictured = True
         except ShapespaceError as error:
             why = _with_shown_name(str(error), upload)
-    kept = ("status", "reason", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev", "distances_mm")
-    tell("verdict", pictured=pictured, why_not=why, **{key: record[key] for key in kept if key in record})
+    tell("verdict", pictured=pictured, why_not=why, **{key: record[key] for key in _TOLD if key in record})
 
 
 def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from shapespace.batch.workers import cores, may_tell, start_loading
+from shapespace.batch.workers import cores, start_loading
 from shapespace.errors import InputError, ShapespaceError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def serve(
                 f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
             )
     # While this process loads its own code.
-    start_loading(tell=may_tell(quiet=quiet))
+    start_loading(tell=not quiet)
     from shapespace.viewer.scratch import sweep
     from shapespace.viewer.server import make_app
     from shapespace.viewer.sessions import Limits

@@ -22,6 +22,7 @@ MODEL_BYTES = 48 * 2**20
 """Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
+_SHOWN = ("shown", "shown_scan_mm")
 _FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
 
 
@@ -162,15 +163,17 @@ class Shown:
             "why_not": why,
             "fitted": "fitted" in fit.entry and fit.status not in ("failed", "unreadable"),
             "z": None,
+            **dict.fromkeys(_SHOWN),
         }
         directions = {"model_to_scan_mm": "model_to_scan", "scan_to_model_mm": "scan_to_model"}
         row |= dict.fromkeys((*directions, "expected_error_mm"))
         try:
             row |= {key: _number(fit.summary_mm("final", direction, "mean")) for key, direction in directions.items()}
             row["expected_error_mm"] = _expected_error_mm(fit)
+            row |= {key: _shown(fit.record[key]) for key in _SHOWN if key in fit.record}
             if self._ours(fit) and "z" in fit.record:
                 row["z"] = _rounded(fit.numbers("z"))
-        except (ShapespaceError, TypeError, ValueError):
+        except (ShapespaceError, KeyError, TypeError, ValueError):
             reason = f"The record of {fit.name} is damaged; fit the scan again."
             row |= {"status": "unreadable", "reason": reason, "pictured": False}
         return row
@@ -204,6 +207,17 @@ def _by_name(fit: SavedFit) -> str:
 def _expected_error_mm(fit: SavedFit) -> float | None:
     evidence: object = fit.record.get("evidence")
     value = cast(Mapping[str, Any], evidence).get("expected_error_mm") if isinstance(evidence, dict) else None
+    return _optional(value)
+
+
+def _shown(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page says of distances over what scan and model both show."""
+    shares = {key: _optional(told[key]) for key in ("model_seen_share", "scan_covered_share")}
+    ways = ("model_to_scan", "scan_to_model")
+    return {way: {key: _optional(told[way][key]) for key in ("mean", "p95")} for way in ways} | shares
+
+
+def _optional(value: Any) -> float | None:
     return None if value is None else _number(float(value))
 
 

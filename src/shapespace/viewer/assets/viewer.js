@@ -7,6 +7,7 @@
   const $ = (id) => document.getElementById(id);
   const SHOWN_AT_FIRST = 12;
   const FILTERED_FROM = 12;
+  const OTHER_SIZE = 0.02; // share by which the scan's millimetres differ where both are told
   const STATUS = {
     converged: "Nothing speaks against this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
     failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
@@ -527,19 +528,27 @@
     return rest.charAt(0).toUpperCase() + rest.slice(1);
   }
 
-  /** Distances of the verdict; of the model's where the scan shows it, once the surfaces (`payload`) tell where. */
-  function distanceFacts(distances, payload) {
-    const final = distances && distances.final;
-    if (!final) return null;
-    const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
-    const seen = payload && payload.arrays.model_to_scan_final;
-    const forward = seen ? `${mm(payload.facts.mean_mm.final.model)} mean where the scan shows it, 95 % within ${mm(quantile(seen, 0.95))}`
-      : `${mm(final.model_to_scan.mean)} mean, 95 % within ${mm(final.model_to_scan.p95)}`;
-    const told = [
-      ["Model to scan", forward],
-      ["Scan to model", `${mm(final.scan_to_model.mean)} mean over ${Math.round(100 * final.scan_to_model.fraction)} % of the scan`],
-    ];
-    return h("dl", { class: "facts" }, ...told.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
+  const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : "an unknown share");
+
+  /** Distances over what scan and model both show, in mm of the model and, where they differ, of the scan. */
+  function distanceFacts(facts) {
+    const { shown: told, shown_scan_mm: inScan } = facts;
+    if (!told) return null;
+    const rows = [
+      ["Model to scan", "model_to_scan", `the scan shows it, ${percent(told.model_seen_share)} of the model`],
+      ["Scan to model", "scan_to_model", `the model covers it, ${percent(told.scan_covered_share)} of the scan`],
+    ].map(([name, way, where]) => {
+      const { mean, p95 } = told[way], own = inScan ? inScan[way].mean : mean;
+      const other = Math.abs(own - mean) > OTHER_SIZE * mean ? ` (${mm(own)} of the scan)` : "";
+      return [name, `${mm(mean)}${other} mean where ${where}; 95 % within ${mm(p95)}`];
+    });
+    return h("dl", { class: "facts", "data-testid": "shown" }, ...rows.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  }
+
+  function shortly(row) {
+    if (row.shown) return `${[row.shown.model_to_scan, row.shown.scan_to_model].map(({ mean }) => (Number.isFinite(mean) ? mean.toFixed(2) : "?")).join(" / ")} mm`;
+    return row.scan_to_model_mm === null ? row.status : `${row.scan_to_model_mm.toFixed(2)} mm`;
   }
 
   async function startFits() {
@@ -554,7 +563,7 @@
       role: "option", id: `fit-${i}`, class: row.status, "aria-selected": "false", "data-testid": "fit", "data-name": row.name,
       title: row.reason, onclick: () => selectFit(i),
     }, h("i", { class: "dot" }), h("span", {}, row.label, h("b", { hidden: true }, ` ${row.status}`)),
-    h("small", {}, row.scan_to_model_mm === null ? row.status : `${row.scan_to_model_mm.toFixed(2)} mm`))));
+    h("small", {}, shortly(row)))));
     $("fit-list").addEventListener("keydown", (event) => {
       const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
       if (!step) return;
@@ -598,7 +607,7 @@
     const detail = h("div");
     fitView.clear();
     fitView.element = detail;
-    $("fit-detail").replaceChildren(verdictCard(row, "fit"), detail);
+    $("fit-detail").replaceChildren(...[verdictCard(row, "fit"), distanceFacts(row), detail].filter(Boolean));
     if (!row.pictured) {
       if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
       if (row.z) $("fit-detail").append(h("button", { type: "button", onclick: () => apply(row.z) }, "Use in Model"));
@@ -796,7 +805,7 @@
   async function showVerdict(mine) {
     const told = mine.verdict;
     const card = verdictCard(told, "scan");
-    $("verdict").replaceChildren(...[card, distanceFacts(told.distances_mm), told.why_not ? h("p", {}, told.why_not) : null].filter(Boolean));
+    $("verdict").replaceChildren(...[card, distanceFacts(told), told.why_not ? h("p", {}, told.why_not) : null].filter(Boolean));
     $("verdict").hidden = false;
     $("progress").hidden = true;
     if (!told.b) {
@@ -812,8 +821,6 @@
     if (!told.pictured) return;
     const payload = await binary(`/api/scans/${mine.id}/picture`);
     if (own !== mine || mine.placing) return;
-    const first = $("verdict").querySelector(".facts");
-    if (first) first.replaceWith(distanceFacts(told.distances_mm, payload));
     scanView.show(payload, { scan: mine.id, b: told.b, z: told.z, b_stddev: told.b_stddev });
     $("scan-detail").append(h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {

@@ -1,62 +1,15 @@
-"""The command line: parsing, printing and exit codes; what the commands do stands in `commands.py`.
-
-Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doubtful); 2 wrong arguments or unusable
-input; 130 stopped by Ctrl-C, files valid.
-"""
+"""What may be written on the command line."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
-import json
-import math
-import os
-import sys
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 from shapespace import __version__
-from shapespace.errors import ShapespaceError
+from shapespace.cli import run
 
 _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            # A file's name may hold what the terminal's encoding cannot show.
-            stream.reconfigure(errors="backslashreplace")
-    arguments = parser().parse_args(argv)
-    try:
-        code = int(arguments.run(arguments))
-        sys.stdout.flush()
-        return code
-    except ShapespaceError as error:
-        _say(f"shapespace: {error}")
-        return 2
-    except MemoryError:
-        _say("shapespace: there is not enough memory for this; give fewer or smaller meshes, or fewer --jobs.")
-        return 2
-    except KeyboardInterrupt:
-        _say("shapespace: stopped; the files written so far are whole.")
-        return 130
-    except BrokenPipeError:
-        _drop_output()
-        return 0
-    except OSError as error:
-        _drop_output()
-        where = f" ({error.filename})" if error.filename else ""
-        _say(f"shapespace: the system refused{where}: {error.strerror or error}; check the path and the free space.")
-        return 2
-
-
-def _drop_output() -> None:
-    """Send what is left of the output nowhere, so that python does not complain when it flushes at exit."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -89,10 +42,14 @@ def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool 
             formatter_class=argparse.RawDescriptionHelpFormatter,
         ),
     )
-    sub.add_argument("--quiet", action="store_true", help="no progress bar")
+    sub.add_argument("--quiet", action="store_true", help="no progress")
     if json_facts:
         sub.add_argument("--json", action="store_true", help="print facts as JSON")
     return sub
+
+
+def _add_recursive(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--recursive", action="store_true", help="take what lies in folders below those given too")
 
 
 def _add_demo(commands: Any) -> None:
@@ -100,7 +57,7 @@ def _add_demo(commands: Any) -> None:
     sub.add_argument("--out", type=Path, default=Path("shapespace-demo"), metavar="DIR", help="where to write")
     sub.add_argument("--quick", action="store_true", help="coarser scans and an earlier stop, under a minute")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
-    sub.set_defaults(run=_demo)
+    sub.set_defaults(run=run.demo)
 
 
 def _add_data(commands: Any) -> None:
@@ -108,11 +65,11 @@ def _add_data(commands: Any) -> None:
         required=True, metavar="list|get|faces"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
-    listing.set_defaults(run=_data_list)
+    listing.set_defaults(run=run.data_list)
     get = _add(sub, "get", "download and verify an open data set", "shapespace data get ict-facekit")
     get.add_argument("name", metavar="NAME")
     get.add_argument("--to", type=Path, metavar="DIR", help="also copy it there")
-    get.set_defaults(run=_data_get)
+    get.set_defaults(run=run.data_get)
     faces = _add(
         sub, "faces", "write simulated corresponded faces (PLY) with labels.csv",
         "shapespace data faces -o faces --subjects 100 --expressions neutral",
@@ -125,14 +82,15 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--area", choices=("face", "face_and_head"), default="face", help="of ict-facekit")
     faces.add_argument("--raw", action="store_true",
                        help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
-    faces.set_defaults(run=_data_faces)
+    faces.set_defaults(run=run.data_faces)
 
 
 def _add_check(commands: Any) -> None:
     sub = _add(commands, "check", "mesh doctor: what is in it, what is wrong, what fitting will do about it",
                "shapespace check scan.obj")  # fmt: skip
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    sub.set_defaults(run=_check)
+    _add_recursive(sub)
+    sub.set_defaults(run=run.check)
 
 
 def _add_build(commands: Any) -> None:
@@ -140,6 +98,9 @@ def _add_build(commands: Any) -> None:
                "shapespace build faces/*.ply -o model.h5 --modes auto")  # fmt: skip
     sub.add_argument("meshes", nargs="+", type=Path, metavar="MESH", help="mesh files or folders of them")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="MODEL.h5")
+    _add_recursive(sub)
+    sub.add_argument("--with-doubtful", action="store_true",
+                     help="take surfaces of doubtful fits too, which are left out otherwise")  # fmt: skip
     how_many = sub.add_mutually_exclusive_group()
     how_many.add_argument("--variance", type=_share, metavar="SHARE", help="modes that hold this share, such as 0.98")
     how_many.add_argument("--modes", type=_modes, default="auto", metavar="K|auto|all",
@@ -162,13 +123,13 @@ def _add_build(commands: Any) -> None:
     sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
     sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
-    sub.set_defaults(run=_build)
+    sub.set_defaults(run=run.build)
 
 
 def _add_info(commands: Any) -> None:
     sub = _add(commands, "info", "facts of a model, a mesh or a fit", "shapespace info model.h5")
     sub.add_argument("file", type=Path, metavar="FILE")
-    sub.set_defaults(run=_info)
+    sub.set_defaults(run=run.info)
 
 
 def _add_fit(commands: Any) -> None:
@@ -178,7 +139,9 @@ def _add_fit(commands: Any) -> None:
                "         shapespace build out/*.dense.ply -o new.h5")  # fmt: skip
     sub.add_argument("model", type=Path, metavar="MODEL.h5")
     sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                     help="where to write; results that are there already stay")  # fmt: skip
+    _add_recursive(sub)
     sub.add_argument(
         "--method",
         default="robust",
@@ -199,7 +162,7 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
-    sub.set_defaults(run=_fit)
+    sub.set_defaults(run=run.fit, goes_on="; the same command with --resume goes on from there")
 
 
 def _add_view(commands: Any) -> None:
@@ -211,7 +174,7 @@ def _add_view(commands: Any) -> None:
     sub.add_argument("--port", type=_natural, metavar="N", help="default: the first free one from 7860")
     sub.add_argument("--no-open", action="store_true", help="do not open a browser")
     sub.add_argument("--max-upload-mb", type=_positive, default=200, metavar="N", help="largest scan (default 200)")
-    sub.set_defaults(run=_view)
+    sub.set_defaults(run=run.view)
 
 
 def _add_report(commands: Any) -> None:
@@ -223,7 +186,7 @@ def _add_report(commands: Any) -> None:
     sub.add_argument("--labels", type=Path, metavar="FILE",
                      help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
-    sub.set_defaults(run=_report)
+    sub.set_defaults(run=run.report)
 
 
 def _add_recognise(commands: Any) -> None:
@@ -254,7 +217,7 @@ def _add_recognise_train(commands: Any) -> None:
     sub.add_argument("--expression-of", type=Path, metavar="MODEL.h5",
                      help="see the expression alone, as parted by this model of build --additive")  # fmt: skip
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
-    sub.set_defaults(run=_recognise_train)
+    sub.set_defaults(run=run.recognise_train)
 
 
 def _add_recognise_predict(commands: Any) -> None:
@@ -266,7 +229,7 @@ def _add_recognise_predict(commands: Any) -> None:
                      help="CSV of file, label and subject: says which scans are neutral faces, and whose")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.csv")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful or an answer unsure")
-    sub.set_defaults(run=_recognise_predict)
+    sub.set_defaults(run=run.recognise_predict)
 
 
 def _add_recognise_transfer(commands: Any) -> None:
@@ -276,7 +239,7 @@ def _add_recognise_transfer(commands: Any) -> None:
     sub.add_argument("person", type=Path, metavar="PERSON.fit.json", help="fit of who is to be shown")
     sub.add_argument("expression", type=Path, metavar="EXPRESSION.fit.json", help="fit of what they shall do")
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.ply")
-    sub.set_defaults(run=_recognise_transfer)
+    sub.set_defaults(run=run.recognise_transfer)
 
 
 def _add_recognise_study(commands: Any) -> None:
@@ -297,391 +260,7 @@ def _add_recognise_study(commands: Any) -> None:
                      help="compare vertices with B-spline control points too (11 minutes more)")  # fmt: skip
     sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
-    sub.set_defaults(run=_recognise_study)
-
-
-def _demo(arguments: argparse.Namespace) -> int:
-    from shapespace.demo import run_demo
-
-    report = run_demo(arguments.out, quick=arguments.quick, quiet=arguments.quiet)
-    if arguments.json:
-        _print_json({"report": str(report)})
-    else:
-        _print(f"The report is {report}")
-    if not arguments.no_open:
-        import webbrowser
-
-        webbrowser.open(report.absolute().as_uri())
-    return 0
-
-
-def _report(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    report = commands.report(
-        arguments.folder, arguments.output, model=arguments.model, labels=arguments.labels, quiet=arguments.quiet
-    )
-    if arguments.json:
-        _print_json({"report": str(report), "bytes": report.stat().st_size})
-    else:
-        _print(f"The report is {report}")
-    if not arguments.no_open:
-        import webbrowser
-
-        webbrowser.open(report.absolute().as_uri())
-    return 0
-
-
-def _data_list(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    rows = commands.data_list()
-    if arguments.json:
-        _print_json(rows)
-    else:
-        for row in rows:
-            for number, (key, value) in enumerate(row.items()):
-                _print(f"{'  ' if number else ''}{key}: {value}")
-    return 0
-
-
-def _data_get(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    folder = commands.data_get(arguments.name, arguments.to, quiet=arguments.quiet)
-    if arguments.json:
-        _print_json({"folder": str(folder)})
-    else:
-        _print(str(folder))
-    return 0
-
-
-def _data_faces(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    names = [name.strip() for name in arguments.expressions.split(",") if name.strip()]
-    count = commands.write_simulated_faces(
-        arguments.output,
-        source=arguments.source,
-        subjects=arguments.subjects,
-        expressions=names,
-        seed=arguments.seed,
-        area=arguments.area,
-        quiet=arguments.quiet,
-        raw=arguments.raw,
-    )
-    if arguments.json:
-        _print_json({"folder": str(arguments.output), "faces": count})
-    else:
-        _print(f"{count} {'face' if count == 1 else 'faces'} in {arguments.output}")
-    return 0
-
-
-def _check(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    reports = commands.check(arguments.files)
-    if arguments.json:
-        _print_json(reports)
-    else:
-        for report in reports:
-            _print_check(report)
-    bad = sum(not report["usable"] for report in reports)
-    for report in reports:
-        if "error" in report:
-            _say(f"shapespace: {report['error']}")
-    if not bad:
-        return 0
-    return 2 if bad == len(reports) else 1
-
-
-def _print_check(report: Mapping[str, Any]) -> None:
-    _print(report["file"])
-    if "error" in report:
-        _print(f"  unusable: {report['error']}")
-        return
-    for key, value in report.items():
-        if key not in ("file", "usable", "findings", "name"):
-            _print(f"  {key}: {_short(value)}")
-    for finding in report["findings"]:
-        what, action = finding["what"], finding["action"]
-        _print(
-            f"  {finding['level']}: "
-            + (f"{what[:-1]}; {action}" if finding["level"] == "refused" else f"{what} {action}")
-        )
-    print("  usable" if report["usable"] else "  not usable for fitting")
-
-
-def _build(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    modes = arguments.variance if arguments.variance is not None else arguments.modes
-    model, notes = commands.build(
-        arguments.meshes,
-        arguments.output,
-        modes=None if modes == "all" else modes,
-        gauge=arguments.gauge,
-        align=not arguments.no_align,
-        unit=arguments.unit,
-        landmarks=arguments.landmarks,
-        representation=arguments.representation,
-        control_points=arguments.control_points,
-        labels=arguments.additive,
-        expression_variance=arguments.expression_variance,
-        provenance=arguments.provenance,
-        licence=arguments.licence,
-        seed=arguments.seed,
-        quiet=arguments.quiet,
-    )
-    for note in notes:
-        _say(note)
-    facts = commands.model_facts(model)
-    if arguments.json:
-        _print_json({"model": str(arguments.output), **facts})
-    else:
-        _print(
-            f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
-            f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of "
-            f"{'the variance of people left out' if model.held_out else 'their variance'}, "
-            f"gauge {facts['gauge']}"
-        )
-    return 0
-
-
-def _info(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    facts = commands.info(arguments.file)
-    if arguments.json:
-        _print_json(facts)
-    else:
-        for key, value in facts.items():
-            _print(f"{key}: {_short(value)}")
-    return 0
-
-
-def _fit(arguments: argparse.Namespace) -> int:
-    if arguments.jobs != 1 and (len(arguments.scans) > 1 or arguments.scans[0].is_dir()):
-        from shapespace.batch.workers import may_tell, start_loading
-
-        # While this process loads its own code; half of the time that many scans take to start.
-        start_loading(tell=may_tell(quiet=arguments.quiet))
-    from shapespace import commands
-    from shapespace.fit.fit import FitConfig
-    from shapespace.fit.methods import method_named
-
-    config = FitConfig(
-        method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
-        unit=arguments.unit,
-        scale=arguments.scale,
-        max_iterations=arguments.max_iterations,
-        seed=arguments.seed,
-        dense=arguments.dense,
-    )
-    records = commands.fit_scans(
-        arguments.model,
-        arguments.scans,
-        arguments.output,
-        config,
-        landmarks=arguments.landmarks,
-        jobs=arguments.jobs,
-        resume=arguments.resume,
-        stages=arguments.stages,
-        quiet=arguments.quiet,
-        say=lambda sentence: _say(f"shapespace: {sentence}"),
-    )
-    counts = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
-    for record in records:
-        counts[record["status"]] += 1
-    if arguments.json:
-        _print_json({"folder": str(arguments.output), "scans": len(records), **counts})
-    elif counts["failed"] < len(records):
-        for record in records[:10]:
-            _print_fit(record)
-        _print(
-            f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
-            + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-            + f"; results in {arguments.output}"
-        )
-    if counts["failed"] == len(records):
-        return 2
-    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
-
-
-def _recognise_train(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    facts, notes = commands.recognise_train(
-        arguments.results,
-        arguments.labels,
-        arguments.output,
-        classifier=arguments.classifier,
-        relative=arguments.relative,
-        neutral=arguments.neutral,
-        confidence=arguments.confidence,
-        modes=arguments.modes,
-        expression_of=arguments.expression_of,
-        seed=arguments.seed,
-    )
-    for note in notes:
-        _say(note)
-    if arguments.json:
-        _print_json({"file": str(arguments.output), **facts})
-        return 0
-    training, checked = facts["training"], facts["cross_validation"]
-    _print(
-        f"{arguments.output}: {facts['classifier']} of {len(facts['classes'])} classes from {training['scans']} scans"
-        + (f" of {training['subjects']} people" if training["subjects"] else "")
-        + f", {facts['modes']} modes"
-        + (", relative to neutral" if facts["relative_to_neutral"] else "")
-    )
-    if checked["macro_accuracy"] is not None:
-        left_out = "people" if checked["by"] == "subject" else "scans"
-        _print(f"macro accuracy on {left_out} left out: {100 * checked['macro_accuracy']:.1f} %")
-    return 0
-
-
-def _recognise_predict(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    rows, counts = commands.recognise_predict(
-        arguments.classifier, arguments.results, arguments.output, labels=arguments.labels
-    )
-    if arguments.json:
-        _print_json({"file": str(arguments.output), **counts, "answers": rows})
-    else:
-        for row in rows[:10]:
-            p = max(row["probabilities"].values(), default=None)
-            _print(
-                f"{row['scan']}: {row['prediction'] or 'no answer'}"
-                + (f" ({p:.2f})" if p is not None and not row["reason"] else "")
-                + (f"; {row['reason']}" if row["reason"] else "")
-            )
-        told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        _print(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {told}; answers in {arguments.output}")
-    asked = len(rows) - counts["neutral"]
-    if counts["failed"] == asked:
-        _say("shapespace: no scan could be answered for; the reasons stand in the table.")
-        return 2
-    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"] + counts["unsure"]) else 0
-
-
-def _recognise_transfer(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    commands.recognise_transfer(arguments.model, arguments.person, arguments.expression, arguments.output)
-    if arguments.json:
-        _print_json({"file": str(arguments.output)})
-    else:
-        _print(f"{arguments.output}: {arguments.person.name} with the expression of {arguments.expression.name}")
-    return 0
-
-
-def _recognise_study(arguments: argparse.Namespace) -> int:
-    from shapespace import commands
-
-    report, targets, holds = commands.recognise_study(
-        arguments.output,
-        data=arguments.data,
-        model=arguments.model,
-        people=arguments.people,
-        strangers=arguments.strangers,
-        folds=arguments.folds,
-        seed=arguments.seed,
-        shape_spaces=arguments.shape_spaces,
-        jobs=arguments.jobs,
-        quiet=arguments.quiet,
-    )
-    if arguments.json:
-        _print_json({"report": str(report), "targets": targets})
-    else:
-        for line in holds.splitlines():
-            _print(line)
-        for one in targets:
-            _print(f"{one['what']}: {one['reached']} ({one['target']}{'' if one['met'] else '; missed'})")
-        _print(f"The report is {report}")
-    if not arguments.no_open:
-        import webbrowser
-
-        webbrowser.open(report.absolute().as_uri())
-    return 0
-
-
-def _view(arguments: argparse.Namespace) -> int:
-    from shapespace.viewer.serve import serve
-
-    serve(
-        arguments.path,
-        model=arguments.model,
-        host=arguments.host,
-        port=arguments.port,
-        open_browser=not arguments.no_open,
-        max_upload_mb=arguments.max_upload_mb,
-        quiet=arguments.quiet,
-        say=_now,
-    )
-    return 0
-
-
-def _now(line: str) -> None:
-    _print(line)
-    sys.stdout.flush()
-
-
-def _print_fit(record: Mapping[str, Any]) -> None:
-    if record["status"] == "failed":
-        return
-    final = record["distances_mm"]["final"]
-    _print(
-        f"{record['scan']['name']}: {record['status']}; model to scan {final['model_to_scan']['mean']:.2f} mm mean, "
-        f"scan to model {final['scan_to_model']['mean']:.2f} mm mean over "
-        f"{100 * final['scan_to_model']['fraction']:.0f} % of the scan"
-    )
-    if "dense" in record["distances_mm"]:
-        dense = record["distances_mm"]["dense"]["model_to_scan"]
-        _print(f"  dense surface to scan: {dense['median']:.2f} mm median, {dense['mean']:.2f} mm mean")
-    for note in record["notes"]:
-        print(f"  {note}")
-
-
-def _say(sentence: str) -> None:
-    print(_visible(sentence), file=sys.stderr)
-
-
-def _print(line: str) -> None:
-    print(_visible(line))
-
-
-def _print_json(facts: Any) -> None:
-    print(json.dumps(_plain(facts), indent=1, allow_nan=False))
-
-
-def _visible(line: str) -> str:
-    """Return `line` with control characters as escapes: a file's name may hold line breaks and terminal codes."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
-
-
-def _short(value: Any) -> str:
-    plain = _plain(value)
-    if isinstance(plain, list):
-        items = cast(list[Any], plain)
-        shown = ", ".join(_short(item) for item in items[:8])
-        return f"[{shown}{', ...' if len(items) > 8 else ''}]" + (f" ({len(items)})" if len(items) > 8 else "")
-    if isinstance(plain, dict):
-        return ", ".join(f"{key} {_short(item)}" for key, item in cast(dict[str, Any], plain).items())
-    return f"{plain:.6g}" if isinstance(plain, float) else str(plain)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in cast(Sequence[Any], value)]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if isinstance(value, (str, int, float, type(None))) else str(value)
+    sub.set_defaults(run=run.recognise_study, goes_on="; the same command goes on from there")
 
 
 def _positive(text: str) -> int:
@@ -727,7 +306,3 @@ def _control_points(text: str) -> tuple[int, int]:
 
 def _modes(text: str) -> int | str:
     return text if text in ("auto", "all") else _positive(text)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,172 @@
+"""A folder of results: which record is of which scan, what new results are called, and the table of all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from shapespace.batch.results import Source, coefficient_row, read_record, write_coefficients
+from shapespace.errors import FileError, ShapespaceError
+from shapespace.io.files import sha256_of_file
+
+COEFFICIENTS = "coefficients.csv"
+RECORD = ".fit.json"
+_LONGEST_NAME = 200
+
+
+def records_in(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield NAME and record of each NAME.fit.json directly in `folder` that can be read, in order of the names."""
+    for file in sorted(folder.glob(f"*{RECORD}")):
+        try:
+            yield file.name.removesuffix(RECORD), read_record(file)
+        except ShapespaceError:
+            continue  # a report names it
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Where a scan is; two are the same if these are.
+
+    Args:
+        name: of the file.
+        path: as records of the folder have it.
+    """
+
+    name: str
+    path: str
+
+    @staticmethod
+    def of(source: Mapping[str, Any]) -> _Scan:
+        return _Scan(str(source.get("name", "")), str(source.get("path", "")))
+
+
+def names_for(scans: Sequence[Path], folder: Path | None = None) -> list[str]:
+    """Return NAME of the result files of each scan: its file name without its ending, where that is free.
+
+    A scan that has results in `folder` keeps their name. Scans that share a name, with each other or with results of
+    another scan, get as much of their path before it as tells them apart. So no name depends on the order of `scans`.
+
+    Args:
+        scans: paths; one that is given twice has one name.
+        folder: where results go; None if nothing can be there.
+    """
+    taken: dict[str, _Scan] = {}
+    hashes: dict[str, str] = {}
+    for name, record in records_in(folder) if folder is not None else ():
+        if isinstance(record.get("scan"), dict):
+            source = cast(dict[str, Any], record["scan"])
+            taken[name] = _Scan.of(source)
+            hashes[name] = str(source.get("hash", ""))
+    own = {scan: name for name, scan in reversed(taken.items())}
+    keys = {scan: _key(scan, folder) for scan in scans}
+    names = {key: own[key] for key in keys.values() if key in own}
+    groups: dict[str, dict[_Scan, Path]] = {}
+    for scan, key in keys.items():
+        if key not in names:
+            groups.setdefault(_stem(scan).casefold(), {})[key] = scan
+    # Names that stand alone come first, so that none is taken from its owner.
+    for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
+        used = {name.casefold() for name in (*taken, *names.values())}
+        (key, scan), *others = group.items()
+        stem = _stem(scan)
+        if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
+            names[key] = stem
+        else:
+            names |= _told_apart(group, used)
+    return [names[keys[scan]] for scan in scans]
+
+
+def _key(scan: Path, folder: Path | None) -> _Scan:
+    if folder is None:
+        return _Scan(scan.name, str(scan.parent.resolve()))
+    return _Scan(scan.name, Source.at(scan, "", folder).path)
+
+
+def _stem(scan: Path) -> str:
+    return _shortened(scan.stem or scan.name)
+
+
+def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, folder: Path | None) -> bool:
+    """Return whether results of the same name are of `scan`, which has moved since, or do not say of what they are."""
+    if of_record is None or folder is None:
+        return False
+    if not of_record.path:
+        return of_record.name == scan.name
+    try:
+        return not (folder / of_record.path).exists() and sha256_of_file(scan) == content_hash
+    except FileError:
+        return False
+
+
+def _told_apart(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]:
+    folders = {key: scan.parent.resolve().parts[1:] for key, scan in group.items()}
+    ends = {key: scan.stem or scan.name for key, scan in group.items()}
+    if len({(folders[key], end) for key, end in ends.items()}) < len(group):
+        ends = {key: scan.name for key, scan in group.items()}
+    for depth in range(1, 1 + max(map(len, folders.values()))):
+        names = {key: "_".join((*folders[key][-depth:], ends[key])) for key in group}
+        counts = Counter(name.casefold() for name in names.values())
+        short = all(len(os.fsencode(name)) <= _LONGEST_NAME for name in names.values())
+        if short and max(counts.values()) == 1 and not counts.keys() & used:
+            return names
+    return {
+        key: f"{_shortened(scan.stem, 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
+        for key, scan in group.items()
+    }
+
+
+def _shortened(stem: str, most: int = _LONGEST_NAME) -> str:
+    # File names end at 255 bytes, and the results add theirs.
+    content = os.fsencode(stem)
+    return stem if len(content) <= most else content[:most].decode("utf-8", "ignore")
+
+
+class CoefficientTable:
+    """coefficients.csv of a folder: a row for each record in it, those of this run last.
+
+    Args:
+        folder: of the results.
+        names: of the results of this run, in order.
+        n_modes: of the model that is fitted; the table has as many coefficients as the largest record at least.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str], n_modes: int) -> None:
+        self._folder = folder
+        self._names = tuple(dict.fromkeys(names))
+        self._n_modes = n_modes
+        self._rows: dict[str, dict[str, Any]] = {}
+        for name, record in records_in(folder):
+            self._add_earlier(name, record)
+
+    def add(self, name: str, record: Mapping[str, Any]) -> None:
+        """Put in the row of a record, in place of an earlier one of that name."""
+        self._rows[name] = coefficient_row(name, record)
+        self._n_modes = max(self._n_modes, len(record.get("b", ())))
+
+    def catch_up(self, names: Sequence[str]) -> None:
+        """Put in the records of `names` that were written without being added, by workers that were stopped."""
+        for name in names:
+            with contextlib.suppress(ShapespaceError):  # never written
+                self._add_earlier(name, read_record(self._folder / f"{name}{RECORD}"))
+
+    def save(self) -> None:
+        """Write the table.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        others = [row for name, row in self._rows.items() if name not in self._names]
+        rows = [*others, *(self._rows[name] for name in self._names if name in self._rows)]
+        write_coefficients(self._folder / COEFFICIENTS, rows, self._n_modes)
+
+    def _add_earlier(self, name: str, record: Mapping[str, Any]) -> None:
+        try:
+            self.add(name, record)
+        except (KeyError, TypeError, AttributeError, ValueError):
+            self._rows.pop(name, None)  # damaged; a report names it

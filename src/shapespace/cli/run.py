@@ -1,0 +1,388 @@
+"""Each command: its arguments to what does it, and what came of it to the terminal; the exit code is returned."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from shapespace.cli.printing import now, say, short, show, show_json, warn
+
+_LISTED = 10
+"""Scans that the terminal lists."""
+_OTHER_SIZE = 0.02
+"""Share by which a millimetre of the scan differs from one of the model where both are told."""
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """Both experiments of the paper, ending in a report."""
+    from shapespace.demo import run_demo
+
+    report = run_demo(arguments.out, quick=arguments.quick, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"report": str(report)})
+    else:
+        show(f"The report is {report}")
+    _open(report, arguments)
+    return 0
+
+
+def _open(report: Path, arguments: argparse.Namespace) -> None:
+    if not arguments.no_open:
+        import webbrowser
+
+        webbrowser.open(report.absolute().as_uri())
+
+
+def report(arguments: argparse.Namespace) -> int:
+    """One HTML file on the results in a folder."""
+    from shapespace.commands.report import write_report
+
+    report = write_report(
+        arguments.folder, arguments.output, model=arguments.model, labels=arguments.labels, quiet=arguments.quiet
+    )
+    if arguments.json:
+        show_json({"report": str(report), "bytes": report.stat().st_size})
+    else:
+        show(f"The report is {report}")
+    _open(report, arguments)
+    return 0
+
+
+def data_list(arguments: argparse.Namespace) -> int:
+    """Open data sets."""
+    from shapespace.commands.data import data_list
+
+    rows = data_list()
+    if arguments.json:
+        show_json(rows)
+    else:
+        for row in rows:
+            for number, (key, value) in enumerate(row.items()):
+                show(f"{'  ' if number else ''}{key}: {value}")
+    return 0
+
+
+def data_get(arguments: argparse.Namespace) -> int:
+    """Download and verify an open data set."""
+    from shapespace.commands.data import data_get
+
+    folder = data_get(arguments.name, arguments.to, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"folder": str(folder)})
+    else:
+        show(str(folder))
+    return 0
+
+
+def data_faces(arguments: argparse.Namespace) -> int:
+    """Write simulated faces."""
+    from shapespace.commands.data import write_simulated_faces
+
+    names = [name.strip() for name in arguments.expressions.split(",") if name.strip()]
+    count = write_simulated_faces(
+        arguments.output,
+        source=arguments.source,
+        subjects=arguments.subjects,
+        expressions=names,
+        seed=arguments.seed,
+        area=arguments.area,
+        quiet=arguments.quiet,
+        raw=arguments.raw,
+    )
+    if arguments.json:
+        show_json({"folder": str(arguments.output), "faces": count})
+    else:
+        show(f"{count} {'face' if count == 1 else 'faces'} in {arguments.output}")
+    return 0
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """What is in each mesh, and what fitting will do about it."""
+    from shapespace.commands.look import check
+
+    reports = check(arguments.files, recursive=arguments.recursive, say=warn)
+    if arguments.json:
+        show_json(reports)
+    else:
+        for report in reports:
+            _print_check(report)
+    bad = sum(not report["usable"] for report in reports)
+    for report in reports:
+        if "error" in report:
+            say(f"shapespace: {report['error']}")
+    if not bad:
+        return 0
+    return 2 if bad == len(reports) else 1
+
+
+def _print_check(report: Mapping[str, Any]) -> None:
+    show(report["file"])
+    if "error" in report:
+        show(f"  unusable: {report['error']}")
+        return
+    for key, value in report.items():
+        if key not in ("file", "usable", "findings", "name"):
+            show(f"  {key}: {short(value)}")
+    for finding in report["findings"]:
+        what, action = finding["what"], finding["action"]
+        show(
+            f"  {finding['level']}: "
+            + (f"{what[:-1]}; {action}" if finding["level"] == "refused" else f"{what} {action}")
+        )
+    print("  usable" if report["usable"] else "  not usable for fitting")
+
+
+def build(arguments: argparse.Namespace) -> int:
+    """Build a shape model."""
+    from shapespace.commands.build import BuildSettings, build
+    from shapespace.commands.look import model_facts
+
+    modes = arguments.variance if arguments.variance is not None else arguments.modes
+    settings = BuildSettings(
+        modes=None if modes == "all" else modes,
+        gauge=arguments.gauge,
+        align=not arguments.no_align,
+        unit=arguments.unit,
+        representation=arguments.representation,
+        control_points=arguments.control_points,
+        landmarks=arguments.landmarks,
+        labels=arguments.additive,
+        expression_variance=arguments.expression_variance,
+        provenance=arguments.provenance,
+        licence=arguments.licence,
+        seed=arguments.seed,
+        recursive=arguments.recursive,
+        with_doubtful=arguments.with_doubtful,
+    )
+    model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
+    for note in notes:
+        say(note)
+    facts = model_facts(model)
+    if arguments.json:
+        show_json({"model": str(arguments.output), **facts})
+    else:
+        show(
+            f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
+            f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of "
+            f"{'the variance of people left out' if model.held_out else 'their variance'}, "
+            f"gauge {facts['gauge']}"
+        )
+    return 0
+
+
+def info(arguments: argparse.Namespace) -> int:
+    """Facts of a model, a mesh or a fit."""
+    from shapespace.commands.look import info
+
+    facts = info(arguments.file)
+    if arguments.json:
+        show_json(facts)
+    else:
+        for key, value in facts.items():
+            show(f"{key}: {short(value)}")
+    return 0
+
+
+def fit(arguments: argparse.Namespace) -> int:
+    """Fit a model to scans."""
+    if arguments.jobs != 1 and (len(arguments.scans) > 1 or arguments.scans[0].is_dir()):
+        from shapespace.batch.workers import start_loading
+
+        # While this process loads its own code; half of the time that many scans take to start.
+        start_loading(tell=not arguments.quiet)
+    from shapespace.commands.fit import BatchSettings, fit_scans
+    from shapespace.fit.fit import FitConfig
+    from shapespace.fit.methods import method_named
+
+    config = FitConfig(
+        method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
+        unit=arguments.unit,
+        scale=arguments.scale,
+        max_iterations=arguments.max_iterations,
+        seed=arguments.seed,
+        dense=arguments.dense,
+    )
+    settings = BatchSettings(
+        config, arguments.landmarks, arguments.jobs, arguments.resume, arguments.stages, arguments.recursive
+    )
+    records = fit_scans(arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn)
+    counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
+    for record in records.values():
+        counts[record["status"]] += 1
+    if arguments.json:
+        told = [{"name": name, **_without_history(record)} for name, record in records.items()]
+        show_json({"folder": str(arguments.output), "scans": len(records), **counts, "records": told})
+    elif counts["failed"] < len(records):
+        _print_fits(records, counts, arguments.output)
+    if counts["failed"] == len(records):
+        return 2
+    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def recognise_train(arguments: argparse.Namespace) -> int:
+    """Train a classifier."""
+    from shapespace.commands.recognise import recognise_train
+
+    facts, notes = recognise_train(
+        arguments.results,
+        arguments.labels,
+        arguments.output,
+        classifier=arguments.classifier,
+        relative=arguments.relative,
+        neutral=arguments.neutral,
+        confidence=arguments.confidence,
+        modes=arguments.modes,
+        expression_of=arguments.expression_of,
+        seed=arguments.seed,
+    )
+    for note in notes:
+        say(note)
+    if arguments.json:
+        show_json({"file": str(arguments.output), **facts})
+        return 0
+    training, checked = facts["training"], facts["cross_validation"]
+    show(
+        f"{arguments.output}: {facts['classifier']} of {len(facts['classes'])} classes from {training['scans']} scans"
+        + (f" of {training['subjects']} people" if training["subjects"] else "")
+        + f", {facts['modes']} modes"
+        + (", relative to neutral" if facts["relative_to_neutral"] else "")
+    )
+    if checked["macro_accuracy"] is not None:
+        left_out = "people" if checked["by"] == "subject" else "scans"
+        show(f"macro accuracy on {left_out} left out: {100 * checked['macro_accuracy']:.1f} %")
+    return 0
+
+
+def recognise_predict(arguments: argparse.Namespace) -> int:
+    """Answer for fitted scans."""
+    from shapespace.commands.recognise import recognise_predict
+
+    rows, counts = recognise_predict(arguments.classifier, arguments.results, arguments.output, labels=arguments.labels)
+    if arguments.json:
+        show_json({"file": str(arguments.output), **counts, "answers": rows})
+    else:
+        for row in rows[:_LISTED]:
+            p = max(row["probabilities"].values(), default=None)
+            show(
+                f"{row['scan']}: {row['prediction'] or 'no answer'}"
+                + (f" ({p:.2f})" if p is not None and not row["reason"] else "")
+                + (f"; {row['reason']}" if row["reason"] else "")
+            )
+        if len(rows) > _LISTED:
+            show(f"and {len(rows) - _LISTED} more; all are in {arguments.output}")
+        told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        show(f"{len(rows)} {'scan' if len(rows) == 1 else 'scans'}: {told}; answers in {arguments.output}")
+    asked = len(rows) - counts["neutral"]
+    if counts["failed"] == asked:
+        say("shapespace: no scan could be answered for; the reasons stand in the table.")
+        return 2
+    return 1 if counts["failed"] or (arguments.strict and counts["doubtful"] + counts["unsure"]) else 0
+
+
+def recognise_transfer(arguments: argparse.Namespace) -> int:
+    """Put one person's expression on another."""
+    from shapespace.commands.recognise import recognise_transfer
+
+    recognise_transfer(arguments.model, arguments.person, arguments.expression, arguments.output)
+    if arguments.json:
+        show_json({"file": str(arguments.output)})
+    else:
+        show(f"{arguments.output}: {arguments.person.name} with the expression of {arguments.expression.name}")
+    return 0
+
+
+def recognise_study(arguments: argparse.Namespace) -> int:
+    """Measure recognition on unseen people."""
+    from shapespace.commands.recognise import recognise_study
+
+    report, targets, holds = recognise_study(
+        arguments.output,
+        data=arguments.data,
+        model=arguments.model,
+        people=arguments.people,
+        strangers=arguments.strangers,
+        folds=arguments.folds,
+        seed=arguments.seed,
+        shape_spaces=arguments.shape_spaces,
+        jobs=arguments.jobs,
+        quiet=arguments.quiet,
+    )
+    if arguments.json:
+        show_json({"report": str(report), "targets": targets})
+    else:
+        for line in holds.splitlines():
+            show(line)
+        for one in targets:
+            show(f"{one['what']}: {one['reached']} ({one['target']}{'' if one['met'] else '; missed'})")
+        show(f"The report is {report}")
+    _open(report, arguments)
+    return 0
+
+
+def view(arguments: argparse.Namespace) -> int:
+    """Show a model and fits in the browser."""
+    from shapespace.viewer.serve import serve
+
+    serve(
+        arguments.path,
+        model=arguments.model,
+        host=arguments.host,
+        port=arguments.port,
+        open_browser=not arguments.no_open,
+        max_upload_mb=arguments.max_upload_mb,
+        quiet=arguments.quiet,
+        say=now,
+    )
+    return 0
+
+
+def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, int], folder: Path) -> None:
+    fitted = {name: record for name, record in records.items() if record["status"] != "failed"}
+    for name, record in list(fitted.items())[:_LISTED]:
+        _print_fit(name, record)
+    if len(fitted) > _LISTED:
+        more = len(fitted) - _LISTED
+        show(f"and {more} more {'scan' if more == 1 else 'scans'}; all are in {folder / 'coefficients.csv'}")
+    show(
+        f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
+        + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+        + f"; results in {folder}"
+    )
+
+
+def _print_fit(name: str, record: Mapping[str, Any]) -> None:
+    file = str(record["scan"]["name"])
+    # A scan that shares its file's name with others goes by the name of its results.
+    called = file if Path(file).stem == name else f"{name} ({file})"
+    told = _distances(record, "shown")
+    show(f"{called}: {record['status']}" + (f"; {told}" if told else ""))
+    if told := _distances(record, "shown_dense", measure="median"):
+        show(f"  dense surface to scan: {told.removeprefix('model to scan ')}")
+    for note in record["notes"]:
+        show(f"  {note}")
+
+
+def _distances(record: Mapping[str, Any], key: str, measure: str = "mean") -> str:
+    """Return the distances over what scan and model both show, in words; empty where the record does not tell."""
+    shown, in_scan = record.get(key), record.get(f"{key}_scan_mm")
+    if not shown or not in_scan:
+        return ""
+    told = [shown[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    if any(value is None or not math.isfinite(value) for value in told):
+        return "scan and model show nothing in common"
+    sizes = [in_scan[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    seen, covered = (f"{100 * shown[key]:.0f} %" for key in ("model_seen_share", "scan_covered_share"))
+    words = (
+        f"model to scan {told[0]:.2f} mm {measure} over the {seen} of it that the scan shows, "
+        f"scan to model {told[1]:.2f} mm {measure} over the {covered} of it that the model covers"
+    )
+    if abs(sizes[0] - told[0]) > _OTHER_SIZE * told[0]:
+        words += f" ({sizes[0]:.2f} and {sizes[1]:.2f} mm of the scan)"
+    return words
+
+
+def _without_history(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record.items() if key != "history"}

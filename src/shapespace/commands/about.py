@@ -1,0 +1,31 @@
+"""Provenance and licence, left beside simulated faces for the models that are made of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from shapespace.io.files import read_bytes, write_text
+
+ABOUT = "about.json"
+
+
+def write_about(folder: Path, provenance: str, licence: str) -> None:
+    """Write what the meshes in `folder` are.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    write_text(folder / ABOUT, json.dumps({"provenance": provenance, "licence": licence}, indent=1) + "\n")
+
+
+def read_about(folder: Path) -> tuple[str, str] | None:
+    """Return the provenance and licence of the meshes in `folder`, or None where nothing says so."""
+    path = folder / ABOUT
+    if not path.is_file():
+        return None
+    try:
+        stored = json.loads(read_bytes(path))
+        return str(stored["provenance"]), str(stored["licence"])
+    except (ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,287 @@
+"""What `build` does: meshes in correspondence to a model file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+
+from shapespace.batch.folder import RECORD
+from shapespace.batch.progress import progress, waiting
+from shapespace.batch.results import read_record
+from shapespace.batch.run import naming
+from shapespace.commands.about import ABOUT, read_about
+from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
+from shapespace.geometry.procrustes import Gauge
+from shapespace.io.files import make_folder
+from shapespace.io.folders import mesh_files
+from shapespace.io.labels import label_of, read_labels
+from shapespace.io.landmarks import read_landmark_indices, read_landmarks
+from shapespace.io.meshes import read_mesh
+from shapespace.model.representation import representation_named
+from shapespace.model.shape_model import ShapeModel
+from shapespace.recognise.scans import NEUTRAL
+from shapespace.types import MM_PER_UNIT, Mesh
+
+if TYPE_CHECKING:
+    from shapespace.model.additive import AdditiveModel
+
+_IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
+_SURFACES = (".dense.ply", ".fitted.ply")
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """What to make of which meshes.
+
+    Args:
+        modes: as of `ShapeModel.fit`; with `labels`, those of identity.
+        gauge: `form` or `shape`.
+        align: whether to align the meshes.
+        unit: of the meshes.
+        representation: what the modes move.
+        control_points: of a B-spline.
+        landmarks: a file of vertices, or of points on the first mesh; None looks for them.
+        labels: a table of subjects and expressions, for a model that parts both; None for a plain one.
+        expression_variance: with `labels`, the share that the modes of expression hold.
+        provenance: what the meshes are.
+        licence: of the meshes.
+        seed: of the cross-validation.
+        recursive: whether to take what lies in folders below those given too.
+        with_doubtful: whether to take surfaces of doubtful fits.
+
+    Raises:
+        InputError: settings that do not go together.
+    """
+
+    modes: int | float | Literal["auto"] | None = "auto"
+    gauge: Gauge = "shape"
+    align: bool = True
+    unit: str = "mm"
+    representation: str = "vertices"
+    control_points: tuple[int, int] | None = None
+    landmarks: Path | None = None
+    labels: Path | None = None
+    expression_variance: float | None = None
+    provenance: str = ""
+    licence: str = ""
+    seed: int = 0
+    recursive: bool = False
+    with_doubtful: bool = False
+
+    def __post_init__(self) -> None:
+        representation_named(self.representation, self.control_points)
+        if self.labels is None and self.expression_variance is not None:
+            raise InputError("--expression-variance belongs to --additive LABELS.csv; give both, or neither.")
+        if self.labels is not None and self.representation != "vertices":
+            raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
+        if self.labels is not None and not self.align:
+            raise InputError(
+                "A model that parts identity and expression aligns its faces itself; leave --no-align out."
+            )
+
+
+def build(
+    meshes: Sequence[Path], output: Path, settings: BuildSettings, *, quiet: bool
+) -> tuple[ShapeModel, list[str]]:
+    """Build a model from mesh files and save it; return it and what the user should know.
+
+    Surfaces of fits lead to their records: those of doubtful fits are left out unless asked for, and the landmarks of
+    the model that fitted them hold for them too.
+
+    Raises:
+        FileError: a mesh cannot be read, or the model not written.
+        FileFormatError: the record beside a surface is damaged.
+        MeshError: a mesh without vertices, or with faces that point past their end.
+        CorrespondenceError: the meshes differ in vertices or triangles.
+        InputError: too few meshes, no variation, too many modes asked for.
+    """
+    if output.suffix.lower() not in (".h5", ".hdf5"):
+        raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
+    found = mesh_files(meshes, recursive=settings.recursive)
+    notes = list(found.left_out)
+    files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
+    make_folder(output.absolute().parent)
+    loaded = _read(files, settings.unit, quiet=quiet)
+    marks = _landmarks(files, records, loaded[0], settings, notes)
+    settings = _with_origin(files, settings, notes)
+    if settings.modes == "auto" and len(files) < 4:
+        settings = replace(settings, modes=None)
+        notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+    with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
+        if settings.labels is not None:
+            additive = _additive(files, loaded, settings.labels, settings, marks)
+            additive.save(output)
+            notes.append(
+                f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
+                f"{settings.labels}."
+            )
+            return additive.shape, notes
+        model = ShapeModel.fit(
+            loaded,
+            modes=settings.modes,
+            gauge=settings.gauge,
+            align=settings.align,
+            landmarks=marks,
+            representation=settings.representation,
+            control_points=settings.control_points,
+            provenance=settings.provenance,
+            licence=settings.licence,
+            seed=settings.seed,
+        )
+        model.save(output)
+    if model.left_out:
+        what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
+        notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
+    return model, notes
+
+
+def _trusted(
+    files: Sequence[Path], notes: list[str], *, with_doubtful: bool
+) -> tuple[list[Path], dict[Path, Mapping[str, Any]]]:
+    """Return `files` without surfaces of doubtful fits, and the records of those that are surfaces of fits."""
+    records: dict[Path, Mapping[str, Any]] = {}
+    for file in files:
+        name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
+        if name is not None and (beside := file.with_name(f"{name}{RECORD}")).is_file():
+            records[file] = read_record(beside)
+    doubtful = [file for file in files if file in records and records[file].get("status") == "doubtful"]
+    if not doubtful:
+        return list(files), records
+    named = ", ".join(file.name for file in doubtful[:_NAMED]) + (", ..." if len(doubtful) > _NAMED else "")
+    what = "1 surface of a doubtful fit is" if len(doubtful) == 1 else f"{len(doubtful)} surfaces of doubtful fits are"
+    if with_doubtful:
+        notes.append(f"{what} taken too ({named}).")
+        return list(files), records
+    left = [file for file in files if file not in set(doubtful)]
+    if not left:
+        raise InputError(
+            f"All meshes are surfaces of doubtful fits ({named}); --with-doubtful takes them all the same."
+        )
+    notes.append(f"{what} left out ({named}); --with-doubtful takes them too.")
+    return left, {file: records[file] for file in left if file in records}
+
+
+def _read(files: Sequence[Path], unit: str, *, quiet: bool) -> list[Mesh]:
+    loaded: list[Mesh] = []
+    with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
+        for file in files:
+            mesh = _training_mesh(file)
+            loaded.append(mesh if unit == "mm" else mesh.with_vertices(mesh.vertices * MM_PER_UNIT[unit]))
+            bar.update()
+    return loaded
+
+
+def _training_mesh(path: Path) -> Mesh:
+    try:
+        mesh = read_mesh(path)
+    except MeshError as error:
+        raise MeshError(naming(path, str(error))) from error
+    if not len(mesh.vertices):
+        raise MeshError(f"{path}: it has no vertices, so no shape model can be made of it; leave it out.")
+    return mesh
+
+
+def _landmarks(
+    files: Sequence[Path],
+    records: Mapping[Path, Mapping[str, Any]],
+    first: Mesh,
+    settings: BuildSettings,
+    notes: list[str],
+) -> dict[str, int]:
+    """Return name -> vertex: as given, or from beside the first mesh, or those of the model that fitted the meshes."""
+    mm = MM_PER_UNIT[settings.unit]
+    if settings.landmarks is not None:
+        return _landmark_indices(settings.landmarks, first, mm)
+    beside = files[0].parent / "landmarks.csv"
+    if beside.is_file():
+        try:
+            marks = _landmark_indices(beside, first, mm)
+        except ShapespaceError as error:
+            notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
+            return {}
+        notes.append(f"Landmarks are taken from {beside}.")
+        return marks
+    return _landmarks_of_parent(files, records, first, notes)
+
+
+def _landmarks_of_parent(
+    files: Sequence[Path], records: Mapping[Path, Mapping[str, Any]], first: Mesh, notes: list[str]
+) -> dict[str, int]:
+    """Return the landmarks of the one model that fitted all `files`: they are vertices, in its order."""
+    sources = [record.get("model") for record in records.values()]
+    if len(records) < len(files) or not all(isinstance(source, dict) for source in sources):
+        return {}
+    known = cast(list[dict[str, Any]], sources)
+    if len({source.get("hash") for source in known}) > 1:
+        notes.append("The model has no landmarks, since the meshes were fitted by different models; give --landmarks.")
+        return {}
+    path = files[0].parent / str(known[0].get("path") or known[0].get("name"))
+    try:
+        parent = ShapeModel.load(path)
+    except ShapespaceError:
+        notes.append(f"The model has no landmarks, since the one that fitted these meshes is no longer at {path}.")
+        return {}
+    if parent.content_hash != known[0].get("hash") or parent.n_vertices != len(first.vertices):
+        notes.append(f"The model has no landmarks, since {path} is not the model that fitted these meshes.")
+        return {}
+    if parent.landmarks:
+        notes.append(f"Landmarks are those of {path}, which fitted these meshes.")
+    return dict(parent.landmarks)
+
+
+def _landmark_indices(path: Path, first: Mesh, mm: float) -> dict[str, int]:
+    """Return name -> vertex from a file of indices, or of points on the first mesh in the meshes' own unit."""
+    if path.suffix.lower() == ".csv":
+        try:
+            return read_landmark_indices(path)
+        except FileFormatError:
+            pass  # a CSV of points, not of indices
+    points = read_landmarks(path)
+    # argmin takes a vertex that is missing, and so not-a-number, for the least.
+    there = np.where(np.isnan(first.vertices), np.inf, first.vertices)
+    return {name: int(np.linalg.norm(there - mm * point, axis=1).argmin()) for name, point in points.items()}
+
+
+def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str]) -> BuildSettings:
+    """Return the settings with provenance and licence, from beside the meshes where none was given."""
+    abouts = {folder: read_about(folder) for folder in dict.fromkeys(file.parent for file in files)}
+    about = abouts[files[0].parent]
+    if about and not (settings.provenance or settings.licence):
+        if len(set(abouts.values())) == 1:
+            notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
+            return replace(settings, provenance=f"{len(files)} meshes of: {about[0]}", licence=about[1])
+        notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
+    said = settings.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
+    return replace(settings, provenance=said)
+
+
+def _additive(
+    files: Sequence[Path], meshes: Sequence[Mesh], labels: Path, settings: BuildSettings, landmarks: Mapping[str, int]
+) -> AdditiveModel:
+    from shapespace.model.additive import AdditiveModel
+
+    known = read_labels(labels)
+    found = [label_of(known, file) for file in files]
+    own = [label for label in found if label is not None and label.subject]
+    if len(own) < len(files):
+        lacking = [file.name for file, label in zip(files, found, strict=True) if label is None or not label.subject]
+        raise InputError(
+            f"{labels} has no subject for {', '.join(lacking[:3])}; each mesh needs a label and a subject."
+        )
+    expression_modes = settings.expression_variance
+    return AdditiveModel.fit(
+        meshes,
+        [label.subject for label in own],
+        [label.text == NEUTRAL for label in own],
+        identity_modes=_IDENTITY_VARIANCE if settings.modes == "auto" else settings.modes,
+        expression_modes=_EXPRESSION_VARIANCE if expression_modes is None else expression_modes,
+        gauge=settings.gauge,
+        landmarks=landmarks,
+        provenance=settings.provenance,
+        licence=settings.licence,
+    )

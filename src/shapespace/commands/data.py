@@ -1,0 +1,72 @@
+"""What `data` does: open data sets, and simulated faces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from shapespace.batch.progress import progress
+from shapespace.commands.about import write_about
+from shapespace.errors import InputError
+from shapespace.io.files import make_folder
+
+
+def data_list() -> list[dict[str, object]]:
+    """Return the open data sets with licence, size, hash, and whether they are here already."""
+    from shapespace.datasets import fetch  # loads much, as the generators of faces do
+
+    return fetch.data_list()
+
+
+def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
+    """Return the folder of a data set, downloaded and verified if it is not here yet.
+
+    Raises:
+        DataError: no such data set, no network, or content that does not match its hash.
+    """
+    from shapespace.datasets import fetch
+
+    return fetch.data_get(name, to=to, progress=False if quiet else None)
+
+
+def write_simulated_faces(
+    folder: Path,
+    *,
+    source: str,
+    subjects: int,
+    expressions: Sequence[str],
+    seed: int,
+    area: str,
+    quiet: bool,
+    raw: bool = False,
+) -> int:
+    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
+
+    Raises:
+        InputError: an unknown expression or area.
+        DataError: ICT-FaceKit is asked for and absent.
+        FileError: the folder cannot be written.
+    """
+    from shapespace.datasets import faces as bundled
+    from shapespace.datasets import ict
+
+    make_folder(folder)
+    total = subjects * len(expressions)
+    with progress(total, "writing", "face", quiet=quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        if source == "ict-facekit":
+            if area not in ("face", "face_and_head"):
+                raise InputError(f"The area must be face or face_and_head, not {area!r}.")
+            ict.write_people(
+                folder, subjects=subjects, seed=seed, area=area, expressions=expressions, raw=raw, progress=step
+            )
+        else:
+            bundled.write_faces(folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, progress=step)
+    licence, of = ("MIT", f"ICT-FaceKit, area {area}") if source == "ict-facekit" else (bundled.LICENSE, "shapespace")
+    said = f"{subjects} simulated people of {of}, seed {seed}, expressions: {', '.join(expressions)}"
+    write_about(folder, said, licence)
+    return total

@@ -1,0 +1,216 @@
+"""What `recognise` does: train, predict, transfer, study."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.batch.folder import RECORD
+from shapespace.batch.progress import telling_of_compiling
+from shapespace.batch.results import read_record
+from shapespace.batch.workers import cores
+from shapespace.errors import InputError
+from shapespace.io.files import make_folder, read_bytes, read_error
+from shapespace.io.labels import read_labels
+from shapespace.io.meshes import write_mesh
+from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, one_model, read_coefficients
+from shapespace.types import FloatArray
+
+
+def read_scans(path: Path) -> list[ScanCoefficients]:
+    """Return the fits in a folder that `fit` wrote, or in a coefficients.csv, in the order of their names or rows.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: a record or the table is damaged.
+        InputError: the folder holds no records of fits.
+    """
+    if not path.is_dir():
+        return read_coefficients(path)
+    try:
+        files = sorted(p for p in path.iterdir() if p.name.endswith(RECORD) and p.is_file())
+    except OSError as error:
+        raise read_error(path, error) from error
+    if not files:
+        raise InputError(f"{path} holds no results of fits; give a folder that shapespace fit wrote.")
+    return [from_record(file.name.removesuffix(RECORD), read_record(file)) for file in files]
+
+
+def recognise_train(
+    results: Path,
+    labels: Path,
+    output: Path,
+    *,
+    classifier: str,
+    relative: bool,
+    neutral: str,
+    confidence: float,
+    modes: int | None,
+    expression_of: Path | None,
+    seed: int,
+) -> tuple[dict[str, Any], list[str]]:
+    """Train a classifier on the fits in `results` and save it; return its facts and what the user should know.
+
+    Raises:
+        FileError: something cannot be read, or the classifier not written.
+        FileFormatError: results or labels are damaged.
+        InputError: what `train_classifier` refuses, fits of another model than `expression_of`, or a name that does
+            not end in .skops.
+        ModelFileError: `expression_of` does not part identity and expression.
+        ShapespaceError: the extra `recognise` is not installed.
+    """
+    from shapespace.model.additive import AdditiveModel
+    from shapespace.recognise.predict import train_classifier
+
+    scans = labelled(read_scans(results), read_labels(labels, of_subjects=False))
+    projection: FloatArray | None = None
+    if expression_of is not None:
+        model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
+        if model.shape.content_hash != fitted_with:
+            raise InputError(
+                f"{results} holds fits of the model {fitted_with[:12]}, and {expression_of} is "
+                f"{model.shape.content_hash[:12]}; give the model that the scans were fitted with."
+            )
+        projection = model.rotation[model.n_identity :]
+    saved, notes = train_classifier(
+        scans, classifier=classifier, relative=relative, neutral=neutral, confidence=confidence, modes=modes,
+        projection=projection, seed=seed,
+    )  # fmt: skip
+    make_folder(output.absolute().parent)
+    saved.save(output)
+    return saved.facts(), notes
+
+
+def recognise_predict(
+    classifier: Path, results: Path, output: Path, *, labels: Path | None
+) -> tuple[list[dict[str, Any]], dict[str, int]]:
+    """Write the classifier's answer for each fit in `results`; return the rows, and counts of what came out.
+
+    The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
+    neutral face is missing) and `neutral` (faces that others are compared with).
+
+    Raises:
+        FileError: something cannot be read, or the answers not written.
+        FileFormatError: the classifier, results or labels are damaged.
+        InputError: the fits are of another model than the classifier, or labels are needed.
+        ShapespaceError: the extra `recognise` is not installed.
+    """
+    from shapespace.recognise.predict import UNSURE, predict_scans, write_answers
+    from shapespace.recognise.saved import load_classifier
+
+    saved = load_classifier(classifier)
+    if saved.relative_to_neutral and labels is None:
+        raise InputError(
+            f"{classifier} compares with each subject's neutral face; give --labels with the columns file, label and "
+            "subject."
+        )
+    scans = read_scans(results)
+    answers = predict_scans(saved, labelled(scans, read_labels(labels)) if labels is not None else scans)
+    make_folder(output.absolute().parent)
+    write_answers(output, answers, saved.classes)
+    counts: dict[str, int] = dict.fromkeys(("answered", "unsure", "doubtful", "failed", "neutral"), 0)
+    rows: list[dict[str, Any]] = []
+    for answer in answers:
+        if answer.neutral:
+            kind = "neutral"
+        elif answer.probabilities is None:
+            kind = "doubtful" if answer.status == "doubtful" else "failed"
+        else:
+            kind = "unsure" if answer.prediction == UNSURE else "answered"
+        counts[kind] += 1
+        p = answer.probabilities
+        rows.append({
+            "scan": answer.scan,
+            "status": answer.status,
+            "prediction": answer.prediction,
+            "probabilities": {} if p is None else dict(zip(saved.classes, p.tolist(), strict=True)),
+            "reason": answer.reason,
+        })  # fmt: skip
+    return rows, counts
+
+
+def recognise_transfer(model: Path, person: Path, expression: Path, output: Path) -> None:
+    """Write the person of one fit with the expression of another, as a mesh.
+
+    Raises:
+        FileError: something cannot be read, or the mesh not written.
+        FileFormatError: a record is damaged.
+        InputError: the model does not part identity and expression, or a fit is of another one.
+    """
+    from shapespace.model.additive import AdditiveModel
+
+    additive = AdditiveModel.load(model)
+    z: list[FloatArray] = []
+    for path in (person, expression):
+        record = read_record(path)
+        if record.get("status") == "failed":
+            raise InputError(f"{path} is the record of a fit that failed, so there is nothing to transfer.")
+        source = record.get("model")
+        if not isinstance(source, dict) or cast(dict[str, Any], source).get("hash") != additive.shape.content_hash:
+            raise InputError(f"{path} is a fit by another model than {model.name}; fit the scan with this one.")
+        values = np.asarray(record.get("z", []), dtype=np.float64)
+        if values.shape != (additive.shape.n_modes,):
+            raise InputError(
+                f"{path} holds {len(values)} coefficients of {additive.shape.n_modes}; fit the scan with all modes."
+            )
+        z.append(values)
+    write_mesh(output, additive.transfer(z[0], z[1]))
+
+
+def recognise_study(
+    output: Path,
+    *,
+    data: Path | None,
+    model: Path | None,
+    people: int | None,
+    strangers: int | None,
+    folds: int | None,
+    seed: int | None,
+    shape_spaces: bool,
+    jobs: int,
+    quiet: bool,
+) -> tuple[Path, list[dict[str, Any]], str]:
+    """Run the recognition study; return its report, its targets and what the scans are, in words.
+
+    Raises:
+        DataError: ICT-FaceKit is not here.
+        FileError: something cannot be read or written.
+        InputError: arguments that do not go together, or a folder of another study.
+        ShapespaceError: the extras `recognise` and `report` are not installed.
+    """
+    if (data is None) != (model is None):
+        raise InputError("A study of scans of your own needs both --data DIR and --model MODEL.h5.")
+    if data is not None and (people is not None or strangers is not None or shape_spaces):
+        raise InputError(
+            "--people, --strangers and --shape-spaces belong to the simulated study; leave them out with --data."
+        )
+    from shapespace.study.run import run_own_study, run_study  # needs the extras
+
+    workers = jobs or cores()
+    holds = ""
+    with telling_of_compiling(quiet=quiet):
+        if data is not None and model is not None:
+            report, holds = run_own_study(
+                output, data, model, folds=folds or 10, workers=workers, seed=seed or 0, quiet=quiet
+            )
+        else:
+            from shapespace.datasets.study_people import StudyPeople
+            from shapespace.study.shape_spaces import ShapeSpaces
+            from shapespace.study.simulated import StudyConfig
+
+            chosen = StudyPeople() if people is None else StudyPeople(people=people)
+            chosen = chosen if seed is None else replace(chosen, seed=seed)
+            usual = StudyConfig()
+            config = StudyConfig(
+                people=chosen,
+                folds=usual.folds if folds is None else folds,
+                strangers=usual.strangers if strangers is None else strangers,
+            )
+            compared = ShapeSpaces() if shape_spaces else None
+            report = run_study(output, config, workers=workers, quiet=quiet, compared=compared)
+    content = json.loads(read_bytes(output / "recognition.json"))
+    return report, content["targets"], holds
