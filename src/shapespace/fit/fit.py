@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from shapespace import __version__
 from shapespace.errors import FitError, InputError
 from shapespace.fit.regions import all_followed
+from shapespace.fit.reliability import reliability
 from shapespace.fit.result import FitResult, Stage, Status, doubts, posterior_stddev
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings, RobustSettings
@@ -239,10 +240,14 @@ def _fit_scan(
     if config.dense:
         stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
     dense_s = time.perf_counter() - dense_from
-    evidence = dict(fitted.evidence)
+    evidence, beside = dict(fitted.evidence), None
     if config.method == "robust":
-        evidence |= start_evidence(start)
-        against = doubts_of_robust(evidence)
+        from shapespace.fit.another import another_beside, doubts_of_layers, layers  # compiled
+
+        evidence |= {**start_evidence(start), **layers(model, target, fitted)}
+        evidence |= reliability(evidence).as_evidence()
+        against = [*doubts_of_layers(evidence), *doubts_of_robust(evidence)]
+        beside = another_beside(model, target, fitted, config.robust, with_scale=fits_scale(model, config))
     else:
         against = doubts(model, stages, start.T_scan_model.scale / mm)
     status, reason = _verdict(against, ended[1][0], ended[2][0], config)
@@ -273,6 +278,7 @@ def _fit_scan(
             *_far_out(model, fitted.b),
             *_no_triangles(scan),
             *_not_all_seen(stages),
+            *([] if beside is None else [beside]),
         ],
         seconds={
             "start": clock[1] - clock[0],

@@ -91,12 +91,35 @@ def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_mod
         1.0 - variance / prior[:K],
         {
             **_matched(fit, v, fit.b[: model.n_modes] ** 2 / new_shapes),
+            "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / len(x))),
+            "model_lack_mm": lack_of_new_shapes(model),
             "spread_mm": fit.sigma_mm,
             "beyond_model_mm": beyond_model_mm,
             "left_out_mm": float(np.sqrt(left_out)),
-            "expected_error_mm": float(np.sqrt(max(expected, 0.0) + left_out)),
+            "posterior_error_mm": float(np.sqrt(max(expected, 0.0) + left_out)),
         },
     )
+
+
+def lack_of_new_shapes(model: ShapeModel) -> float:
+    """Return how far, RMS over the vertices, mm, a new shape of the kind lies outside the model, by its spectrum.
+
+    A training shape lies 1 / (G^-1)_ii outside the span of the others, G their Gram matrix; that is about N times the
+    harmonic mean of the variances. What modes that were cut off held comes on top. Where variances were found on shapes
+    left out, what they leave is what new shapes leave.
+    """
+    spectrum, left = _whole_spectrum(model)
+    outside = 0.0 if model.held_out else model.n_training / float((1.0 / spectrum).mean())
+    return float(np.sqrt((left + outside) / model.n_vertices))
+
+
+def _whole_spectrum(model: ShapeModel) -> tuple[FloatArray, float]:
+    """Return the variances of all N - 1 modes, those not kept sharing alike what is left, and what is left."""
+    own = model.stddev**2
+    left, rest = model.total_variance - float(own.sum()), model.n_training - 1 - model.n_modes
+    if rest > 0 and left > _ALL_KEPT * model.total_variance:
+        return np.concatenate([own, np.full(rest, left / rest)]), left
+    return own, 0.0
 
 
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
@@ -108,13 +131,9 @@ def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     are taken as they are where they were found on shapes left out.
     """
     own, n = model.stddev**2, model.n_training
-    left = model.total_variance - float(own.sum())
-    rest = n - 1 - model.n_modes
     if n < _FEWEST_SHAPES or model.held_out:
         return own
-    spectrum = own
-    if rest > 0 and left > _ALL_KEPT * model.total_variance:
-        spectrum = np.concatenate([own, np.full(rest, left / rest)])
+    spectrum, _ = _whole_spectrum(model)
     c = len(spectrum) / (n - 1)
     density, transform = _smoothed(spectrum, n)
     if c < 1:
@@ -207,6 +226,8 @@ def _matched(fit: JointFit, v: FloatArray, z2: FloatArray) -> dict[str, float]:
         "model_allowed_share": float(vertices.allowed.mean()),
         "scan_allowed_share": float(scan.allowed.mean()),
         "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
+        "scan_near_share": float((scan.distance < _NEAR * size_mm).mean()),
+        "points_per_vertex": len(fit.target.mesh.vertices) / len(fit.surface.vertices),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),
         "log_scale": float(np.log(fit.T.scale)),

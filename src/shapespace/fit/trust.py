@@ -53,7 +53,7 @@ def _log_share(share: float) -> float:
 
 INPUTS = (
     Input(
-        lambda e: math.log(max(e["expected_error_mm"] / e["size_mm"], 1e-6)),
+        lambda e: math.log(max(e["posterior_error_mm"] / e["size_mm"], 1e-6)),
         least=-6.5,
         usual=-4.519,
         weight=1.293,
@@ -144,7 +144,7 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     """Return reasons not to trust a robust fit, what weighs most first; none where nothing speaks against it.
 
     Args:
-        evidence: of `posterior` and `start_evidence`; lengths in mm of the model's frame.
+        evidence: of `posterior`, `start_evidence` and `reliability`; lengths in mm of the model's frame.
     """
     parts = _contributions(evidence)
     beyond = [i for i, each in enumerate(INPUTS) if each.value(evidence) > each.most]
