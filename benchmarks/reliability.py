@@ -330,7 +330,7 @@ def tune(found: list[dict[str, Any]]) -> str:
 
     Weights: a regression of the logarithm of the error on "dev", by Huber's loss with a small ridge on standardised
     inputs and no weight below zero. Offset and interval: quantiles of what that leaves on "calibration". The
-    probability of failure: a logistic regression of no slope below zero on both.
+    probability of failure: a logistic regression on both.
     """
     dev, held = (told([r for r in found if r["split"] == split]) for split in ("dev", "calibration"))
     raw = np.array([[value(r["evidence"]) for value in reliability.INPUTS.values()] for r in dev])
@@ -357,14 +357,15 @@ def tune(found: list[dict[str, Any]]) -> str:
     high = left[min(int(np.ceil((len(left) + 1) * (1 - outside))) - 1, len(left) - 1)] - offset
     judged = [r for r in found if r.get("evidence") and r["split"] != "test"]
     wrong = np.array([failed(r) for r in judged])
-    x = np.array([(*reliability.failure_inputs(r["evidence"], min(offset + foretold(r), 0.0)), 1.0) for r in judged])
+    bound = np.log(reliability.FAILED_SHARE)
+    x = np.array([(min(offset + foretold(r), 0.0) - bound, 1.0) for r in judged])
     sign = np.where(wrong, -1.0, 1.0)
 
     def unlikely(t: np.ndarray) -> tuple[float, np.ndarray]:
         margin = sign * (x @ t)
         return float(np.logaddexp(0, margin).sum()), x.T @ (sign / (1 + np.exp(-margin)))
 
-    f = minimize(unlikely, np.zeros(3), jac=True, method="L-BFGS-B", bounds=[(0, None), (0, None), (None, None)]).x
+    f = minimize(unlikely, np.zeros(2), jac=True, method="L-BFGS-B", bounds=[(0, None), (None, None)]).x
     return "\n".join(
         [
             f"# {len(dev)} fits of dev, {len(held)} of calibration; {int(wrong.sum())} of {len(judged)} failed",
@@ -373,7 +374,7 @@ def tune(found: list[dict[str, Any]]) -> str:
             "}",
             f"OFFSET = {offset:.3f}",
             f"LOW, HIGH = {np.exp(low):.3f}, {np.exp(high):.3f}",
-            f"FAILURE_OFFSET, FAILURE_BY_ERROR, FAILURE_BY_SCORE = {f[2]:.3f}, {f[0]:.3f}, {f[1]:.3f}",
+            f"FAILURE_OFFSET, FAILURE_SLOPE = {f[1]:.3f}, {f[0]:.3f}",
         ]
     )
 

@@ -227,7 +227,6 @@ def _matched(fit: JointFit, v: FloatArray, z2: FloatArray) -> dict[str, float]:
         "scan_allowed_share": float(scan.allowed.mean()),
         "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
         "scan_near_share": float((scan.distance < _NEAR * size_mm).mean()),
-        "points_per_vertex": len(fit.target.mesh.vertices) / len(fit.surface.vertices),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),
         "log_scale": float(np.log(fit.T.scale)),

@@ -1,10 +1,11 @@
 """How far off a robust fit is, by its evidence: an expected error, an interval, a probability that it failed.
 
-The posterior's own figure knows nothing of what it takes for granted: that residuals are noise of the model's kind, and
-that the model varies as far as it says. So the mean vertex error is foretold from that figure together with what speaks
-against it, as a product of powers: true / size = exp(offset) * product of inputs ** weight, no weight below zero. How
-far the truth then lies from it was counted on fits that took no part in the weights (split-conformal: Papadopoulos et
-al., ECML 2002), which gives the interval. Every input is free of units.
+The posterior's own figure takes for granted that residuals are noise, and that shapes vary as the model says; where
+neither holds it falls while the error rises. So the mean vertex error is foretold from that figure together with what
+speaks against it, as a product of powers: true / size = exp(offset) * product of inputs ** weight, no weight below
+zero. How far the truth then lies from it was counted on fits that took no part in the weights (split-conformal:
+Papadopoulos et al., ECML 2002), which gives the interval. The expected error alone foretells a failure as well as with
+any other evidence beside it. Every input is free of units.
 """
 
 from __future__ import annotations
@@ -13,14 +14,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
-from shapespace.fit.trust import score
-
 FAILED_SHARE = 0.0375
 """A fit has failed if its mean vertex error exceeds this share of the model's size (3 mm on a face), or if the scan
 shows something else."""
 COVERAGE = 0.9
 _LEAST_SHARE, _LEAST_LACK, _LEAST_LENGTH = 0.02, 1e-3, 1e-4
-_MOST_SCORE = 10.0
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,7 @@ INPUTS: Mapping[str, Callable[[Mapping[str, float]], float]] = {
     "spread": lambda e: _log(e["spread_mm"] / e["size_mm"]),
     "spread beside the model's": lambda e: _log(e["spread_mm"] / max(e["model_spread_mm"], 1e-9)),
     "lack": lambda e: _log(e["model_lack_mm"] / e["size_mm"], _LEAST_LACK),
-    "points": lambda e: _log(e["points_per_vertex"]),
-    "unmatched": lambda e: -_log(e["model_matched_share"], _LEAST_SHARE),
+    "facing otherwise": lambda e: -_log(e["scan_allowed_share"], _LEAST_SHARE),
     "far out": lambda e: max(_log(e["z2"]), 0.0),
     "layers": lambda e: e["layered_share"],
 }
@@ -63,28 +60,22 @@ INPUTS: Mapping[str, Callable[[Mapping[str, float]], float]] = {
 
 # Made by `python benchmarks/reliability.py --tune`; see there.
 WEIGHTS: Mapping[str, float] = {
-    "posterior": 0.989,
-    "spread": 0.272,
-    "spread beside the model's": 0.165,
-    "lack": 0.129,
-    "points": 0.135,
-    "unmatched": 0.578,
-    "far out": 0.256,
-    "layers": 3.518,
+    "posterior": 0.969,
+    "spread": 0.245,
+    "spread beside the model's": 0.144,
+    "lack": 0.119,
+    "facing otherwise": 1.467,
+    "far out": 0.272,
+    "layers": 2.638,
 }
-OFFSET = 2.32
-LOW, HIGH = 0.5, 2.5
-FAILURE_OFFSET, FAILURE_BY_ERROR, FAILURE_BY_SCORE = 0.0, 2.0, 0.5
+OFFSET = 1.917
+LOW, HIGH = 0.530, 2.432
+FAILURE_OFFSET, FAILURE_SLOPE = 0.240, 3.601
 
 
 def log_error(evidence: Mapping[str, float]) -> float:
     """Return the logarithm of the expected error as a share of the model's size, at most 0."""
     return min(OFFSET + sum(weight * INPUTS[name](evidence) for name, weight in WEIGHTS.items()), 0.0)
-
-
-def failure_inputs(evidence: Mapping[str, float], log_error: float) -> tuple[float, float]:
-    """Return what the probability of failure goes by: `log_error` above the bound, and the score of trust."""
-    return log_error - math.log(FAILED_SHARE), max(-_MOST_SCORE, min(score(evidence), _MOST_SCORE))
 
 
 def reliability(evidence: Mapping[str, float]) -> Reliability:
@@ -94,7 +85,6 @@ def reliability(evidence: Mapping[str, float]) -> Reliability:
         evidence: of `posterior`, with `layered_share` of `another`; lengths in mm of the model's frame.
     """
     error = log_error(evidence)
-    beyond, doubt = failure_inputs(evidence, error)
-    margin = FAILURE_OFFSET + FAILURE_BY_ERROR * beyond + FAILURE_BY_SCORE * doubt
+    margin = FAILURE_OFFSET + FAILURE_SLOPE * (error - math.log(FAILED_SHARE))
     expected = math.exp(error) * evidence["size_mm"]
     return Reliability(expected, LOW * expected, HIGH * expected, 1.0 / (1.0 + math.exp(-margin)))
