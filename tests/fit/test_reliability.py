@@ -58,9 +58,9 @@ def test_the_expected_error_is_near_the_truth_for_noise_and_for_models_far_too_n
     result = fit_scan(model, simulate_scan(shape, np.random.default_rng(0), triangles=6_000, noise_mm=noise_mm).scan)
     error = float(np.linalg.norm(result.surface().vertices - shape.vertices, axis=1).mean())
     told = result.evidence
-    assert error / 3.5 < told["expected_error_mm"] < 3.5 * error
+    assert error / 4 < told["expected_error_mm"] < 4 * error
     if width < 1.0:
-        assert told["posterior_error_mm"] < error / 3.5
+        assert told["posterior_error_mm"] < error / 4
 
 
 def test_the_lack_of_a_model_is_how_far_shapes_left_out_lie_outside_it() -> None:
