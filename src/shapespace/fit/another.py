@@ -24,7 +24,7 @@ from shapespace.geometry.surface import rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
-# Chosen on the splits "dev" and "calibration" of `benchmarks/reliability.py`, and on a real scan with hair and neck.
+# Chosen on fits of `benchmarks/reliability.py`, heads, hair and collars, and a real scan with hair and neck.
 _NEAR = 0.05
 _EXPLAINED = 0.75
 _LEAST_REST = 0.25
