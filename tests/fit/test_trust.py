@@ -13,7 +13,7 @@ from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
 GOOD: Mapping[str, float] = {
-    "expected_error_mm": 0.9, "size_mm": 80.0, "spread_mm": 0.55, "model_near_share": 0.92, "seen_share": 0.5,
+    "posterior_error_mm": 0.9, "size_mm": 80.0, "spread_mm": 0.55, "model_near_share": 0.92, "seen_share": 0.5,
     "scan_allowed_share": 0.94, "model_matched_share": 0.7,
     "z2": 1.0, "z2_leading": 1.0, "log_scale": 0.0,
 }  # fmt: skip
@@ -22,7 +22,7 @@ GOOD: Mapping[str, float] = {
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("expected_error_mm", 6.0, "6.0 mm off"),
+        ("posterior_error_mm", 6.0, "6.0 mm off"),
         ("spread_mm", 8.0, "8.0 mm apart"),
         ("model_near_share", 0.03, "3 % of the model has"),
         ("seen_share", 0.02, "2 % of the model's vertices"),
@@ -32,7 +32,7 @@ GOOD: Mapping[str, float] = {
 )
 def test_each_fault_alone_is_doubted_and_named_first(name: str, value: float, said: str) -> None:
     assert doubts_of_robust(GOOD) == []
-    assert said in doubts_of_robust({**GOOD, name: value})[0]
+    assert said in doubts_of_robust({"expected_error_mm": 6.0, **GOOD, name: value})[0]
 
 
 def test_worse_evidence_never_makes_a_fit_more_trusted() -> None:
@@ -49,7 +49,9 @@ def test_worse_evidence_never_makes_a_fit_more_trusted() -> None:
 
 def test_a_shape_near_the_mean_makes_up_for_nothing() -> None:
     # Where hardly anything matched, the shape stays at the mean.
-    assert doubts_of_robust({**GOOD, "expected_error_mm": 12.0, "z2": 1e-5, "z2_leading": 1e-5})
+    assert doubts_of_robust(
+        {**GOOD, "posterior_error_mm": 12.0, "expected_error_mm": 12.0, "z2": 1e-5, "z2_leading": 1e-5}
+    )
 
 
 def cut_blob(*, missing: bool) -> Mesh:

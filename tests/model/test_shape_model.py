@@ -1,5 +1,6 @@
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -263,6 +264,26 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
         fields = {k: getattr(m, k) for k in ("mean", "basis", "stddev", "total_variance", "n_training", "faces")}
         with pytest.raises(InputError):
             ShapeModel(**(fields | change))
+
+
+@pytest.mark.parametrize(("times", "said"), [(1e-30, "less than the rounding"), (1e12, "no shape of its size")])
+def test_standard_deviations_that_cannot_be_are_refused_in_one_sentence(
+    saved: Path, tmp_path: Path, times: float, said: str
+) -> None:
+    model = ShapeModel.load(saved)
+    with pytest.raises(InputError, match=said):
+        replace(model, stddev=model.stddev * [1.0, *[times] * (model.n_modes - 1)])
+    with h5py.File(saved) as file:
+        arrays = {k: v[()] for k, v in file.items()} | {"stddev": model.stddev * times}
+        attributes = {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
+    write_hdf5(tmp_path / "m.h5", arrays, attributes)
+    with pytest.raises(ModelFileError, match=said):
+        ShapeModel.load(tmp_path / "m.h5")
+
+
+def test_models_a_thousand_times_too_narrow_or_too_wide_are_no_error(model: ShapeModel) -> None:
+    for times in (1e-3, 1e3):
+        assert replace(model, stddev=model.stddev * times).n_modes == model.n_modes
 
 
 @pytest.mark.parametrize("gauge", ["form", "shape"])

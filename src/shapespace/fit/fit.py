@@ -18,7 +18,7 @@ from shapespace.fit.methods import method_named
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings
-from shapespace.fit.start import Start, find_unit, start_evidence, start_from_any_pose, start_from_landmarks
+from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.verdict import verdict
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
@@ -162,8 +162,14 @@ def fit_scan(
             "version": __version__,
         },
         start=placed.start.how,
-        evidence={**fitted.evidence, **(start_evidence(placed.start) if fitted.evidence else {})},
-        notes=[*placed.findings, *_far_out(model, fitted.b), *_no_triangles(placed.scan), *_not_all_seen(stages)],
+        evidence=fitted.evidence,
+        notes=[
+            *placed.findings,
+            *_far_out(model, fitted.b),
+            *_no_triangles(placed.scan),
+            *_not_all_seen(stages),
+            *fitted.notes,
+        ],
         seconds={
             "start": clock[1] - clock[0],
             "phase_1": driven.phase_2_from - clock[1],

@@ -130,13 +130,9 @@ def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     are taken as they are where they were found on shapes left out.
     """
     own, n = model.stddev**2, model.n_training
-    left = model.total_variance - float(own.sum())
-    rest = n - 1 - model.n_modes
     if n < _FEWEST_SHAPES or model.held_out:
         return own
-    spectrum = own
-    if rest > 0 and left > _ALL_KEPT * model.total_variance:
-        spectrum = np.concatenate([own, np.full(rest, left / rest)])
+    spectrum, _ = _whole_spectrum(model)
     c = len(spectrum) / (n - 1)
     density, transform = _smoothed(spectrum, n)
     if c < 1:
@@ -144,6 +140,27 @@ def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     else:
         shrunk = 1.0 / (np.pi**2 * spectrum * (density**2 + transform**2))
     return np.maximum(own, shrunk[: len(own)])
+
+
+def lack_of_new_shapes(model: ShapeModel) -> float:
+    """Return how far, RMS over the vertices, mm, a new shape of the kind lies outside the model, by its spectrum.
+
+    A training shape lies 1 / (G^-1)_ii outside the span of the others, G their Gram matrix; that is about N times the
+    harmonic mean of the variances. What modes that were cut off held comes on top. Where variances were found on shapes
+    left out, what they leave is what new shapes leave.
+    """
+    spectrum, left = _whole_spectrum(model)
+    outside = 0.0 if model.held_out else model.n_training / float((1.0 / spectrum).mean())
+    return float(np.sqrt((left + outside) / model.n_vertices))
+
+
+def _whole_spectrum(model: ShapeModel) -> tuple[FloatArray, float]:
+    """Return the variances of all N - 1 modes, those not kept sharing alike what is left, and what is left."""
+    own = model.stddev**2
+    left, rest = model.total_variance - float(own.sum()), model.n_training - 1 - model.n_modes
+    if rest > 0 and left > _ALL_KEPT * model.total_variance:
+        return np.concatenate([own, np.full(rest, left / rest)]), left
+    return own, 0.0
 
 
 def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,7 @@ from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_eq
 from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
-from shapespace.fit.posterior import new_shapes, posterior
+from shapespace.fit.posterior import lack_of_new_shapes, new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -318,7 +318,9 @@ def robust_icp(
             **_matched(look, gathered, at, model, known.prior_variance[: model.n_modes]),
             "beyond_model_mm": float(np.sqrt(max(left_mm2, 0.0))),
             "left_out_mm": float(np.sqrt(left_out_mm2)),
-            "expected_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
+            "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
+            "model_lack_mm": lack_of_new_shapes(model),
+            "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         },
     )  # fmt: skip
 
@@ -341,6 +343,7 @@ def _matched(look: Look, gathered: Gathered, at: Estimate, model: ShapeModel, va
         "model_matched_share": float((v > _HALF * v.max()).mean()),
         "model_allowed_share": float(vertices.allowed.mean()),
         "scan_allowed_share": float(points.allowed.mean()),
+        "scan_near_share": float((points.distance < _NEAR * size_mm).mean()),
         "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from shapespace.fit.method import Ended, Limits
+from shapespace.fit.reliability import reliability
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
-from shapespace.fit.start import Start
+from shapespace.fit.start import Start, start_evidence
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.trust import doubts_of_robust
+from shapespace.fit.trust import doubts_of_layers, doubts_of_robust
 from shapespace.model.shape_model import ShapeModel
 
 
@@ -30,16 +31,27 @@ class Robust(RobustSettings):
         self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
     ) -> Generator[IcpState, None, Fitted]:
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
-        from shapespace.fit.robust import robust_icp  # compiled
+        from shapespace.fit.another import another_beside, layers  # compiled
+        from shapespace.fit.robust import robust_icp
 
-        return robust_icp(
-            model, scan, start, self,
-            with_scale=limits.with_scale, modes=limits.modes, max_iterations=limits.max_iterations,
-        )  # fmt: skip
+        fitted = yield from robust_icp(
+            model,
+            scan,
+            start,
+            self,
+            with_scale=limits.with_scale,
+            modes=limits.modes,
+            max_iterations=limits.max_iterations,
+        )
+        evidence = {**fitted.evidence, **start_evidence(start), **layers(model, scan, fitted)}
+        evidence |= reliability(evidence).as_evidence()
+        beside = another_beside(model, scan, fitted, self, with_scale=limits.with_scale)
+        return replace(fitted, evidence=evidence, notes=() if beside is None else (beside,))
 
     def doubts(self, ended: Ended) -> list[str]:
         """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""
-        return doubts_of_robust(ended.fitted.evidence)
+        evidence = ended.fitted.evidence
+        return [*doubts_of_layers(evidence), *doubts_of_robust(evidence)]
 
     def reason(self, ended: Ended) -> str:
         """Return that it stood still, and how near."""

@@ -50,6 +50,7 @@ class Fitted:
         regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
         evidence: what the verdict goes by, by name.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
+        notes: what was noticed in the scan, a sentence each.
     """
 
     T_scan_model: Similarity
@@ -62,6 +63,7 @@ class Fitted:
     regions: Callable[[], IntArray] = field(repr=False)
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
     b_covariance: FloatArray | None = None
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ _LEAST_SHARE = 0.01
 _MOST_LOG_SCALE = 1.0
 _TOLD_SHARE = 0.4
 _TOLD = 3
+_LAYERED = 0.16
+"""Share of a scan over which it has two surfaces; chosen on fits of `benchmarks/reliability.py`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def _log_share(share: float) -> float:
 
 INPUTS = (
     Input(
-        lambda e: math.log(max(e["expected_error_mm"] / e["size_mm"], 1e-6)),
+        lambda e: math.log(max(e["posterior_error_mm"] / e["size_mm"], 1e-6)),
         least=-6.5,
         usual=-4.519,
         weight=1.293,
@@ -137,7 +139,7 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     """Return reasons not to trust a robust fit, what weighs most first; none where nothing speaks against it.
 
     Args:
-        evidence: of `posterior` and `start_evidence`; lengths in mm of the model's frame.
+        evidence: of `posterior`, `start_evidence` and `reliability`; lengths in mm of the model's frame.
     """
     if not _is_doubted(evidence):
         return []
@@ -162,3 +164,10 @@ def _contributions(evidence: Mapping[str, float]) -> list[float]:
 
 def _is_doubted(evidence: Mapping[str, float]) -> bool:
     return score(evidence) > 0.0 or any(each.value(evidence) > each.most for each in INPUTS)
+
+
+def doubts_of_layers(evidence: Mapping[str, float]) -> list[str]:
+    """Return a reason to doubt a fit whose scan holds two surfaces on top of each other; none where it does not."""
+    if evidence["layered_share"] < _LAYERED:
+        return []
+    return [f"the scan shows two surfaces on top of each other, about {evidence['layers_apart_mm']:.1f} mm apart"]

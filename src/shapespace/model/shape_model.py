@@ -29,6 +29,9 @@ _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
 _IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
+_ROUNDING = 64 * float(np.finfo(float).eps)
+_WIDEST = 1e6
+"""Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class ShapeModel:
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
-        InputError: arrays whose shapes do not belong together.
+        InputError: arrays whose shapes do not belong together, or standard deviations that cannot be.
     """
 
     mean: FloatArray
@@ -98,6 +101,7 @@ class ShapeModel:
         object.__setattr__(self, "n_training", int(self.n_training))
         object.__setattr__(self, "coding", MappingProxyType(dict(self._coder.arrays())))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
+        _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
         for name, vertex in self.landmarks.items():
             if not 0 <= vertex < len(checked.vertices):
@@ -384,6 +388,24 @@ def _components_of_codes(
     shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
     mean = codes.mean(axis=0)
     return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
+
+
+def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:
+    """Refuse modes that vary by less than the vertices are rounded to, or by far more than the shape is large."""
+    norm = float(np.linalg.norm(mean_vertices - mean_vertices.mean(axis=0)))
+    if norm == 0.0:
+        return
+    for mode, value in ((int(stddev.argmin()), float(stddev.min())), (int(stddev.argmax()), float(stddev.max()))):
+        if value < _ROUNDING * norm:
+            raise InputError(
+                f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less than the "
+                "rounding of its vertices; leave such modes out."
+            )
+        if value > _WIDEST * norm:
+            raise InputError(
+                f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape of its size "
+                "can have; check its unit."
+            )
 
 
 def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
