@@ -155,7 +155,7 @@ class ShapeModel:
             )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        rounding = rounding_mm(np.nan_to_num(shapes[0]))
+        rounding = rounding_mm(np.nan_to_num(shapes[0], posinf=0.0, neginf=0.0))
         if kind.takes_holes and np.isnan(shapes).any():
             _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
             fill_holes(shapes, faces, names)
