@@ -6,15 +6,17 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from shapespace import __version__
-from shapespace.batch.run import Job, fit_files, make_jobs
+from shapespace.batch.run import Job, fit_files, make_executor, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig
@@ -23,12 +25,57 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.report.html import require_report_extra, write_report
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
 NEUTRAL = "neutral"
 _FEWEST_SUBJECTS = 4
 _FEWEST_PER_CLASS = 2
+
+
+def run_own_study(
+    folder: Path, data: Path, model: Path, *, folds: int, workers: int, seed: int = 0, quiet: bool = False
+) -> tuple[Path, str]:
+    """Run the study on labelled scans of one's own; return the path of its report, and what the scans are.
+
+    Args:
+        folder: for the results; fits that are there already are kept.
+        data: BU-3DFE, Bosphorus, or a folder with labels.csv.
+        model: file of the shape model.
+        folds: by subject.
+        workers: processes that fit.
+        seed: of the folds.
+        quiet: no progress bar.
+
+    Raises:
+        FileError: something cannot be read or written.
+        InputError: too few people or expressions.
+        ShapespaceError: the extras `recognise` and `report` are not installed.
+    """
+    require_report_extra()
+    make_folder(folder)
+    with ExitStack() as stack:
+        executor = stack.enter_context(make_executor(model, workers)) if workers > 1 else None
+        bar = stack.enter_context(tqdm(unit="scan", leave=False, desc="fitting", disable=True if quiet else None))
+
+        def count(scans: int) -> None:
+            bar.total = scans
+
+        def fitted(job: Job, record: Mapping[str, Any]) -> None:
+            bar.update()
+
+        _, holds = run_own(
+            folder,
+            data,
+            model,
+            folds=folds,
+            seed=seed,
+            executor=executor,
+            on_scans=count,
+            on_fit=fitted,
+        )
+    return write_report(folder), holds
 
 
 def run_own(

@@ -16,6 +16,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+import approaches
+from approaches import APPROACHES, Features, Rows
 from shapespace import __version__
 from shapespace.datasets.ict import IctFaces, load_ict
 from shapespace.errors import InputError
@@ -26,10 +28,10 @@ from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.hierarchy import FaceTypes
 from shapespace.recognise.line_structure import disjointness, line_scores, pooled_line_scores
-from shapespace.study import approaches, parts
-from shapespace.study.approaches import APPROACHES, Features, Rows
+from shapespace.study import parts
 from shapespace.study.parts import Part, target, words
-from shapespace.study.simulated import (
+from shapespace.types import BoolArray, FloatArray, IntArray
+from simulated import (
     PAPER_EXPRESSIONS,
     STATUSES,
     Fits,
@@ -43,7 +45,6 @@ from shapespace.study.simulated import (
     stranger_path,
     stranger_shown,
 )
-from shapespace.types import BoolArray, FloatArray, IntArray
 
 Told = Callable[[str], None]
 TextArray = npt.NDArray[np.str_]
