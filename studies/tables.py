@@ -877,16 +877,13 @@ def _unit(codes: FloatArray) -> FloatArray:
 def _spread_mm(model: AdditiveModel, codes: FloatArray, *, identity: bool) -> float:
     """Return the mean over the vertices of the standard deviation of surfaces with these codes alone, mm."""
     none = np.zeros(0)
-    surfaces = np.stack(
-        [model.shape.reconstruct(model.join(code, none) if identity else model.join(none, code)) for code in codes]
-    )
+    surfaces = np.stack([(model.mesh(code, none) if identity else model.mesh(none, code)).vertices for code in codes])
     return float(np.sqrt(surfaces.var(axis=0).sum(axis=1)).mean())
 
 
 def _basis_of_codes(model: AdditiveModel) -> FloatArray:
     """Return (V, 3, K) what one standard deviation of each of [a; e] does to each vertex, mm."""
-    to_b: FloatArray = model.shape.stddev[:, None] * model.rotation.T
-    flat: FloatArray = model.shape.vertex_basis @ to_b
+    flat: FloatArray = model.shape.vertex_basis @ model.shape.to_b(model.rotation).T
     return flat.reshape(model.shape.n_vertices, 3, model.shape.n_modes)
 
 
