@@ -171,22 +171,13 @@ def _parser() -> argparse.ArgumentParser:
     usual = StudyConfig()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("shapespace-study"), metavar="DIR")
-    parser.add_argument(
-        "--people", type=whole_number, default=usual.people.people, metavar="N", help="default %(default)s"
-    )
-    parser.add_argument(
-        "--strangers",
-        type=whole_number,
-        default=usual.strangers,
-        metavar="N",
-        help="of another generator; default %(default)s",
-    )
-    parser.add_argument(
-        "--folds", type=whole_number, default=usual.folds, metavar="N", help="by person; default %(default)s"
-    )
-    parser.add_argument(
-        "--seed", type=whole_number, default=usual.people.seed, metavar="S", help="of everything that is drawn"
-    )
+    for name, default, what in (
+        ("people", usual.people.people, "simulated people"),
+        ("strangers", usual.strangers, "people of another generator"),
+        ("folds", usual.folds, "folds by person"),
+        ("seed", usual.people.seed, "of everything that is drawn"),
+    ):
+        parser.add_argument(f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what}; {default}")
     parser.add_argument("--shape-spaces", action="store_true", help="compare B-spline control points too; 11 minutes")
     parser.add_argument("--jobs", type=whole_number, default=0, metavar="N", help="fits at a time; default: one a core")
     parser.add_argument("--no-open", action="store_true", help="do not open the report in a browser")

@@ -33,7 +33,7 @@ _SHARE_TOLERANCE = 1e-12
 class ShapeModel:
     """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (eq 6).
 
-    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b, and
+    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b;
     `to_z` and `to_b` turn one into the other.
 
     Args:
