@@ -175,7 +175,7 @@ def test_the_fast_permutation_test_is_the_slow_one(monkeypatch):
     z[5] = np.nan
     folds = folds_of(z, labels, subjects, 4)
     fast = permutation_test(folds, "lda", permutations=20, seed=2)
-    monkeypatch.setattr("shapespace.recognise.evaluate._score_lda", None)
+    monkeypatch.setattr("shapespace.recognise.resampling._score_lda", None)
     monkeypatch.setitem(CLASSIFIERS, "the same", CLASSIFIERS["lda"])
     slow = permutation_test(folds, "the same", permutations=20, seed=2)
     assert fast.observed == pytest.approx(slow.observed)
@@ -278,7 +278,7 @@ def test_what_cannot_be_evaluated_is_refused():
 
 
 def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch):
-    from shapespace.recognise import evaluate
+    from shapespace.recognise import predictions
 
     z, labels, subjects = people(n=12)
     owner = {row.tobytes(): person for row, person in zip(z[:, :1], subjects, strict=True)}
@@ -288,8 +288,8 @@ def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch
         seen.append(({owner[row[:1].tobytes()] for row in X}, {owner[row[:1].tobytes()] for row in test}))
         return original(X, y, test, *rest)
 
-    original = evaluate.predict_probabilities
-    monkeypatch.setattr(evaluate, "predict_probabilities", watched)
+    original = predictions.predict_probabilities
+    monkeypatch.setattr(predictions, "predict_probabilities", watched)
     nested_predictions(folds_of(z, labels, subjects, 3), classifiers=["lda"], modes=(None,), inner_folds=4)
     assert len(seen) == 3 * (4 + 3 * 4 + 1)
     assert all(not trained & tested for trained, tested in seen)

@@ -14,9 +14,10 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import InputError
 from shapespace.io.tables import write_rows
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.evaluate import fit_temperature, left_out, macro_accuracy, subject_folds
+from shapespace.recognise.predictions import left_out, subject_folds
 from shapespace.recognise.saved import SavedClassifier, software_versions
 from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
+from shapespace.recognise.scores import fit_temperature, macro_accuracy
 from shapespace.types import FloatArray
 
 UNSURE = "unsure"
