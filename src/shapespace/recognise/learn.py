@@ -12,7 +12,6 @@ try:
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import confusion_matrix as _confusion_matrix  # pyright: ignore[reportUnknownVariableType]
     from sklearn.metrics import precision_recall_fscore_support as _precision_recall_fscore_support  # pyright: ignore[reportUnknownVariableType]
-    from sklearn.metrics import recall_score as _recall_score  # pyright: ignore[reportUnknownVariableType]
     from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
     from sklearn.model_selection import cross_val_predict as _cross_val_predict  # pyright: ignore[reportUnknownVariableType]
     from sklearn.neighbors import KNeighborsClassifier
@@ -34,7 +33,6 @@ check_is_fitted = cast(Any, _check_is_fitted)
 confusion_matrix = cast(Any, _confusion_matrix)
 cross_val_predict = cast(Any, _cross_val_predict)
 precision_recall_fscore_support = cast(Any, _precision_recall_fscore_support)
-recall_score = cast(Any, _recall_score)
 validate_data = cast(Any, _validate_data)
 
 __all__ = [
@@ -53,7 +51,6 @@ __all__ = [
     "confusion_matrix",
     "cross_val_predict",
     "precision_recall_fscore_support",
-    "recall_score",
     "skops_io",
     "validate_data",
 ]

@@ -199,12 +199,8 @@ def _nested(
     inner = subject_folds(subjects.tolist(), inner_folds, seed)
     K = X.shape[1]
     counts = sorted({min(K if m is None else m, K) for m in modes})
-    tried = [
-        macro_accuracy(
-            labels, answers_of(left_out(X[:, :m], labels, inner, classes, "lda", {}, seed), classes), classes
-        )
-        for m in counts
-    ]
+    by_modes = [left_out(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
+    tried = [macro_accuracy(labels, answers_of(found, classes), classes) for found in by_modes]
     m = counts[int(np.argmax(tried))]
     best: tuple[float, str, dict[str, Any], FloatArray] | None = None
     fewest = min(len(train) for train, _ in inner)
@@ -295,6 +291,7 @@ def left_out(
 
 
 def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
+    """Return all classes in order, or raise InputError where there are fewer than two, or no folds."""
     if not folds:
         raise InputError("There are no folds to evaluate.")
     classes = sorted({label for fold in folds for label in (*fold.train_labels, *fold.test_labels)})
@@ -304,6 +301,7 @@ def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
 
 
 def refuse_unknown(names: Sequence[str]) -> None:
+    """Raise InputError where a name is none of `CLASSIFIERS`."""
     for name in names:
         if name not in CLASSIFIERS:
             raise InputError(f"There is no classifier {name!r}; choose among {', '.join(CLASSIFIERS)}.")
@@ -319,6 +317,7 @@ def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
 
 
 def answers_of(probabilities: FloatArray, classes: Sequence[str]) -> Any:
+    """Return the likeliest classes (n,); empty where a fit failed."""
     lost = np.isnan(probabilities).any(axis=1)
     best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
     return np.where(lost, "", np.asarray(classes)[best])

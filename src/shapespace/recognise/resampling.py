@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -235,7 +235,7 @@ def mode_importance(
     Raises:
         InputError: no folds, or an unknown classifier.
     """
-    from sklearn.inspection import permutation_importance  # a fifth of a second to import
+    from sklearn.inspection import permutation_importance  # pyright: ignore[reportUnknownVariableType]
 
     classes = classes_of(folds)
     refuse_unknown([classifier])
@@ -252,6 +252,8 @@ def mode_importance(
             test, truth = fold.test[finite, :m], np.asarray(fold.test_labels, dtype=str)[finite]
             pipeline: Any = CLASSIFIERS[classifier](seed)
             pipeline.fit(X[:, :m], labels)
-            found = permutation_importance(pipeline, test, truth, scoring=score, n_repeats=repeats, random_state=seed)
+            found = cast(Any, permutation_importance)(
+                pipeline, test, truth, scoring=score, n_repeats=repeats, random_state=seed
+            )
             loss[f, :m] = found.importances_mean
     return loss

@@ -12,7 +12,7 @@ from scipy.special import softmax
 
 from shapespace.errors import InputError
 from shapespace.recognise.classifiers import likeliest_temperature
-from shapespace.recognise.learn import confusion_matrix, precision_recall_fscore_support, recall_score
+from shapespace.recognise.learn import confusion_matrix, precision_recall_fscore_support
 from shapespace.types import FloatArray
 
 IndexArray: TypeAlias = npt.NDArray[np.integer[Any]]
@@ -64,9 +64,12 @@ def macro_accuracy(labels: Sequence[str] | Any, predicted: Sequence[str] | Any, 
     Classes without a sample do not count; any answer but the right class is wrong, also none and "unsure".
     """
     truth, answer = np.asarray(labels, dtype=str), np.asarray(predicted, dtype=str)
-    if not np.isin(truth, classes).any():
+    own = [truth == name for name in classes]
+    # recall_score(average="macro") gives the same in 2 ms instead of 0.06, which is asked for by the thousand.
+    recalls = [float((answer[mine] == name).mean()) for mine, name in zip(own, classes, strict=True) if mine.any()]
+    if not recalls:
         raise InputError("Accuracy needs at least one sample of the classes.")
-    return float(recall_score(truth, answer, labels=list(classes), average="macro", zero_division=np.nan))
+    return float(np.mean(recalls))
 
 
 def confusion(labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> IndexArray:
