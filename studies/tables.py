@@ -7,9 +7,7 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from functools import cached_property
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,7 +16,6 @@ import numpy.typing as npt
 
 import approaches
 from approaches import APPROACHES, Features, Rows
-from shapespace import __version__
 from shapespace.datasets.ict import IctFaces, load_ict
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_bytes, write_text
@@ -280,10 +277,7 @@ class _Maker:
             self.targets,
             self.parts,
             settings=_flat(asdict(config)) | {f"seconds, {name}": round(value, 1) for name, value in seconds.items()},
-            versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
             model_hashes=[model.shape.content_hash for model in study.models],
-            version=__version__,
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
 
     # What everything is compared with

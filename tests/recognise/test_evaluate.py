@@ -128,6 +128,15 @@ def test_macro_accuracy_weighs_classes_alike_whatever_their_number():
     assert macro_accuracy(labels, ["unsure"] * 10, ("a", "b")) == 0.0
 
 
+def test_macro_accuracy_is_that_of_scikit_learn():
+    from sklearn.metrics import recall_score
+
+    rng = np.random.default_rng(3)
+    labels, predicted = rng.choice(NAMES[:2], 60).tolist(), rng.choice([*NAMES, "unsure"], 60).tolist()
+    theirs = recall_score(labels, predicted, labels=NAMES, average="macro", zero_division=np.nan)
+    assert macro_accuracy(labels, predicted, NAMES) == pytest.approx(theirs)
+
+
 def test_the_confusion_counts_each_answer_once_and_other_answers_apart():
     labels = ["a", "a", "a", "b", "b"]
     counts = confusion(labels, ["a", "b", "unsure", "b", ""], ("a", "b"))
