@@ -28,8 +28,6 @@ from shapespace.types import FloatArray
 LDA_SHRINKAGE = 0.1
 """Share of the round covariance in that of the LDA, unless cross-validation chooses another."""
 
-_COLDEST, _HOTTEST = 0.02, 100.0
-
 
 class NearestMeanDirection(ClassifierMixin, BaseEstimator):
     """The class whose mean direction has the largest cosine with a sample, seen from the origin (the paper, figure 9).
@@ -294,13 +292,16 @@ def _left_out_cosines(unit: FloatArray, sums: FloatArray, own: Any) -> FloatArra
     return cosines
 
 
-def likeliest_temperature(scores: FloatArray, own: Any, *, doubt: float = 0.0) -> float:
+def likeliest_temperature(
+    scores: FloatArray, own: Any, *, doubt: float = 0.0, bounds: tuple[float, float] = (0.02, 10.0)
+) -> float:
     """Return the temperature at which a softmax of `scores` (n, C) makes the true classes likeliest.
 
     Args:
         scores: of samples left out, logits up to the temperature.
         own: (n,) index of each sample's class.
         doubt: share of each sample that counts for all classes alike.
+        bounds: coldest and hottest temperature; few samples alone would go anywhere.
     """
     C = scores.shape[1]
     target = (1 - doubt) * np.eye(C)[own] + doubt / C
@@ -308,7 +309,7 @@ def likeliest_temperature(scores: FloatArray, own: Any, *, doubt: float = 0.0) -
     def surprise(log_temperature: float) -> float:
         return -float((target * log_softmax(scores / np.exp(log_temperature), axis=1)).sum(axis=1).mean())
 
-    found: Any = minimize_scalar(surprise, bounds=(np.log(_COLDEST), np.log(_HOTTEST)), method="bounded")
+    found: Any = minimize_scalar(surprise, bounds=np.log(bounds), method="bounded")
     return float(np.exp(found.x))
 
 

@@ -149,7 +149,7 @@ def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: S
     """
     truth, p = _with_probabilities(labels, probabilities, classes)
     logits = np.log(np.maximum(p, _LEAST_PROBABILITY))
-    return likeliest_temperature(logits, truth, doubt=1 / (len(p) + 2))
+    return likeliest_temperature(logits, truth, doubt=1 / (len(p) + 2), bounds=(0.1, 100.0))
 
 
 def calibrated(probabilities: FloatArray, temperature: float) -> FloatArray:
