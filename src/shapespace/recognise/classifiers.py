@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -309,7 +310,7 @@ def likeliest_temperature(
     def surprise(log_temperature: float) -> float:
         return -float((target * log_softmax(scores / np.exp(log_temperature), axis=1)).sum(axis=1).mean())
 
-    found: Any = minimize_scalar(surprise, bounds=np.log(bounds), method="bounded")
+    found: Any = minimize_scalar(surprise, bounds=(math.log(bounds[0]), math.log(bounds[1])), method="bounded")
     return float(np.exp(found.x))
 
 
