@@ -28,8 +28,8 @@ from shapespace.errors import ShapespaceError
 from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.distance import surface_distances
 from shapespace.geometry.surface import boundary_vertices, face_areas, face_vectors
+from shapespace.model.floor import floor_mm as floor_of
 from shapespace.model.shape_model import ShapeModel
-from shapespace.study.shape_spaces import floor_mm as floor_of
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
 
 Split = Literal["test", "dev"]

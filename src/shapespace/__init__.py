@@ -14,13 +14,18 @@ if TYPE_CHECKING:
     from shapespace.geometry.distance import surface_distances
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
+    from shapespace.model.additive import AdditiveModel
     from shapespace.model.shape_model import ShapeModel
+    from shapespace.recognise.classifiers import CLASSIFIERS
+    from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
     from shapespace.types import Mesh, Similarity
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "CLASSIFIERS",
+    "AdditiveModel",
     "FitConfig",
     "FitResult",
     "Mesh",
@@ -37,10 +42,13 @@ __all__ = [
     "read_mesh",
     "simulate_scan",
     "surface_distances",
+    "train_classifier",
     "write_mesh",
 ]
 
 _HOMES = {
+    "AdditiveModel": "model.additive",
+    "CLASSIFIERS": "recognise.classifiers",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
     "Mesh": "types",
@@ -56,6 +64,7 @@ _HOMES = {
     "read_mesh": "io.meshes",
     "simulate_scan": "datasets.simulated_scan",
     "surface_distances": "geometry.distance",
+    "train_classifier": "recognise.predict",
     "write_mesh": "io.meshes",
 }
 

@@ -26,6 +26,7 @@ DOCUMENTS = [
     ROOT / "CONTRIBUTING.md",
     ROOT / "CHANGELOG.md",
     ROOT / "benchmarks" / "README.md",
+    ROOT / "studies" / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NEEDS_DATA = "<!-- needs data -->"

@@ -7,7 +7,6 @@ from shapespace.geometry.surface import (
     boundary_vertices,
     face_areas,
     faces_of,
-    sample_surface,
     vertex_areas,
     vertex_normals,
 )
@@ -52,21 +51,7 @@ def test_an_edge_of_three_triangles_is_not_rim() -> None:
     assert len(boundary_edges(fan)) == 6
 
 
-def test_samples_lie_on_the_surface_evenly_by_area() -> None:
-    points = sample_surface(KITE, 20000, np.random.default_rng(0))
-    assert np.allclose(points[:, 2], 2.0)
-    x, y = points[:, 0], points[:, 1]
-    assert (y >= -1e-12).all()
-    assert (np.where(x > 0, x + y, y - x / 3) <= 1 + 1e-12).all()
-    assert (x < 0).mean() == pytest.approx(0.75, abs=0.015)
-    right = points[x > 0]
-    assert np.allclose(right[:, :2].mean(axis=0), 1 / 3, atol=0.01)
-    assert np.array_equal(points, sample_surface(KITE, 20000, np.random.default_rng(0)))
-
-
-def test_point_clouds_and_flat_surfaces_are_refused_where_triangles_are_needed() -> None:
+def test_point_clouds_are_refused_where_triangles_are_needed() -> None:
     for function in (faces_of, face_areas, vertex_normals, vertex_areas):
         with pytest.raises(MeshError, match=r"cloud\.ply has no faces"):
             function(Mesh(np.zeros((3, 3)), name="cloud.ply"))
-    with pytest.raises(MeshError, match="no area"):
-        sample_surface(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), 5, np.random.default_rng(0))

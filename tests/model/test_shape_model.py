@@ -508,3 +508,15 @@ def test_modes_for_a_share_that_the_kept_modes_do_not_reach_are_none():
         assert model.cumulative_variance[k - 1] >= share - 1e-12
         assert k == 1 or model.cumulative_variance[k - 2] < share
     assert model.truncate(1).modes_for_variance(0.999) is None
+
+
+def test_coefficients_in_mm_and_in_standard_deviations_are_each_others_inverse():
+    model = blob_model(300)
+    z = np.random.default_rng(0).standard_normal((3, 2, 4))
+    b = model.to_b(z)
+    np.testing.assert_allclose(b, z * model.stddev[:4])
+    np.testing.assert_allclose(model.to_z(b), z)
+    np.testing.assert_allclose(model.to_z(b[0, 0]), z[0, 0])
+    for wrong in (np.zeros(6), 1.0):
+        with pytest.raises(InputError, match="at most 5"):
+            model.to_z(wrong)

@@ -128,6 +128,15 @@ def test_macro_accuracy_weighs_classes_alike_whatever_their_number():
     assert macro_accuracy(labels, ["unsure"] * 10, ("a", "b")) == 0.0
 
 
+def test_macro_accuracy_is_that_of_scikit_learn():
+    from sklearn.metrics import recall_score
+
+    rng = np.random.default_rng(3)
+    labels, predicted = rng.choice(NAMES[:2], 60).tolist(), rng.choice([*NAMES, "unsure"], 60).tolist()
+    theirs = recall_score(labels, predicted, labels=NAMES, average="macro", zero_division=np.nan)
+    assert macro_accuracy(labels, predicted, NAMES) == pytest.approx(theirs)
+
+
 def test_the_confusion_counts_each_answer_once_and_other_answers_apart():
     labels = ["a", "a", "a", "b", "b"]
     counts = confusion(labels, ["a", "b", "unsure", "b", ""], ("a", "b"))
@@ -175,7 +184,7 @@ def test_the_fast_permutation_test_is_the_slow_one(monkeypatch):
     z[5] = np.nan
     folds = folds_of(z, labels, subjects, 4)
     fast = permutation_test(folds, "lda", permutations=20, seed=2)
-    monkeypatch.setattr("shapespace.recognise.evaluate._score_lda", None)
+    monkeypatch.setattr("shapespace.recognise.resampling._score_lda", None)
     monkeypatch.setitem(CLASSIFIERS, "the same", CLASSIFIERS["lda"])
     slow = permutation_test(folds, "the same", permutations=20, seed=2)
     assert fast.observed == pytest.approx(slow.observed)
@@ -278,7 +287,7 @@ def test_what_cannot_be_evaluated_is_refused():
 
 
 def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch):
-    from shapespace.recognise import evaluate
+    from shapespace.recognise import predictions
 
     z, labels, subjects = people(n=12)
     owner = {row.tobytes(): person for row, person in zip(z[:, :1], subjects, strict=True)}
@@ -288,8 +297,8 @@ def test_what_is_chosen_is_chosen_on_people_that_were_not_trained_on(monkeypatch
         seen.append(({owner[row[:1].tobytes()] for row in X}, {owner[row[:1].tobytes()] for row in test}))
         return original(X, y, test, *rest)
 
-    original = evaluate.predict_probabilities
-    monkeypatch.setattr(evaluate, "predict_probabilities", watched)
+    original = predictions.predict_probabilities
+    monkeypatch.setattr(predictions, "predict_probabilities", watched)
     nested_predictions(folds_of(z, labels, subjects, 3), classifiers=["lda"], modes=(None,), inner_folds=4)
     assert len(seen) == 3 * (4 + 3 * 4 + 1)
     assert all(not trained & tested for trained, tested in seen)

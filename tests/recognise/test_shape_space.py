@@ -54,6 +54,17 @@ def test_scans_are_fitted_and_fits_and_records_are_taken_as_they_are():
     assert np.isnan(z[3]).all()
 
 
+def test_one_bad_scan_is_a_row_that_is_not_a_number_and_the_others_are_fitted():
+    space = ss.ShapeSpace(model=blob_model(300), meshes="scans", config=FitConfig(max_iterations=5)).fit([])
+    good = raw_scan(np.zeros(5), similarity(2, 8.0, 1.0)).scan
+    bad = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), name="flat.ply")
+    with pytest.warns(UserWarning, match=r"Number 2 has no coefficients: flat\.ply"):
+        z = space.transform([good, bad, good])
+    assert np.isnan(z[1]).all()
+    np.testing.assert_array_equal(z[0], z[2])
+    assert np.isfinite(z[0]).all()
+
+
 def test_what_does_not_belong_to_the_model_is_refused():
     model = blob_model(300)
     space = ss.ShapeSpace(model=model).fit([])

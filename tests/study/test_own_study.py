@@ -132,3 +132,15 @@ def test_a_table_without_subjects_cannot_part_them(
     assert "each mesh needs a label and a subject" in capsys.readouterr().err
     assert command(*built, "--expression-variance", "0.9") == 2
     assert "belongs to --additive" in capsys.readouterr().err
+
+
+def test_without_scans_or_a_model_one_sentence_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("recognise", "study", "-o", str(tmp_path / "o"), "--no-open")
+    for arguments in ((), ("--data", str(tmp_path)), ("--model", "m.h5")):
+        assert command(*asked, *arguments) == 2
+        told = capsys.readouterr().err
+        assert "needs both --data DIR and --model" in told and "studies/recognition.py" in told
+        assert told.count("\n") == 1 and not (tmp_path / "o").exists()
+    assert (Path(__file__).resolve().parents[2] / "studies" / "recognition.py").is_file()

@@ -244,20 +244,14 @@ def _add_recognise_transfer(commands: Any) -> None:
 
 def _add_recognise_study(commands: Any) -> None:
     sub = _add(commands, "study", "recognition measured on unseen people, ending in a report",
-               "shapespace recognise study -o study\n"
-               "         shapespace recognise study --data BU-3DFE --model model.h5 -o study")  # fmt: skip
+               "shapespace recognise study --data BU-3DFE --model model.h5 -o study")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, default=Path("shapespace-study"), metavar="DIR",
                      help="where to write; a study that was interrupted goes on")  # fmt: skip
     sub.add_argument("--data", type=Path, metavar="DIR",
                      help="labelled scans: BU-3DFE, Bosphorus, or a folder with labels.csv")  # fmt: skip
-    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="shape model that fits them, with --data")
-    sub.add_argument("--people", type=_positive, metavar="N", help="simulated people (default 100)")
-    sub.add_argument("--strangers", type=_natural, metavar="N", help="people of another generator (default 25)")
-    sub.add_argument("--folds", type=_positive, metavar="N",
-                     help="folds by subject (default 4 for simulated people, 10 with --data)")  # fmt: skip
-    sub.add_argument("--seed", type=_natural, metavar="S", help="of everything that is drawn")
-    sub.add_argument("--shape-spaces", action="store_true",
-                     help="compare vertices with B-spline control points too (11 minutes more)")  # fmt: skip
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="shape model that fits them")
+    sub.add_argument("--folds", type=_positive, default=10, metavar="N", help="folds by subject (default 10)")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of everything that is drawn")
     sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.recognise_study, goes_on="; the same command goes on from there")

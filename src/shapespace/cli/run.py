@@ -300,13 +300,10 @@ def recognise_study(arguments: argparse.Namespace) -> int:
 
     report, targets, holds = recognise_study(
         arguments.output,
-        data=arguments.data,
-        model=arguments.model,
-        people=arguments.people,
-        strangers=arguments.strangers,
+        arguments.data,
+        arguments.model,
         folds=arguments.folds,
         seed=arguments.seed,
-        shape_spaces=arguments.shape_spaces,
         jobs=arguments.jobs,
         quiet=arguments.quiet,
     )

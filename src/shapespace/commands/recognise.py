@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -162,55 +161,23 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
 
 
 def recognise_study(
-    output: Path,
-    *,
-    data: Path | None,
-    model: Path | None,
-    people: int | None,
-    strangers: int | None,
-    folds: int | None,
-    seed: int | None,
-    shape_spaces: bool,
-    jobs: int,
-    quiet: bool,
+    output: Path, data: Path | None, model: Path | None, *, folds: int, seed: int, jobs: int, quiet: bool
 ) -> tuple[Path, list[dict[str, Any]], str]:
-    """Run the recognition study; return its report, its targets and what the scans are, in words.
+    """Run the recognition study on labelled scans; return its report, its targets and what the scans are, in words.
 
     Raises:
-        DataError: ICT-FaceKit is not here.
         FileError: something cannot be read or written.
-        InputError: arguments that do not go together, or a folder of another study.
+        InputError: no scans or no model, or too few people.
         ShapespaceError: the extras `recognise` and `report` are not installed.
     """
-    if (data is None) != (model is None):
-        raise InputError("A study of scans of your own needs both --data DIR and --model MODEL.h5.")
-    if data is not None and (people is not None or strangers is not None or shape_spaces):
+    if data is None or model is None:
         raise InputError(
-            "--people, --strangers and --shape-spaces belong to the simulated study; leave them out with --data."
+            "A study of scans of your own needs both --data DIR and --model MODEL.h5; the one on simulated people is "
+            "python studies/recognition.py in the source of shapespace."
         )
-    from shapespace.study.run import run_own_study, run_study  # needs the extras
+    from shapespace.study.own_scans import run_own_study  # needs the extras
 
-    workers = jobs or cores()
-    holds = ""
     with telling_of_compiling(quiet=quiet):
-        if data is not None and model is not None:
-            report, holds = run_own_study(
-                output, data, model, folds=folds or 10, workers=workers, seed=seed or 0, quiet=quiet
-            )
-        else:
-            from shapespace.datasets.study_people import StudyPeople
-            from shapespace.study.shape_spaces import ShapeSpaces
-            from shapespace.study.simulated import StudyConfig
-
-            chosen = StudyPeople() if people is None else StudyPeople(people=people)
-            chosen = chosen if seed is None else replace(chosen, seed=seed)
-            usual = StudyConfig()
-            config = StudyConfig(
-                people=chosen,
-                folds=usual.folds if folds is None else folds,
-                strangers=usual.strangers if strangers is None else strangers,
-            )
-            compared = ShapeSpaces() if shape_spaces else None
-            report = run_study(output, config, workers=workers, quiet=quiet, compared=compared)
+        report, holds = run_own_study(output, data, model, folds=folds, workers=jobs or cores(), seed=seed, quiet=quiet)
     content = json.loads(read_bytes(output / "recognition.json"))
     return report, content["targets"], holds

@@ -141,10 +141,6 @@ class FaceGenerator:
     _generic: FloatArray = field(repr=False)
     _loop: Any = field(repr=False)
 
-    def generic_person(self) -> Person:
-        """Return the average young adult, whose neutral face is the template."""
-        return Person(self._generic, "generic")
-
     def draw_person(self, rng: np.random.Generator, name: str = "person") -> Person:
         """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.
 

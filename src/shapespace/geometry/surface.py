@@ -65,17 +65,3 @@ def boundary_vertices(mesh: Mesh) -> BoolArray:
     if mesh.faces is not None:
         mask[boundary_edges(mesh.faces).ravel()] = True
     return mask
-
-
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return `count` points drawn evenly by area from the surface, (count, 3)."""
-    faces = faces_of(mesh)
-    areas = face_areas(mesh)
-    if not areas.sum() > 0:
-        raise MeshError(f"{mesh.name}: all its triangles have no area, so no points can be drawn from it.")
-    chosen = rng.choice(len(faces), size=count, p=areas / areas.sum())
-    u, v = rng.random(count), rng.random(count)
-    flip = u + v > 1
-    u[flip], v[flip] = 1 - u[flip], 1 - v[flip]
-    a, b, c = (mesh.vertices[faces[chosen, k]] for k in range(3))
-    return a + u[:, None] * (b - a) + v[:, None] * (c - a)

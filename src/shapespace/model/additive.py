@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +47,9 @@ class Told:
 
 @dataclass(frozen=True, eq=False)
 class AdditiveModel:
-    """A shape model whose whitened coefficients split into identity a and expression e: [a; e] = rotation @ z.
+    """A shape model whose coefficients z split into identity a and expression e: [a; e] = rotation @ z.
+
+    All coefficients here are in standard deviations; `shape.to_b` has them in mm.
 
     Args:
         shape: the model that fits: its covariance is that of identity plus that of expression.
@@ -181,11 +182,6 @@ class AdditiveModel:
         """Number of expression coefficients."""
         return self.shape.n_modes - self.n_identity
 
-    @cached_property
-    def _to_b(self) -> FloatArray:
-        """[a; e] to b, mm: (K, K)."""
-        return self.shape.stddev[:, None] * self.rotation.T
-
     def split(self, z: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return identity a (..., Ka) and expression e (..., Ke), in standard deviations, of coefficients z (..., K).
 
@@ -195,8 +191,10 @@ class AdditiveModel:
         t = self._checked(z) @ self.rotation.T
         return t[..., : self.n_identity], t[..., self.n_identity :]
 
-    def join(self, a: npt.ArrayLike, e: npt.ArrayLike) -> FloatArray:
-        """Return b (K,), mm, of identity `a` and expression `e`; missing ones are zero: an e of () is the neutral face.
+    def join_z(self, a: npt.ArrayLike, e: npt.ArrayLike) -> FloatArray:
+        """Return z (K,) of identity `a` and expression `e`, what `split` undoes; missing ones are zero.
+
+        An e of () is the neutral face.
 
         Raises:
             InputError: more coefficients than the model has, or some that are not finite.
@@ -210,11 +208,11 @@ class AdditiveModel:
             if values.ndim != 1 or len(values) > count or not np.isfinite(values).all():
                 raise InputError(f"There are at most {count} finite coefficients of {what}, not {values.shape}.")
             t[start : start + len(values)] = values
-        return self._to_b @ t
+        return t @ self.rotation
 
     def mesh(self, a: npt.ArrayLike, e: npt.ArrayLike) -> Mesh:
         """Return the surface of identity `a` with expression `e`, mm."""
-        return self.shape.mesh(self.join(a, e))
+        return self.shape.mesh(self.shape.to_b(self.join_z(a, e)))
 
     def transfer(self, z_of: npt.ArrayLike, z_expression: npt.ArrayLike) -> Mesh:
         """Return the person of coefficients `z_of` (K,) with the expression of `z_expression` (K,), as a mesh in mm."""

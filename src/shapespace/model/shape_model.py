@@ -38,7 +38,8 @@ _WIDEST = 1e6
 class ShapeModel:
     """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (eq 6).
 
-    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b.
+    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b;
+    `to_z` and `to_b` turn one into the other.
 
     Args:
         mean: (D,) mm; D = 3V for vertices, 3mn for B-splines of m x n control points.
@@ -313,6 +314,24 @@ class ShapeModel:
     def _nearest(self, vertices: FloatArray) -> FloatArray:
         """Return the coefficients (K,) of the shape nearest to `vertices` (V, 3) in the model's frame."""
         return self._vertex_modes @ (vertices - self.mean_vertices).reshape(-1)
+
+    def to_z(self, b: npt.ArrayLike) -> FloatArray:
+        """Return coefficients z (..., k), in standard deviations, of `b` (..., k) in mm; k is at most K."""
+        b = np.asarray(b, dtype=np.float64)
+        return b / self._stddev_of(b)
+
+    def to_b(self, z: npt.ArrayLike) -> FloatArray:
+        """Return coefficients b (..., k), in mm, of `z` (..., k) in standard deviations; k is at most K."""
+        z = np.asarray(z, dtype=np.float64)
+        return z * self._stddev_of(z)
+
+    def _stddev_of(self, coefficients: FloatArray) -> FloatArray:
+        count = coefficients.shape[-1] if coefficients.ndim else self.n_modes + 1
+        if count > self.n_modes:
+            raise InputError(
+                f"Coefficients must have the shape (..., k) with k at most {self.n_modes}, not {coefficients.shape}."
+            )
+        return self.stddev[:count]
 
     def sample(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return coefficients (count, K), mm, drawn from the normal distribution of the model."""

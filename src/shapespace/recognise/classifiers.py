@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -20,14 +21,13 @@ from shapespace.recognise.learn import (
     StratifiedKFold,
     check_classification_targets,
     check_is_fitted,
+    cross_val_predict,
     validate_data,
 )
 from shapespace.types import FloatArray
 
 LDA_SHRINKAGE = 0.1
 """Share of the round covariance in that of the LDA, unless cross-validation chooses another."""
-
-_COLDEST, _HOTTEST = 0.02, 10.0
 
 
 class NearestMeanDirection(ClassifierMixin, BaseEstimator):
@@ -63,7 +63,7 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
         unit = _directions(X)
         sums = np.eye(len(self.classes_))[own].T @ unit
         self.directions_ = _directions(sums)
-        self.temperature_ = self.temperature or _likeliest_temperature(_left_out_cosines(unit, sums, own), own)
+        self.temperature_ = self.temperature or likeliest_temperature(_left_out_cosines(unit, sums, own), own)
         return self
 
     def predict_proba(self, X: Any) -> FloatArray:
@@ -252,10 +252,9 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
         folds = min(3, int(np.bincount(own).min()))
         self.temperature_ = self.temperature or 1.0
         if self.temperature is None and folds > 1:
-            scores = np.zeros((len(X), len(self.classes_)))
-            for train, test in StratifiedKFold(folds, shuffle=True, random_state=self.random_state).split(X, own):
-                scores[test] = _margins(SVC(C=self.C).fit(X[train], own[train]), X[test])
-            self.temperature_ = _likeliest_temperature(scores, own)
+            parts = StratifiedKFold(folds, shuffle=True, random_state=self.random_state)
+            left_out = cross_val_predict(SVC(C=self.C), X, own, cv=parts, method="decision_function")
+            self.temperature_ = likeliest_temperature(_margins(left_out), own)
         return self
 
     def predict_proba(self, X: Any) -> FloatArray:
@@ -269,12 +268,12 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
 
     def _scores(self, X: Any) -> FloatArray:
         check_is_fitted(self)
-        return _margins(self.machine_, validate_data(self, X, dtype=np.float64, reset=False))
+        return _margins(self.machine_.decision_function(validate_data(self, X, dtype=np.float64, reset=False)))
 
 
-def _margins(machine: Any, X: FloatArray) -> FloatArray:
+def _margins(decision: Any) -> FloatArray:
     """Return decision values (n, C); of two classes scikit-learn gives one column."""
-    values = np.asarray(machine.decision_function(X), dtype=np.float64)
+    values = np.asarray(decision, dtype=np.float64)
     return values if values.ndim == 2 else np.stack([-values, values], axis=1)
 
 
@@ -294,13 +293,24 @@ def _left_out_cosines(unit: FloatArray, sums: FloatArray, own: Any) -> FloatArra
     return cosines
 
 
-def _likeliest_temperature(scores: FloatArray, own: Any) -> float:
-    rows = np.arange(len(scores))
+def likeliest_temperature(
+    scores: FloatArray, own: Any, *, doubt: float = 0.0, bounds: tuple[float, float] = (0.02, 10.0)
+) -> float:
+    """Return the temperature at which a softmax of `scores` (n, C) makes the true classes likeliest.
+
+    Args:
+        scores: of samples left out, logits up to the temperature.
+        own: (n,) index of each sample's class.
+        doubt: share of each sample that counts for all classes alike.
+        bounds: coldest and hottest temperature; few samples alone would go anywhere.
+    """
+    C = scores.shape[1]
+    target = (1 - doubt) * np.eye(C)[own] + doubt / C
 
     def surprise(log_temperature: float) -> float:
-        return -float(log_softmax(scores / np.exp(log_temperature), axis=1)[rows, own].mean())
+        return -float((target * log_softmax(scores / np.exp(log_temperature), axis=1)).sum(axis=1).mean())
 
-    found: Any = minimize_scalar(surprise, bounds=(np.log(_COLDEST), np.log(_HOTTEST)), method="bounded")
+    found: Any = minimize_scalar(surprise, bounds=(math.log(bounds[0]), math.log(bounds[1])), method="bounded")
     return float(np.exp(found.x))
 
 

@@ -10,7 +10,10 @@ try:
     import skops.io as skops_io
     from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
     from sklearn.linear_model import LogisticRegression
-    from sklearn.model_selection import StratifiedKFold
+    from sklearn.metrics import confusion_matrix as _confusion_matrix  # pyright: ignore[reportUnknownVariableType]
+    from sklearn.metrics import precision_recall_fscore_support as _precision_recall_fscore_support  # pyright: ignore[reportUnknownVariableType]
+    from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
+    from sklearn.model_selection import cross_val_predict as _cross_val_predict  # pyright: ignore[reportUnknownVariableType]
     from sklearn.neighbors import KNeighborsClassifier
     from sklearn.pipeline import Pipeline
     from sklearn.preprocessing import StandardScaler
@@ -27,6 +30,9 @@ except ImportError as error:
 # scikit-learn has no types of its own.
 check_classification_targets = cast(Any, _check_classification_targets)
 check_is_fitted = cast(Any, _check_is_fitted)
+confusion_matrix = cast(Any, _confusion_matrix)
+cross_val_predict = cast(Any, _cross_val_predict)
+precision_recall_fscore_support = cast(Any, _precision_recall_fscore_support)
 validate_data = cast(Any, _validate_data)
 
 __all__ = [
@@ -37,10 +43,14 @@ __all__ = [
     "LogisticRegression",
     "Pipeline",
     "StandardScaler",
+    "StratifiedGroupKFold",
     "StratifiedKFold",
     "TransformerMixin",
     "check_classification_targets",
     "check_is_fitted",
+    "confusion_matrix",
+    "cross_val_predict",
+    "precision_recall_fscore_support",
     "skops_io",
     "validate_data",
 ]

@@ -14,9 +14,10 @@ from threadpoolctl import threadpool_limits
 from shapespace.errors import InputError
 from shapespace.io.tables import write_rows
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.evaluate import fit_temperature, left_out, macro_accuracy, subject_folds
+from shapespace.recognise.predictions import left_out, subject_folds
 from shapespace.recognise.saved import SavedClassifier, software_versions
 from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
+from shapespace.recognise.scores import fit_temperature, macro_accuracy
 from shapespace.types import FloatArray
 
 UNSURE = "unsure"
@@ -86,6 +87,32 @@ def train_classifier(
     if not 0 <= confidence <= 1:
         raise InputError(f"The confidence must lie from 0 to 1, not {confidence!r}.")
     model_hash = one_model(scans)
+    used, left_out_counts, notes = _with_labels(scans)
+    z, labels, subjects = _samples(used, neutral if relative else None, projection)
+    K = _modes(z.shape[1], modes)
+    z = z[:, :K]
+    classes, counts = _classes(labels)
+    pipeline: Any = CLASSIFIERS[classifier](seed)
+    with threadpool_limits(1):
+        pipeline.fit(z, labels)
+        temperature, checked, note = _calibrate(z, labels, subjects, classes, classifier, seed)
+    if note:
+        notes.append(note)
+    training: dict[str, Any] = {
+        "scans": len(labels),
+        "subjects": len(set(subjects)) if all(subjects) else None,
+        "per_class": dict(zip(classes, counts, strict=True)),
+        "left_out": left_out_counts,
+    }
+    saved = SavedClassifier(
+        pipeline, classifier, model_hash, K, relative, neutral, tuple(classes), float(confidence), temperature,
+        training, checked, software_versions(), projection,
+    )  # fmt: skip
+    return saved, notes
+
+
+def _with_labels(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficients], dict[str, int], list[str]]:
+    """Return the scans to train on, how many are left out and why, and the same in sentences."""
     labelled = [scan for scan in scans if scan.label]
     used = [scan for scan in labelled if scan.trusted]
     lost = Counter(scan.status for scan in labelled if not scan.trusted)
@@ -98,50 +125,42 @@ def train_classifier(
     notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(lost.items())]
     if without_label:
         notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
-    z = _stacked(used)
+    return used, {**dict(lost), "without_label": without_label}, notes
+
+
+def _samples(
+    scans: Sequence[ScanCoefficients], neutral: str | None, projection: FloatArray | None
+) -> tuple[FloatArray, Any, list[str]]:
+    """Return features (n, k), labels (n,) and subjects; with `neutral`, relative to the faces that it labels."""
+    z = _stacked(scans)
     if projection is not None:
         if projection.shape[1:] != z.shape[1:]:
             raise InputError(
                 f"The fits have {z.shape[1]} coefficients, this model {projection.shape[1]}; fit with all modes."
             )
         z = z @ projection.T
-    K = _modes(z.shape[1], modes)
-    labels = np.asarray([scan.label for scan in used])
-    subjects = [scan.subject for scan in used]
-    if relative:
-        is_neutral = labels == neutral
-        if not all(subjects):
-            raise InputError(
-                "Coefficients relative to neutral need to know whom each scan shows; add a column subject to the "
-                "labels."
-            )
-        z = relative_to_neutral(z, subjects, is_neutral)[~is_neutral]
-        subjects = [name for name, mine in zip(subjects, is_neutral, strict=True) if not mine]
-        labels = labels[~is_neutral]
-    z = z[:, :K]
+    labels = np.asarray([scan.label for scan in scans])
+    subjects = [scan.subject for scan in scans]
+    if neutral is None:
+        return z, labels, subjects
+    if not all(subjects):
+        raise InputError(
+            "Coefficients relative to neutral need to know whom each scan shows; add a column subject to the labels."
+        )
+    expressive = labels != neutral
+    z = relative_to_neutral(z, subjects, ~expressive)[expressive]
+    return z, labels[expressive], [name for name, mine in zip(subjects, expressive, strict=True) if mine]
+
+
+def _classes(labels: Any) -> tuple[list[str], list[int]]:
+    """Return the classes and how many samples each has, or raise where they cannot be learned."""
     classes, counts = np.unique(labels, return_counts=True)
     if len(classes) < 2 or counts.min() < 2:
         few = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
         raise InputError(f"Training needs at least two classes with at least two scans each; these were found: {few}.")
     if UNSURE in classes:
         raise InputError(f"The label {UNSURE!r} is what shapespace answers below the confidence; give it another name.")
-    pipeline: Any = CLASSIFIERS[classifier](seed)
-    with threadpool_limits(1):
-        pipeline.fit(z, labels)
-        temperature, checked, note = _calibrate(z, labels, subjects, classes.tolist(), classifier, seed)
-    if note:
-        notes.append(note)
-    training: dict[str, Any] = {
-        "scans": len(labels),
-        "subjects": len(set(subjects)) if all(subjects) else None,
-        "per_class": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
-        "left_out": {**dict(lost), "without_label": without_label},
-    }
-    saved = SavedClassifier(
-        pipeline, classifier, model_hash, K, relative, neutral, tuple(classes.tolist()), float(confidence), temperature,
-        training, checked, software_versions(), projection,
-    )  # fmt: skip
-    return saved, notes
+    return classes.tolist(), counts.tolist()
 
 
 def _calibrate(

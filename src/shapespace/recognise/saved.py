@@ -25,8 +25,8 @@ from shapespace import __version__
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.evaluate import calibrated
 from shapespace.recognise.learn import Pipeline, skops_io
+from shapespace.recognise.scores import calibrated
 from shapespace.types import FloatArray
 
 FORMAT = "shapespace classifier"

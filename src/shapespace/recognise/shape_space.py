@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 
-from shapespace.errors import InputError
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.geometry.procrustes import Gauge
@@ -29,8 +30,8 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
       by `fit_scan` (`meshes="scans"`); a mesh alone does not say which it is;
     - `FitResult`s and records of fits (as read from NAME.fit.json), of the same model, whose z is taken.
 
-    A record of a failed fit, or a scan that ends as failed, becomes a row of NaN; it is not dropped. A doubtful fit
-    keeps its coefficients here: see `status` of the fit.
+    A record of a failed fit, or a scan that cannot be fitted, becomes a row of NaN; it is not dropped, and a warning
+    says why. A doubtful fit keeps its coefficients here: see `status` of the fit.
 
     Args:
         modes: as in `ShapeModel.fit`: a number, a share of the variance, "auto", or None for all.
@@ -107,7 +108,6 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             CorrespondenceError: a mesh that is not in the model's vertex order, where meshes are not scans.
             InputError: a fit of another model, or something that is neither mesh nor fit.
             FileFormatError: a record that is damaged.
-            FitError: a scan that cannot be fitted at all.
         """
         check_is_fitted(self)
         rows = [self._coefficients(surface, number) for number, surface in enumerate(X, 1)]
@@ -117,8 +117,8 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         model = self.model_
         if isinstance(surface, Mesh):
             if self.meshes == "scans":
-                return self._of_fit(fit_scan(model, surface, self.config or FitConfig()))
-            return model.project(surface, align=self.align) / model.stddev
+                return self._of_scan(surface, number)
+            return model.to_z(model.project(surface, align=self.align))
         if isinstance(surface, FitResult):
             self._refuse_other_model(surface.model_hash, surface.scan_name)
             return self._of_fit(surface)
@@ -131,6 +131,13 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         if scan.z.shape != (model.n_modes,):
             raise InputError(f"The record of {scan.file} has {len(scan.z)} coefficients, not {model.n_modes}.")
         return scan.z
+
+    def _of_scan(self, scan: Mesh, number: int) -> FloatArray:
+        try:
+            return self._of_fit(fit_scan(self.model_, scan, self.config or FitConfig()))
+        except ShapespaceError as error:
+            warnings.warn(f"Number {number} has no coefficients: {error}", stacklevel=4)
+            return np.full(self.model_.n_modes, np.nan)
 
     def _of_fit(self, result: FitResult) -> FloatArray:
         return np.full(self.model_.n_modes, np.nan) if result.status == "failed" else result.z
@@ -152,7 +159,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         z = np.asarray(X, dtype=np.float64)
         if z.ndim != 2 or z.shape[1] > self.n_features_out_:
             raise InputError(f"Coefficients must be (n, k) with k at most {self.n_features_out_}, not {z.shape}.")
-        return [self.model_.mesh(row * self.model_.stddev[: len(row)]) for row in z]
+        return [self.model_.mesh(self.model_.to_b(row)) for row in z]
 
     def get_feature_names_out(self, input_features: Any = None) -> Any:
         """Return the names z1 to zK, (K,)."""

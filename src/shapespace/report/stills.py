@@ -63,13 +63,6 @@ def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
     return encoded(image)
 
 
-def posed_pair(scan: Mesh, surface: Mesh, panel: tuple[int, int] = (336, 416)) -> Still:
-    """Return two panels: the model's surface, and the scan and it over each other."""
-    camera = Camera.framing(surface.vertices, aspect=panel[0] / panel[1], margin=0.06)
-    above, below = Layer(scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
-    return encoded(np.concatenate(render_series([[below], [above, below]], camera=camera, size=panel), axis=1))
-
-
 def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:
     """Return a map as a bar of 256 by 10 pixels."""
     row = np.rint(255 * np.asarray(colours)).astype(np.uint8)

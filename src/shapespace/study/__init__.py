@@ -1,1 +1,1 @@
-"""The study of recognition on simulated people: the whole of `shapespace recognise study`."""
+"""Recognition measured on scans of one's own: `shapespace recognise study`."""

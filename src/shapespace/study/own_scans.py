@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
-from datetime import UTC, datetime
-from importlib.metadata import version as version_of
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
 
-from shapespace import __version__
-from shapespace.batch.run import Job, fit_files, make_jobs
+from shapespace.batch.run import Job, fit_files, make_executor, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig
@@ -23,63 +24,157 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
+from shapespace.report.html import require_report_extra, write_report
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
 NEUTRAL = "neutral"
+TextArray = npt.NDArray[np.str_]
 _FEWEST_SUBJECTS = 4
 _FEWEST_PER_CLASS = 2
+_CURVE = (2, 5, 10, 20, 40, 80)
 
 
-def run_own(
-    folder: Path,
-    data: Path,
-    model_file: Path,
-    *,
-    folds: int = 10,
-    seed: int = 0,
-    executor: Executor | None = None,
-    on_scans: Callable[[int], None] | None = None,
-    on_fit: Callable[[Job, Mapping[str, Any]], None] | None = None,
+def run_own_study(
+    folder: Path, data: Path, model_file: Path, *, folds: int, workers: int, seed: int = 0, quiet: bool = False
 ) -> tuple[Path, str]:
-    """Fit the labelled scans in `data` with a model, classify them, and write recognition.json.
+    """Fit the labelled scans in `data`, classify them, and write recognition.json and its report.
 
     Args:
-        folder: where results go; fits that are there already are kept.
+        folder: for the results; fits that are there already are kept.
         data: BU-3DFE, Bosphorus, or a folder with labels.csv; see `scan_set`.
         model_file: the shape model, which should know none of these people; where it parts identity and expression,
             expression alone is a feature as well.
-        folds: at most; fewer where there are fewer people.
+        folds: by subject, at most; fewer where there are fewer people.
+        workers: processes that fit.
         seed: of the folds.
-        executor: from `make_executor`; None fits one after the other.
-        on_scans: told how many there are.
-        on_fit: told of each fit.
+        quiet: no progress bar.
 
     Returns:
-        The path of recognition.json, and what the folder of scans holds, in words.
+        The path of the report, and what the folder of scans holds, in words.
 
     Raises:
         FileError: something cannot be read or written.
         InputError: too few people or expressions.
+        ShapespaceError: the extras `recognise` and `report` are not installed.
     """
+    require_report_extra()
+    make_folder(folder)
     found = scan_set(data)
     _check(found.scans, data, folds)
-    if on_scans is not None:
-        on_scans(len(found.scans))
     model = ShapeModel.load(model_file)
     try:
         additive: AdditiveModel | None = AdditiveModel.load(model_file)
     except ModelFileError:
         additive = None  # a plain shape model, which loaded
-    jobs = make_jobs([entry.path for entry in found.scans])
-    results = make_folder(folder / "fits")
-    records = fit_files(
-        jobs, model, model_file, results, FitConfig(), executor=executor, resume=True, on_done=on_fit
-    )  # fmt: skip
-    made = _document(found.scans, records, model, additive, found.summary(), folds, seed, model_file)
-    path = folder / "recognition.json"
-    write_text(path, json.dumps(made, indent=1, allow_nan=False) + "\n")
-    return path, found.summary()
+    with ExitStack() as stack:
+        executor = stack.enter_context(make_executor(model_file, workers)) if workers > 1 else None
+        bar = stack.enter_context(
+            tqdm(total=len(found.scans), unit="scan", leave=False, desc="fitting", disable=True if quiet else None)
+        )
+
+        def fitted(job: Job, record: Mapping[str, Any]) -> None:
+            bar.update()
+
+        jobs = make_jobs([entry.path for entry in found.scans])
+        results = make_folder(folder / "fits")
+        records = fit_files(
+            jobs, model, model_file, results, FitConfig(), executor=executor, resume=True, on_done=fitted
+        )
+    fits = OwnFits.of(found.scans, records, model, additive)
+    settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}
+    made = _document(fits, found.summary(), settings)
+    write_text(folder / "recognition.json", json.dumps(made, indent=1, allow_nan=False) + "\n")
+    return write_report(folder), found.summary()
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFits:
+    """Labelled scans and their fits by one model.
+
+    Args:
+        codes: features by name, each (N, k); rows of failed fits are NaN.
+        status: N words.
+        expression: (N,) what each scan shows.
+        subject: (N,) who.
+        level: (N,) at which intensity.
+        model_hash: of the model.
+    """
+
+    codes: Mapping[str, FloatArray]
+    status: Sequence[str]
+    expression: TextArray
+    subject: TextArray
+    level: FloatArray
+    model_hash: str
+
+    @classmethod
+    def of(
+        cls,
+        scans: Sequence[ScanEntry],
+        records: Sequence[Mapping[str, Any]],
+        model: ShapeModel,
+        additive: AdditiveModel | None,
+    ) -> OwnFits:
+        """Return what the records tell of the scans, in their order."""
+        z = np.full((len(scans), model.n_modes), np.nan)
+        for row, record in enumerate(records):
+            if record["status"] != "failed":
+                z[row] = np.asarray(record["z"], dtype=np.float64)
+        codes: dict[str, FloatArray] = {"all coefficients": z}
+        if additive is not None:
+            e = np.full((len(z), additive.n_expression), np.nan)
+            usable = np.isfinite(z).all(axis=1)
+            e[usable] = additive.split(z[usable])[1]
+            codes["expression coefficients of the additive model"] = e
+        return cls(
+            codes,
+            [str(record["status"]) for record in records],
+            np.array([entry.expression for entry in scans], dtype=np.str_),
+            np.array([entry.subject for entry in scans], dtype=np.str_),
+            np.array([entry.intensity for entry in scans], dtype=np.float64),
+            model.content_hash,
+        )
+
+    @cached_property
+    def tested(self) -> BoolArray:
+        """(N,) which are not neutral: (M,) of them."""
+        return np.asarray(self.expression != NEUTRAL, dtype=np.bool_)
+
+    @cached_property
+    def labels(self) -> TextArray:
+        """(M,) what those tested show."""
+        return self.expression[self.tested]
+
+    @cached_property
+    def subjects(self) -> TextArray:
+        """(M,) who they are."""
+        return self.subject[self.tested]
+
+    @property
+    def people(self) -> int:
+        """How many people are tested."""
+        return len(np.unique(self.subjects))
+
+    @property
+    def neutral_known(self) -> bool:
+        """Whether there is a neutral scan of everybody who is tested."""
+        return set(self.subjects.tolist()) <= set(self.subject[~self.tested].tolist())
+
+    def most_folds(self, wanted: int) -> int:
+        """Return how many folds there can be."""
+        return min(wanted, self.people)
+
+    def folds(self, code: FloatArray, settings: Mapping[str, Any]) -> list[evaluate.Fold]:
+        """Return the folds by person of one feature."""
+        labels, subjects = self.labels.tolist(), self.subjects.tolist()
+        return evaluate.folds_of(code[self.tested], labels, subjects, settings["folds"], settings["seed"])
+
+    def accuracy_of(
+        self, predicted: Sequence[str], chosen: BoolArray | None = None
+    ) -> tuple[float, tuple[float, float]]:
+        """Return macro accuracy and its interval over people, of all or of some."""
+        return parts.accuracy_of(self.labels, predicted, self.subjects, chosen)
 
 
 def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
@@ -101,69 +196,17 @@ def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
         )
 
 
-def _document(
-    scans: Sequence[ScanEntry],
-    records: Sequence[Mapping[str, Any]],
-    model: ShapeModel,
-    additive: AdditiveModel | None,
-    holds: str,
-    folds: int,
-    seed: int,
-    model_file: Path,
-) -> dict[str, Any]:
-    z = np.full((len(scans), model.n_modes), np.nan)
-    for row, record in enumerate(records):
-        if record["status"] != "failed":
-            z[row] = np.asarray(record["z"], dtype=np.float64)
-    expression = np.array([entry.expression for entry in scans])
-    subject = np.array([entry.subject for entry in scans])
-    level = np.array([entry.intensity for entry in scans], dtype=np.float64)
-    status = [str(record["status"]) for record in records]
-    tested: BoolArray = np.asarray(expression != NEUTRAL, dtype=np.bool_)
-    labels, subjects = expression[tested], subject[tested]
-    classes = tuple(sorted(set(labels.tolist())))
-    n_folds = min(folds, len(set(subjects.tolist())))
-
-    codes: dict[str, FloatArray] = {"all coefficients": z}
-    if additive is not None:
-        e = np.full((len(z), additive.n_expression), np.nan)
-        usable = np.isfinite(z).all(axis=1)
-        e[usable] = additive.split(z[usable])[1]
-        codes["expression coefficients of the additive model"] = e
-    rows: list[tuple[object, ...]] = []
-    default: evaluate.Predictions | None = None
-    default_folds: list[evaluate.Fold] = []
-    with_neutral = int(sum(name in set(subject[expression == NEUTRAL].tolist()) for name in set(subjects.tolist())))
-    for relative in (False, True):
-        if relative and with_neutral < len(set(subjects.tolist())):
-            continue
-        word = "known" if relative else "unknown"
-        for name, code in codes.items():
-            used = _relative(code, subject, expression) if relative else code
-            made = evaluate.folds_of(used[tested], labels.tolist(), subjects.tolist(), n_folds, seed)
-            nested = evaluate.nested_predictions(made, inner_folds=parts.inner_folds(made), seed=seed, modes=(10, None))
-            accuracy, interval = parts.accuracy_of(labels, nested.predicted, subjects)
-            chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
-            rows.append((name, word, f"nested choice ({chosen})", accuracy, interval))
-            for classifier in CLASSIFIERS:
-                fixed = parts.fixed(made, classifier)
-                if fixed is None:
-                    rows.append((name, word, f"{classifier} (too few samples)", None, None))
-                    continue
-                accuracy, interval = parts.accuracy_of(labels, fixed.predicted, subjects)
-                rows.append((name, word, classifier, accuracy, interval))
-            if not relative:
-                default, default_folds = nested, made
-    assert default is not None
-    test = evaluate.permutation_test(default_folds, permutations=99, seed=seed)
-    accuracy, interval = parts.accuracy_of(labels, default.predicted, subjects)
-    doubtful, failed = status.count("doubtful"), status.count("failed")
-    people = len(set(subjects.tolist()))
-    counts = [count for count in (2, 5, 10, 20, 40, 80) if count < people * (n_folds - 1) // n_folds]
-    made_parts: list[parts.Part] = [
+def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return recognition.json."""
+    rows, folds, found = _compared(fits, settings)
+    test = evaluate.permutation_test(folds, permutations=99, seed=settings["seed"])
+    accuracy, interval = fits.accuracy_of(found.predicted)
+    labels, classes = fits.labels.tolist(), found.classes
+    doubtful, failed = fits.status.count("doubtful"), fits.status.count("failed")
+    made: list[parts.Part] = [
         {"kind": "text", "title": "What was tested", "text": [
             *holds.splitlines(),
-            f"{doubtful} of {len(status)} fits are doubtful and {failed} failed. Doubtful fits are classified "
+            f"{doubtful} of {len(fits.status)} fits are doubtful and {failed} failed. Doubtful fits are classified "
             "and counted; a failed one counts as wrong.",
             "The shape model was given and stays the same in all folds; scaling and classifiers are made anew "
             "without the people tested. Where it was made of the same people, these figures flatter.",
@@ -173,41 +216,67 @@ def _document(
             [("Features", "text"), ("Neutral face", "text"), ("Classifier", "text"), ("Macro accuracy", "percent"),
              ("95 % over people", "interval")],
             rows,
-            f"{n_folds} folds by subject. With labels shuffled within each person LDA gets "
+            f"{settings['folds']} folds by subject. With labels shuffled within each person LDA gets "
             f"{parts.words(float(test.null.mean()))} (p = {test.p:.3f}).",
         ),
-        parts.confusion("Confusion", labels.tolist(), default.predicted, classes,
+        *_by_intensity(fits, found),
+        parts.confusion("Confusion", labels, found.predicted, classes,
                         "Classifier chosen inside the training people, neutral face unknown."),
-        parts.per_class("Each expression", labels.tolist(), default.predicted, classes),
-        parts.calibration("Whether the probabilities come true", labels.tolist(), default.probabilities,
-                          default.classes),
+        parts.per_class("Each expression", labels, found.predicted, classes),
+        parts.calibration("Whether the probabilities come true", labels, found.probabilities, classes),
     ]  # fmt: skip
+    taught = fits.people * (settings["folds"] - 1) // settings["folds"]
+    counts = [count for count in _CURVE if count < taught]
     if counts:
-        made_parts.append(parts.learning_curve("How many people it takes", default_folds, counts, ceiling=None))
-    levels = sorted(set(level[tested].tolist()))
-    if len(levels) > 1:
-        made_parts.insert(2, parts.table(
+        made.append(parts.learning_curve("How many people it takes", folds, counts, ceiling=None))
+    summary = [
+        f"{len(classes)} expressions of unseen people are told apart at {parts.words(accuracy)} (95 % interval "
+        f"over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
+        f"{parts.words(1 / len(classes))}).",
+        f"{doubtful + failed} of {len(fits.status)} fits are not to be trusted.",
+    ]
+    title = f"Expressions in {len(fits.status)} scans of {fits.people} people"
+    return parts.document(title, summary, [], made, settings=settings, model_hashes=[fits.model_hash])
+
+
+def _compared(
+    fits: OwnFits, settings: Mapping[str, Any]
+) -> tuple[list[tuple[object, ...]], list[evaluate.Fold], evaluate.Predictions]:
+    """Return a row for each feature and classifier, and folds and answers of the last feature, neutral unknown."""
+    rows: list[tuple[object, ...]] = []
+    last: tuple[list[evaluate.Fold], evaluate.Predictions] | None = None
+    for word in ("unknown", "known") if fits.neutral_known else ("unknown",):
+        for name, code in fits.codes.items():
+            folds = fits.folds(_relative(code, fits.subject, fits.expression) if word == "known" else code, settings)
+            nested = evaluate.nested_predictions(
+                folds, inner_folds=parts.inner_folds(folds), seed=settings["seed"], modes=(10, None)
+            )
+            chosen = ", ".join(sorted({choice.classifier for choice in nested.chosen}))
+            rows.append((name, word, f"nested choice ({chosen})", *fits.accuracy_of(nested.predicted)))
+            for classifier in CLASSIFIERS:
+                fixed = parts.fixed(folds, classifier)
+                if fixed is None:
+                    rows.append((name, word, f"{classifier} (too few samples)", None, None))
+                else:
+                    rows.append((name, word, classifier, *fits.accuracy_of(fixed.predicted)))
+            if word == "unknown":
+                last = folds, nested
+    assert last is not None
+    return rows, *last
+
+
+def _by_intensity(fits: OwnFits, found: evaluate.Predictions) -> list[parts.Part]:
+    level = fits.level[fits.tested]
+    levels = sorted(set(level.tolist()))
+    if len(levels) < 2:
+        return []
+    return [
+        parts.table(
             "By intensity",
             [("Intensity", "percent"), ("Macro accuracy", "percent"), ("Scans", "count")],
-            [(one, parts.accuracy_of(labels, default.predicted, subjects, level[tested] == one)[0],
-              int((level[tested] == one).sum())) for one in levels],
-        ))  # fmt: skip
-    return parts.document(
-        f"Expressions in {len(scans)} scans of {people} people",
-        [
-            f"{len(classes)} expressions of unseen people are told apart at {parts.words(accuracy)} (95 % interval "
-            f"over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
-            f"{parts.words(1 / len(classes))}).",
-            f"{doubtful + failed} of {len(scans)} fits are not to be trusted.",
-        ],
-        [],
-        made_parts,
-        settings={"model": model_file.name, "folds": n_folds, "seed": seed},
-        versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
-        model_hashes=[model.content_hash],
-        version=__version__,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+            [(one, fits.accuracy_of(found.predicted, level == one)[0], int((level == one).sum())) for one in levels],
+        )
+    ]
 
 
 def _relative(code: FloatArray, subject: Any, expression: Any) -> FloatArray:

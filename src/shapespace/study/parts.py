@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version as version_of
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from shapespace import __version__
 from shapespace.errors import InputError
 from shapespace.recognise import evaluate
 from shapespace.types import FloatArray
@@ -144,22 +147,19 @@ def document(
     parts: Sequence[Part],
     *,
     settings: Mapping[str, Any],
-    versions: Mapping[str, str],
     model_hashes: Sequence[str],
-    version: str,
-    created: str,
 ) -> dict[str, Any]:
     """Return the whole of recognition.json."""
     return {
         "format": "shapespace recognition",
         "format_version": 1,
-        "version": version,
-        "created": created,
+        "version": __version__,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "title": title,
         "summary": list(summary),
         "targets": list(targets),
         "parts": list(parts),
         "settings": dict(settings),
-        "versions": dict(versions),
+        "versions": {name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
         "model_hashes": list(model_hashes),
     }

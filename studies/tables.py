@@ -7,16 +7,15 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from functools import cached_property
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from shapespace import __version__
+import approaches
+from approaches import APPROACHES, Features, Rows
 from shapespace.datasets.ict import IctFaces, load_ict
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_bytes, write_text
@@ -26,10 +25,10 @@ from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.hierarchy import FaceTypes
 from shapespace.recognise.line_structure import disjointness, line_scores, pooled_line_scores
-from shapespace.study import approaches, parts
-from shapespace.study.approaches import APPROACHES, Features, Rows
+from shapespace.study import parts
 from shapespace.study.parts import Part, target, words
-from shapespace.study.simulated import (
+from shapespace.types import BoolArray, FloatArray, IntArray
+from simulated import (
     PAPER_EXPRESSIONS,
     STATUSES,
     Fits,
@@ -43,7 +42,6 @@ from shapespace.study.simulated import (
     stranger_path,
     stranger_shown,
 )
-from shapespace.types import BoolArray, FloatArray, IntArray
 
 Told = Callable[[str], None]
 TextArray = npt.NDArray[np.str_]
@@ -279,10 +277,7 @@ class _Maker:
             self.targets,
             self.parts,
             settings=_flat(asdict(config)) | {f"seconds, {name}": round(value, 1) for name, value in seconds.items()},
-            versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
             model_hashes=[model.shape.content_hash for model in study.models],
-            version=__version__,
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
 
     # What everything is compared with
@@ -876,16 +871,13 @@ def _unit(codes: FloatArray) -> FloatArray:
 def _spread_mm(model: AdditiveModel, codes: FloatArray, *, identity: bool) -> float:
     """Return the mean over the vertices of the standard deviation of surfaces with these codes alone, mm."""
     none = np.zeros(0)
-    surfaces = np.stack(
-        [model.shape.reconstruct(model.join(code, none) if identity else model.join(none, code)) for code in codes]
-    )
+    surfaces = np.stack([(model.mesh(code, none) if identity else model.mesh(none, code)).vertices for code in codes])
     return float(np.sqrt(surfaces.var(axis=0).sum(axis=1)).mean())
 
 
 def _basis_of_codes(model: AdditiveModel) -> FloatArray:
     """Return (V, 3, K) what one standard deviation of each of [a; e] does to each vertex, mm."""
-    to_b: FloatArray = model.shape.stddev[:, None] * model.rotation.T
-    flat: FloatArray = model.shape.vertex_basis @ to_b
+    flat: FloatArray = model.shape.vertex_basis @ model.shape.to_b(model.rotation).T
     return flat.reshape(model.shape.n_vertices, 3, model.shape.n_modes)
 
 

@@ -1,5 +1,8 @@
 """All approaches of the study against one contract: taught by some people, they tell expressions of others apart."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,8 +10,10 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.recognise.hierarchy import FaceTypes
-from shapespace.study import approaches
-from shapespace.study.approaches import APPROACHES, Rows
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
+import approaches
+from approaches import APPROACHES, Rows
 
 EXPRESSIONS = ("anger", "fear", "smile")
 IDENTITIES, MODES = 6, 10

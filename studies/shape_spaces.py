@@ -16,12 +16,10 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from shapespace import __version__
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
-from shapespace.datasets.study_people import StudyPeople, holes_of
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine
@@ -29,10 +27,12 @@ from shapespace.geometry.distance import surface_distances
 from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.surface import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text
+from shapespace.model.floor import floor_mm
 from shapespace.model.representation import BSplineSurface
 from shapespace.model.shape_model import ShapeModel
-from shapespace.study.simulated import Stage, faces_of_ict
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from simulated import Stage, faces_of_ict
+from study_people import StudyPeople, holes_of
 
 Record: TypeAlias = dict[str, Any]
 
@@ -51,7 +51,6 @@ TRAINING: Mapping[str, tuple[float, float]] = {
     "30 % missing": (0.0, 0.3),
 }
 """The same of the meshes that the models are made of."""
-_FLOOR_STEPS, _FLOOR_REACHED_MM = 20, 1e-4
 _NARROW_MM = 5.0
 _SEED = 500
 
@@ -270,32 +269,6 @@ def _trained_on(
     except InputError:
         return None
     return float(np.mean([floor_mm(model, mesh.vertices) for mesh in others]))
-
-
-def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
-    """Return the mean error, mm, of the shape of `model` and the pose that come nearest to `truth` (V, 3).
-
-    Pose and coefficients are solved for together: in turn they crawl where modes hold pose or size.
-    """
-    b, T = model.project(truth, align=False), Similarity.identity()
-    modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
-    for _ in range(_FLOOR_STEPS):
-        shape = T.apply(model.reconstruct(b))
-        arm = shape - T.translation
-        turn = np.cross(np.eye(3), arm[:, None]).transpose(0, 2, 1)
-        move = np.broadcast_to(np.eye(3), turn.shape)
-        reach = T.scale * (T.rotation @ modes)
-        J = np.concatenate([turn, move, arm[:, :, None], reach], axis=2).reshape(-1, 7 + model.n_modes)
-        # A touch of damping, since modes may hold all of a pose.
-        H = J.T @ J
-        H[np.diag_indices_from(H)] *= 1.0 + 1e-9
-        step = np.linalg.solve(H, J.T @ (truth - shape).ravel())
-        turned = Rotation.from_rotvec(step[:3]).as_matrix() @ T.rotation
-        T = Similarity(T.scale * np.exp(step[6]), turned, T.translation + step[3:6])
-        b = b + step[7:]
-        if np.abs(J @ step).max() < _FLOOR_REACHED_MM:
-            break
-    return float(np.linalg.norm(T.apply(model.reconstruct(b)) - truth, axis=1).mean())
 
 
 # The second comparison: expressions from one PCA in each shape space

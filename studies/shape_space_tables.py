@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.errors import FileFormatError
-from shapespace.recognise import evaluate
-from shapespace.study import parts
-from shapespace.study.parts import Part
-from shapespace.study.shape_spaces import (
+from shape_spaces import (
     SCANS,
     TRAINING,
     Record,
@@ -21,6 +17,10 @@ from shapespace.study.shape_spaces import (
     read_record,
     read_rows,
 )
+from shapespace.errors import FileFormatError
+from shapespace.recognise import evaluate
+from shapespace.study import parts
+from shapespace.study.parts import Part
 from shapespace.types import FloatArray
 
 

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.bilinear import BilinearModel
 from shapespace.model.pca import modes_for_variance
-from shapespace.recognise.classifiers import ShrinkageLDA
 from shapespace.recognise.hierarchy import ExpressionByType, FaceTypes
 from shapespace.types import BoolArray, FloatArray, IntArray
 
@@ -183,10 +182,3 @@ def by_type(
     a, e = model.split(taught.z)
     hierarchy = ExpressionByType(types, soft=soft).fit(a, e, taught.expression.tolist())
     return hierarchy.classes, hierarchy.predict_proba(*model.split(faces.z))
-
-
-def by_one_classifier(features: Features, training: Rows, faces: Rows) -> tuple[tuple[str, ...], FloatArray]:
-    """Return the classes and how likely each is, (n, C), by the classifier that all approaches share."""
-    taught = training.expressive
-    classifier = ShrinkageLDA().fit(features(taught), taught.expression)
-    return tuple(classifier.classes_.tolist()), classifier.predict_proba(features(faces))

@@ -1,5 +1,6 @@
 """People of the recognition study: the same whatever is made first, each in a way of their own."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from shapespace.datasets.ict import IctFaces, load_ict
-from shapespace.datasets.study_people import SIX_EXPRESSIONS, StudyPeople, holes_of
 from shapespace.errors import InputError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
+from study_people import SIX_EXPRESSIONS, StudyPeople, holes_of
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,6 @@ from shapespace.datasets.faces import LICENSE, Expression, FaceGenerator, load_f
 from shapespace.datasets.fetch import present_folder
 from shapespace.datasets.ict import IctFaces, landmark_vertices, load_ict
 from shapespace.datasets.simulated_scan import SimulatedScan
-from shapespace.datasets.study_people import StudyPeople
 from shapespace.errors import FileFormatError, FitError, InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.robust_method import Robust
@@ -34,6 +33,7 @@ from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel, Told
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from study_people import StudyPeople
 
 MIRRORED = ", mirrored"
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")

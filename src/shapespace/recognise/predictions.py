@@ -1,0 +1,348 @@
+"""Classes predicted in people who were not trained on: folds by subject, and a choice nested inside them.
+
+Everything here works on arrays of whitened coefficients, (n, K). A `Fold` carries its own training and test arrays, so
+that the shape model behind them may be another one in each fold, made without the people tested. A test row that is not
+finite stands for a fit that failed: it gets no answer, and counts as wrong. Such training rows are left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from shapespace.errors import InputError
+from shapespace.recognise.classifiers import CLASSIFIERS, GRIDS
+from shapespace.recognise.learn import StratifiedGroupKFold
+from shapespace.recognise.scores import IndexArray, calibrated, fit_temperature, macro_accuracy
+from shapespace.types import FloatArray
+
+MODES: tuple[int | None, ...] = (10, 20, 40, None)
+"""Numbers of leading modes among which nested cross-validation chooses; None is all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """One training and one test set, of different people.
+
+    Args:
+        train: (n, K) coefficients in standard deviations.
+        train_labels: n classes.
+        train_subjects: n names of people.
+        test: (m, K), by the same model.
+        test_labels: m classes.
+        test_subjects: m names of people, none of them trained on.
+        test_index: (m,) place of each test sample in the whole, which orders `Predictions`; None keeps the order of the
+            folds.
+
+    Raises:
+        InputError: arrays that do not belong together, or a person in both sets.
+    """
+
+    train: FloatArray
+    train_labels: Sequence[str]
+    train_subjects: Sequence[str]
+    test: FloatArray
+    test_labels: Sequence[str]
+    test_subjects: Sequence[str]
+    test_index: IndexArray | None = None
+
+    def __post_init__(self) -> None:
+        n, m = len(self.train_labels), len(self.test_labels)
+        fits = (
+            self.train.ndim == self.test.ndim == 2
+            and self.train.shape[1] == self.test.shape[1] > 0
+            and len(self.train) == n == len(self.train_subjects)
+            and len(self.test) == m == len(self.test_subjects)
+            and (self.test_index is None or len(self.test_index) == m)
+        )
+        if not fits or not n or not m:
+            raise InputError(
+                f"A fold needs (n, K) training and (m, K) test coefficients with a label and a subject each, not "
+                f"{self.train.shape} with {n} labels and {self.test.shape} with {m} labels."
+            )
+        both = sorted(set(self.train_subjects) & set(self.test_subjects))
+        if both:
+            raise InputError(f"{', '.join(both[:3])} would be trained on and tested; split the samples by subject.")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What nested cross-validation chose within the training people of one fold.
+
+    Args:
+        classifier: a name of `CLASSIFIERS`.
+        parameters: of its pipeline.
+        modes: number of leading modes.
+        temperature: that calibrates its probabilities.
+        macro_accuracy: of the choice, within the training people.
+    """
+
+    classifier: str
+    parameters: Mapping[str, Any]
+    modes: int
+    temperature: float
+    macro_accuracy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Answers for the test samples of all folds.
+
+    Args:
+        classes: C names, sorted.
+        labels: n true classes.
+        predicted: n answers; empty where the fit failed.
+        probabilities: (n, C); NaN where the fit failed.
+        subjects: n names of people.
+        index: (n,) `test_index`, or 0 to n - 1.
+        chosen: one a fold.
+    """
+
+    classes: tuple[str, ...]
+    labels: tuple[str, ...]
+    predicted: tuple[str, ...]
+    probabilities: FloatArray
+    subjects: tuple[str, ...]
+    index: IndexArray
+    chosen: tuple[Choice, ...]
+
+
+def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[tuple[IndexArray, IndexArray]]:
+    """Return (train, test) indices of folds that never split a person and have about as many samples each.
+
+    Raises:
+        InputError: fewer people than folds, or fewer than two folds.
+    """
+    people = np.asarray(subjects, dtype=str)
+    count = len(np.unique(people))
+    if not 2 <= n_folds <= count:
+        raise InputError(f"{count} people cannot be split into {n_folds} folds; ask for 2 to {count}.")
+    # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
+    parted: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
+    return list(parted.split(people, np.zeros(len(people)), people))
+
+
+def folds_of(
+    z: FloatArray, labels: Sequence[str], subjects: Sequence[str], n_folds: int = 5, seed: int = 0
+) -> list[Fold]:
+    """Return folds of (n, K) coefficients that all come from one shape model.
+
+    That model may have seen the people tested, which flatters; for an honest figure make each fold's model without
+    them.
+
+    Raises:
+        InputError: arrays that do not belong together, or too few people.
+    """
+    names, people = np.asarray(labels, dtype=str), np.asarray(subjects, dtype=str)
+    return [
+        Fold(
+            z[train], names[train].tolist(), people[train].tolist(),
+            z[test], names[test].tolist(), people[test].tolist(), test,
+        )
+        for train, test in subject_folds(subjects, n_folds, seed)
+    ]  # fmt: skip
+
+
+def nested_predictions(
+    folds: Sequence[Fold],
+    *,
+    classifiers: Sequence[str] = tuple(CLASSIFIERS),
+    inner_folds: int = 4,
+    seed: int = 0,
+    modes: Sequence[int | None] = MODES,
+    on_fold: Callable[[int, int], None] | None = None,
+) -> Predictions:
+    """Predict the test samples of each fold by what was chosen among its training people alone.
+
+    Inside the training people, again split by person: first the number of leading modes is chosen by LDA, then the
+    classifier and its parameters with that many, each by macro accuracy of the samples left out. The probabilities of
+    the chosen one on those samples give the temperature that calibrates it. Then it is fitted to all training people.
+
+    Args:
+        folds: the outer folds.
+        classifiers: names of `CLASSIFIERS` to choose from; among equals the first is taken.
+        inner_folds: folds of the training people.
+        seed: of the inner folds and the classifiers.
+        modes: numbers of leading modes to choose from; None is all.
+        on_fold: told of folds done and their number.
+
+    Raises:
+        InputError: no folds, an unknown classifier, too few people, or a class in too few of them.
+    """
+    classes = classes_of(folds)
+    refuse_unknown(classifiers)
+    if not classifiers or not modes:
+        raise InputError("Nested cross-validation needs at least one classifier and one number of modes.")
+    found: list[tuple[FloatArray, Choice]] = []
+    with threadpool_limits(1):  # small matrices: more threads cost more than they give
+        for number, fold in enumerate(folds, 1):
+            found.append(_nested(fold, classes, classifiers, inner_folds, seed, modes))
+            if on_fold is not None:
+                on_fold(number, len(folds))
+    return _gather(folds, classes, found)
+
+
+def _nested(
+    fold: Fold,
+    classes: tuple[str, ...],
+    names: Sequence[str],
+    inner_folds: int,
+    seed: int,
+    modes: Sequence[int | None],
+) -> tuple[FloatArray, Choice]:
+    X, labels, subjects = usable(fold)
+    inner = subject_folds(subjects.tolist(), inner_folds, seed)
+    K = X.shape[1]
+    counts = sorted({min(K if m is None else m, K) for m in modes})
+    by_modes = [left_out(X[:, :m], labels, inner, classes, "lda", {}, seed) for m in counts]
+    tried = [macro_accuracy(labels, answers_of(found, classes), classes) for found in by_modes]
+    m = counts[int(np.argmax(tried))]
+    best: tuple[float, str, dict[str, Any], FloatArray] | None = None
+    fewest = min(len(train) for train, _ in inner)
+    for name in names:
+        for parameters in _grid(name):
+            if int(parameters.get("classify__n_neighbors", 1)) > fewest:
+                continue  # so many neighbours there are not
+            probabilities = left_out(X[:, :m], labels, inner, classes, name, parameters, seed)
+            accuracy = macro_accuracy(labels, answers_of(probabilities, classes), classes)
+            if best is None or accuracy > best[0] + 1e-12:
+                best = accuracy, name, parameters, probabilities
+    if best is None:
+        raise InputError("None of the classifiers can be had with so few training samples; add samples.")
+    accuracy, name, parameters, probabilities = best
+    temperature = fit_temperature(labels.tolist(), probabilities, classes)
+    answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, name, parameters, seed)
+    return calibrated(answer, temperature), Choice(name, parameters, m, temperature, accuracy)
+
+
+def fixed_predictions(
+    folds: Sequence[Fold], classifier: str, *, modes: int | None = None, seed: int = 0
+) -> Predictions:
+    """Predict the test samples of each fold by one classifier with its own settings, with nothing to choose.
+
+    Raises:
+        InputError: no folds, or an unknown classifier.
+    """
+    classes = classes_of(folds)
+    refuse_unknown([classifier])
+    found: list[tuple[FloatArray, Choice]] = []
+    with threadpool_limits(1):
+        for fold in folds:
+            X, labels, _ = usable(fold)
+            m = min(modes or X.shape[1], X.shape[1])
+            answer = predict_probabilities(X[:, :m], labels, fold.test[:, :m], classes, classifier, {}, seed)
+            found.append((answer, Choice(classifier, {}, m, 1.0, float("nan"))))
+    return _gather(folds, classes, found)
+
+
+def predict_probabilities(
+    X: FloatArray,
+    labels: Any,
+    test: FloatArray,
+    classes: Sequence[str],
+    classifier: str,
+    parameters: Mapping[str, Any],
+    seed: int = 0,
+) -> FloatArray:
+    """Return probabilities (m, C) of `test` (m, K) by a classifier fitted to `X` (n, K).
+
+    Rows of `test` that are not finite give NaN; classes that the training samples lack have probability 0.
+    """
+    pipeline: Any = CLASSIFIERS[classifier](seed).set_params(**parameters)
+    neighbours = int(getattr(pipeline[-1], "n_neighbors", 1))
+    if neighbours > len(X):
+        raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
+    finite = np.isfinite(test).all(axis=1)
+    only = np.unique(np.asarray(labels, dtype=str))
+    if len(only) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
+        answer = np.full((len(test), len(classes)), np.nan)
+        answer[finite] = 0.0
+        answer[finite, list(classes).index(str(only[0]))] = 1.0
+        return answer
+    pipeline.fit(X, labels)
+    answer = np.full((len(test), len(classes)), np.nan)
+    if finite.any():
+        columns = [classes.index(name) for name in pipeline.classes_.tolist()]
+        known = np.zeros((int(finite.sum()), len(classes)))
+        known[:, columns] = pipeline.predict_proba(test[finite])
+        answer[finite] = known
+    return answer
+
+
+def left_out(
+    X: FloatArray,
+    labels: Any,
+    folds: Sequence[tuple[IndexArray, IndexArray]],
+    classes: Sequence[str],
+    classifier: str,
+    parameters: Mapping[str, Any],
+    seed: int = 0,
+) -> FloatArray:
+    """Return probabilities (n, C) of each sample by the classifier fitted to the folds that do not hold it."""
+    answer = np.full((len(X), len(classes)), np.nan)
+    for train, test in folds:
+        answer[test] = predict_probabilities(X[train], labels[train], X[test], classes, classifier, parameters, seed)
+    return answer
+
+
+def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
+    """Return all classes in order, or raise InputError where there are fewer than two, or no folds."""
+    if not folds:
+        raise InputError("There are no folds to evaluate.")
+    classes = sorted({label for fold in folds for label in (*fold.train_labels, *fold.test_labels)})
+    if len(classes) < 2:
+        raise InputError("Recognition needs at least two classes.")
+    return tuple(classes)
+
+
+def refuse_unknown(names: Sequence[str]) -> None:
+    """Raise InputError where a name is none of `CLASSIFIERS`."""
+    for name in names:
+        if name not in CLASSIFIERS:
+            raise InputError(f"There is no classifier {name!r}; choose among {', '.join(CLASSIFIERS)}.")
+
+
+def usable(fold: Fold) -> tuple[FloatArray, Any, Any]:
+    """Return the finite training rows with labels and subjects as arrays."""
+    finite = np.isfinite(fold.train).all(axis=1)
+    labels = np.asarray(fold.train_labels, dtype=str)[finite]
+    if len(np.unique(labels)) < 2:
+        raise InputError("The training part of a fold has fewer than two classes with fits that can be used.")
+    return fold.train[finite], labels, np.asarray(fold.train_subjects, dtype=str)[finite]
+
+
+def answers_of(probabilities: FloatArray, classes: Sequence[str]) -> Any:
+    """Return the likeliest classes (n,); empty where a fit failed."""
+    lost = np.isnan(probabilities).any(axis=1)
+    best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
+    return np.where(lost, "", np.asarray(classes)[best])
+
+
+def _grid(name: str) -> Iterator[dict[str, Any]]:
+    grid = GRIDS.get(name, {})
+    for values in itertools.product(*grid.values()):
+        yield dict(zip(grid, values, strict=True))
+
+
+def _gather(folds: Sequence[Fold], classes: tuple[str, ...], found: Sequence[tuple[FloatArray, Choice]]) -> Predictions:
+    probabilities = np.concatenate([answer for answer, _ in found])
+    labels = np.concatenate([np.asarray(fold.test_labels, dtype=str) for fold in folds])
+    subjects = np.concatenate([np.asarray(fold.test_subjects, dtype=str) for fold in folds])
+    index = np.arange(len(labels))
+    if all(fold.test_index is not None for fold in folds):
+        index = np.concatenate([np.asarray(fold.test_index) for fold in folds])
+    order = np.argsort(index, kind="stable")
+    return Predictions(
+        classes,
+        tuple(labels[order].tolist()),
+        tuple(answers_of(probabilities, classes)[order].tolist()),
+        probabilities[order],
+        tuple(subjects[order].tolist()),
+        index[order],
+        tuple(choice for _, choice in found),
+    )
