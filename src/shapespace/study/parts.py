@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from shapespace.errors import InputError
 from shapespace.recognise import evaluate
+from shapespace.schemas import Recognition
 from shapespace.types import FloatArray
 
 Part = dict[str, Any]
@@ -149,10 +150,10 @@ def document(
     version: str,
     created: str,
 ) -> dict[str, Any]:
-    """Return the whole of recognition.json."""
-    return {
-        "format": "shapespace recognition",
-        "format_version": 1,
+    """Return the whole of recognition.json, checked as the report will."""
+    whole = {
+        "format": Recognition.FORMAT,
+        "format_version": Recognition.VERSION,
         "version": version,
         "created": created,
         "title": title,
@@ -163,3 +164,5 @@ def document(
         "versions": dict(versions),
         "model_hashes": list(model_hashes),
     }
+    Recognition.from_json(whole)
+    return whole

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -151,7 +151,7 @@ def _picture(upload: Upload) -> None:
 
     folder = Folder(upload.folder)
     (found,) = find_fits(folder)
-    saved = SavedFit({**found.entry, "name": upload.shown}, found.record)
+    saved = SavedFit(replace(found.entry, name=upload.shown), found.record)
     (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, saved)))
 
 
