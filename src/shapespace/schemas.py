@@ -58,20 +58,20 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def check_format(content: object, name: str, version: int, where: str, again: str) -> None:
-    """Refuse what is not a file of the format `name` and `version`; a file without a version is of the first.
+def check_format(content: object, kind: type[FitRecord] | type[Recognition], where: str, again: str) -> None:
+    """Refuse what is not a file of the format of `kind` and its version; a file without a version is of the first.
 
     Raises:
         FileFormatError: it is not.
     """
     known: Mapping[str, Any] = cast(dict[str, Any], content) if isinstance(content, dict) else {}
-    if known.get("format") != name:
-        raise FileFormatError(f"{where} does not hold a {name!r}; {again}.")
+    if known.get("format") != kind.FORMAT:
+        raise FileFormatError(f"{where} is not {kind.CALLED} ({kind.FORMAT!r}); {again}.")
     found = known.get("format_version", 1)
-    if found != version:
+    if found != kind.VERSION:
         raise FileFormatError(
             f"{where} has the format version {str(found)[:40]}, of which this version of shapespace knows only "
-            f"{version}; update shapespace, or {again}."
+            f"{kind.VERSION}; update shapespace, or {again}."
         )
 
 
@@ -161,6 +161,7 @@ class FitRecord:
         shown_dense: and of the dense surface, where there is one; None in records of earlier versions.
     """
 
+    CALLED: ClassVar = "the record of a fit"
     FORMAT: ClassVar = "shapespace fit"
     VERSION: ClassVar = 1
 
@@ -198,7 +199,7 @@ class FitRecord:
         Raises:
             FileFormatError: it is no record of a fit, of another version, or damaged.
         """
-        check_format(content, FitRecord.FORMAT, FitRecord.VERSION, where, again)
+        check_format(content, FitRecord, where, again)
         return read(FitRecord, content, where, again)
 
 
@@ -546,6 +547,7 @@ def read_part(content: object, where: str, again: str = STUDY_AGAIN) -> Part:
 class Recognition:
     """A recognition.json; `parts` are read one by one with `read_part`, so that one that is damaged costs no other."""
 
+    CALLED: ClassVar = "the result of a study of recognition"
     FORMAT: ClassVar = "shapespace recognition"
     VERSION: ClassVar = 1
 
@@ -568,7 +570,7 @@ class Recognition:
         Raises:
             FileFormatError: it is no study of recognition, of another version, or damaged.
         """
-        check_format(content, Recognition.FORMAT, Recognition.VERSION, where, again)
+        check_format(content, Recognition, where, again)
         study = read(Recognition, content, where, again)
         for part in study.parts:
             read_part(part, where, again)

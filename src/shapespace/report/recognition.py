@@ -184,7 +184,7 @@ class _Study:
     """A study and the page that it goes to; each key of its file is read when it is shown."""
 
     def __init__(self, page: Page, folder: Folder, content: Mapping[str, Any]) -> None:
-        check_format(content, Recognition.FORMAT, Recognition.VERSION, FILE, STUDY_AGAIN)
+        check_format(content, Recognition, FILE, STUDY_AGAIN)
         self.page = page
         self.folder = Folder(folder.root, STUDY_AGAIN)
         self.content = content
