@@ -11,7 +11,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report import sections
+from shapespace.report import sections, tables
 from shapespace.report.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
 from shapespace.report.page import Chapter, Make, Page, Step
 from shapespace.report.saved import Folder, SavedFit, read_fit, staged_fit
@@ -21,7 +21,7 @@ from shapespace.schemas import DEMO_AGAIN, Case, Claim, DemoModel, ExpressionsOf
 if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
 
-_NEEDED_BYTES = 1_500_000
+_RESERVE_BYTES = 1_200_000
 _PICTURES = 30
 _MODES_OF_A_CASE = 4
 _NOTHING = Text("No fit kept its surfaces.", "broken")
@@ -242,7 +242,7 @@ class DemoPage:
 
     def numbers(self, fits: Sequence[SavedFit]) -> Table:
         """Return the table of fits."""
-        return sections.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
+        return tables.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
 
     def training(self, one: ExpressionsOfOne) -> Figure:
         """Return some of the faces that the model is made of."""
@@ -285,10 +285,7 @@ class DemoPage:
             raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
         staged = self.staged(fit, label)
         spread = np.array(population_z, dtype=np.float64) if population_z else None
-        pictures = sections.fit_pictures(self.page, staged, spread, of_paper=True)
-        if self.page.left < _NEEDED_BYTES:
-            return [pictures]
-        return [*self.page.tried(lambda: sections.fit_to_turn(self.page, staged)), pictures]
+        return sections.fit_in_full(self.page, staged, spread, reserve=_RESERVE_BYTES, of_paper=True)
 
     def all_fitted(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return every test face with its fitted model."""
@@ -320,7 +317,7 @@ class DemoPage:
             out.append(sections.lines_through_neutral(self.page, scans, neutral, figures_of=of))
             if all(len(scan.b) >= 3 for scan in scans):
                 out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
-        return out + sections.score_tables(
+        return out + tables.score_tables(
             one.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
 

@@ -15,7 +15,7 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.labels import Label
 from shapespace.io.meshes import read_mesh
-from shapespace.report import recognition, sections
+from shapespace.report import recognition, sections, tables
 from shapespace.report.blocks import (
     Block,
     Card,
@@ -55,7 +55,6 @@ _FEWEST_POINTS = 20
 _FEWEST_LEVELS = 2
 _ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
-_DETAIL_BYTES = 1_300_000
 
 
 class FolderPage:
@@ -155,10 +154,12 @@ class FolderPage:
             (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
             (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
         ]
-        where = "over what the scan shows" if all(fit.shown for fit in trusted) else "of the whole model"
+        to_scan = "from model to scan, over what the scan shows"
+        if not all(fit.shown for fit in trusted):
+            to_scan = "from the whole model to the scan"
         for value, what in (
             (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
-            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance to the scan {where}"),
+            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
             (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
         ):
             if isfinite(value):
@@ -365,7 +366,7 @@ class FolderPage:
         """Return the table of all fits."""
         shown = self.fits[:MOST_ROWS]
         caption = "Every fit: distances and errors at the end in mm. A dash: not known."
-        out: list[Block] = [sections.fits_table(shown, self._cards | self._details, caption=caption)]
+        out: list[Block] = [tables.fits_table(shown, self._cards | self._details, caption=caption)]
         if len(self.fits) > len(shown):
             left = counted(len(self.fits) - len(shown), "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
@@ -410,14 +411,11 @@ class FolderPage:
     def detail(self, fit: SavedFit) -> list[Block]:
         """Return one fit with every picture, as far as the file's size allows."""
         staged = self.staged(fit)
-        out = sections.fit_facts(fit)
-        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
-        if self.page.left < _DETAIL_BYTES + reserve:
-            return [*out, Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
-        others = [other.numbers("z") for other in self.of_one_model(fit.record.model.hash) if other.name != fit.name]
+        same = self.of_one_model(fit.record.model.hash)
+        others = [other.numbers("z") for other in same if other.name != fit.name]
         population = np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
-        turning = sections.fit_to_turn(self.page, staged)
-        return [*out, turning, sections.fit_pictures(self.page, staged, population)]
+        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
+        return [*sections.fit_facts(fit), *sections.fit_in_full(self.page, staged, population, reserve=reserve)]
 
     # The rest
 

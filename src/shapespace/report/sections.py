@@ -2,46 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from shapespace.errors import ShapespaceError
 from shapespace.report.blocks import (
     Block,
-    Cell,
-    Column,
     Facts,
     Figure,
     Folded,
     Group,
     Notes,
-    Table,
     Text,
     Turning,
     Verdict,
     facts_of,
-    length,
-    number,
     status,
 )
 from shapespace.report.page import Page
-from shapespace.report.saved import Direction, Measure, SavedFit
-from shapespace.report.wording import counted, isfinite, listed, mm, percent, plain, words
+from shapespace.report.saved import SavedFit
+from shapespace.report.wording import counted, isfinite, listed, mm, percent
 from shapespace.types import FloatArray
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.figures import Coefficients
     from shapespace.report.staged import StagedFit
-    from shapespace.schemas import Quality, VertexErrors
+    from shapespace.schemas import Quality
 
 ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
 """Statuses, those first that somebody must look at."""
 
 MODEL_PICTURES, FIT_PICTURES = 4, 9
-"""How many pictures `model_part`, and `fit_to_turn` with `fit_pictures`, make."""
+"""How many pictures `model_part` and `fit_in_full` make."""
 
 MODES_IN_WIDGET = 8
 SCAN_TRIANGLES = 8_000
@@ -49,6 +44,7 @@ SCAN_TRIANGLES = 8_000
 
 _From = TypeVar("_From")
 _To = TypeVar("_To")
+_DETAIL_BYTES = 1_300_000
 _VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
 
 
@@ -156,6 +152,24 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
 # One fit
 
 
+def fit_in_full(
+    page: Page, fit: StagedFit, population: FloatArray | None = None, *, reserve: int = 0, of_paper: bool = False
+) -> list[Block]:
+    """Return one fit to turn and every picture of it, as far as the file's size allows.
+
+    Args:
+        page: that they go to.
+        fit: with its stages.
+        population: (N, K) coefficients of others in standard deviations, or None.
+        reserve: bytes of the page that are kept free.
+        of_paper: whether captions name the figures of the paper.
+    """
+    if page.left < _DETAIL_BYTES + reserve:
+        return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
+    turning = page.tried(lambda: fit_to_turn(page, fit))
+    return [*turning, fit_pictures(page, fit, population, of_paper=of_paper)]
+
+
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     """Return scan and model of one fit, as a strip of stills where nothing turns."""
     from shapespace.report import stills
@@ -197,19 +211,12 @@ def _known(fit: StagedFit, stage: str) -> FloatArray:
     return distances[np.isfinite(distances)]
 
 
-def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = None, *, of_paper: bool = False) -> Group:
-    """Return every picture of one fit.
-
-    Args:
-        page: that they go to.
-        fit: with its stages.
-        population: (N, K) coefficients of others in standard deviations, or None.
-        of_paper: whether captions name the figures of the paper.
-    """
+def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Group:
+    """Return every picture of one fit, as `fit_in_full` has them."""
     from shapespace.report import figures
 
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
-    largest = "largest from model to scan " + listed(
+    largest = "largest distance from model to scan " + listed(
         [f"{mm(float(_known(fit, stage).max(initial=0.0)))} {stages[stage]}" for stage in fit.surfaces]
     )
     within = listed([f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)])
@@ -302,80 +309,6 @@ def common_limit_mm(fits: Sequence[StagedFit]) -> float:
     from shapespace.report.staged import nice_ceiling
 
     return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
-
-
-def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: str) -> Table:
-    """Return a table of all fits that sorts, without the columns that would be empty.
-
-    Distances over what the scan shows come first; those over the whole model, which `summary_mm` gives, stand for the
-    fits of earlier versions and beside them.
-
-    Args:
-        fits: in the order wanted.
-        places: where in the page a fit is shown, by its name.
-        caption: of the table.
-    """
-
-    def error(of: Callable[[SavedFit], VertexErrors | None], measure: str) -> Callable[[SavedFit], Cell]:
-        return lambda fit: length(getattr(of(fit), measure, np.nan))
-
-    def shown(direction: Direction, measure: Measure) -> Callable[[SavedFit], Cell]:
-        return lambda fit: length(fit.distance_mm(direction, measure) if fit.shown else np.nan)
-
-    def whole(direction: Direction, measure: Measure) -> Callable[[SavedFit], Cell]:
-        return lambda fit: length(fit.summary_mm("final", direction, measure))
-
-    def share(key: str) -> Callable[[SavedFit], Cell]:
-        def cell(fit: SavedFit) -> Cell:
-            found = getattr(fit.record.shown, key, None)
-            return number(np.nan if found is None else 100 * found, 0)
-
-        return cell
-
-    def spread(fit: SavedFit) -> Cell:
-        z = np.array(fit.record.z)
-        return number(float(np.sqrt(np.mean(z**2))) if len(z) else np.nan, 1)
-
-    def total(values: Mapping[str, float], digits: int) -> Cell:
-        return number(sum(values.values()) if values else np.nan, digits)
-
-    by_kind: dict[str, list[tuple[str, Callable[[SavedFit], Cell]]]] = {
-        "text": [
-            ("Scan", lambda fit: Cell(fit.name, place=places.get(fit.name))),
-            ("Label", lambda fit: Cell(fit.label if fit.label != fit.name else "")),
-            ("Status", lambda fit: status(fit.status)),
-        ],
-        "number": [
-            ("True vertex error, mean", error(lambda fit: fit.entry.vertex_error_mm, "mean")),
-            ("True vertex error, max", error(lambda fit: fit.entry.vertex_error_mm, "max")),
-            ("Floor of that, mean", error(lambda fit: fit.entry.floor_mm, "mean")),
-            ("Expected vertex error", lambda fit: length(fit.expected_error_mm)),
-            ("Model to scan where shown, mean", shown("model_to_scan", "mean")),
-            ("Scan to model where covered, mean", shown("scan_to_model", "mean")),
-            ("Model shown, %", share("model_seen_share")),
-            ("Scan covered, %", share("scan_covered_share")),
-            ("Scan to model, mean", whole("scan_to_model", "mean")),
-            ("Scan to model, 95 %", whole("scan_to_model", "p95")),
-            ("Whole model to scan, mean", whole("model_to_scan", "mean")),
-            ("Whole model to scan, max", whole("model_to_scan", "max")),
-            ("Scan counted, %", lambda fit: number(100 * fit.summary_mm("final", "scan_to_model", "fraction"), 0)),
-            ("RMS of z", spread),
-            ("Steps", lambda fit: total(fit.record.iterations, 0)),
-            ("Seconds", lambda fit: total(fit.record.seconds, 1)),
-        ],
-    }
-    made = [
-        (Column(head, "number" if kind == "number" else "text"), [make(fit) for fit in fits])
-        for kind, columns in by_kind.items()
-        for head, make in columns
-    ]
-    kept = [
-        (column, cells)
-        for column, cells in made
-        if any(cell.text if cell.value is None else isfinite(cell.value) for cell in cells)
-    ]
-    rows = [[cells[k] for _, cells in kept] for k in range(len(fits))]
-    return Table([column for column, _ in kept], rows, caption, sortable=len(fits) > 1)
 
 
 def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
@@ -477,53 +410,3 @@ def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Fig
         label="Scatter of three coefficients, to be turned",
         still="The still shows the first three from two sides.",
     )
-
-
-# Scores
-
-
-SCORE_WORDS: Mapping[str, str] = {
-    "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
-    "line_r2_free": "R² of the best line anywhere, of the scatter about the mean (a smaller whole, so it may be lower)",
-    "line_sign_consistency": "Share of faces on the same side of neutral",
-    "line_spearman": "Rank correlation of position on the line with intensity",
-    "line_permutation_p": "Its permutation p-value",
-    "disjointness": "All expressions",
-    "leave_one_out_accuracy": "Leave-one-out accuracy of the nearest mean direction",
-    "chance": "Accuracy of guessing",
-    "cosine_silhouette": "Silhouette of the directions (−1 to 1)",
-    "separability": "Between-class over within-class scatter",
-    "accuracy_p": "Permutation p-value of the accuracy",
-    "silhouette_p": "Permutation p-value of the silhouette",
-    "left_out": "Faces left out because their fit is not trusted",
-}
-
-
-def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[Block]:
-    """Return scores as tables: those given for each of several things as one, single values as another.
-
-    Args:
-        scores: name -> value, or name -> {thing: value}.
-        many: caption of the first.
-        single: caption of the second.
-    """
-
-    def row(key: str, values: Sequence[object]) -> list[Cell]:
-        told = [f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value) for value in values]
-        return [Cell(SCORE_WORDS.get(key, words(key))), *map(Cell, told)]
-
-    by_thing = {key: _object(value) for key, value in scores.items() if key.startswith("line_")}
-    out: list[Block] = []
-    if by_thing:
-        names = list(dict.fromkeys(name for value in by_thing.values() for name in value))
-        rows = [row(key, [value.get(name) for name in names]) for key, value in by_thing.items()]
-        out.append(Table([Column("Score"), *(Column(name, "number") for name in names)], rows, many))
-    singles = {key: _object(value) or {key: value} for key, value in scores.items() if key not in by_thing}
-    rest = [row(key, [value]) for values in singles.values() for key, value in values.items()]
-    if rest:
-        out.append(Table([Column("Score"), Column("Value", "number")], rest, single))
-    return out or [Text("There are no scores.")]
-
-
-def _object(value: object) -> Mapping[str, object]:
-    return cast(Mapping[str, object], value) if isinstance(value, Mapping) else {}
