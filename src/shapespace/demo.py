@@ -28,14 +28,7 @@ from shapespace.batch.run import fit_files, make_executor, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
-from shapespace.datasets.simulated_scan import (
-    Collar,
-    Hair,
-    Hole,
-    SimulatedScan,
-    random_similarity,
-    simulate_scan,
-)
+from shapespace.datasets.simulated_scan import Collar, Hair, Hole, SimulatedScan, random_similarity, simulate_scan
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.geometry.similarity import fit_similarity
@@ -176,7 +169,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
         scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
         labels[name] = (expression, level)
-    fits = _fit_all(folder, home, model, scans, labels, scale, clock)
+    fits = _fit_all(home, model, scans, labels, scale, clock)
 
     make_folder(home / "training")
     examples: list[Example] = []
@@ -276,7 +269,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
             "and is held to the modes with 90 % of its variance."
         )
         story.append(_Story("bundled_main", main_modes, james, title, "James, bundled model", note))
-    return ManyPeople(folder="experiment2", cases=tuple(_case(folder, home, one, scale, clock) for one in story))
+    return ManyPeople(folder="experiment2", cases=tuple(_case(home, one, scale, clock) for one in story))
 
 
 def _ict_model(scale: DemoScale) -> ShapeModel:
@@ -304,14 +297,14 @@ class _Story:
     note: str
 
 
-def _case(folder: Path, home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
+def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
     """Fit one scan of experiment 2 and return its entry."""
     model, file = story.model, f"{story.model_name}_model.h5"
     if not (home / file).exists():
         model.save(home / file)
     mesh = story.scan.scan if isinstance(story.scan, SimulatedScan) else story.scan
     name = f"{Path(mesh.name).stem}_{story.model_name}"
-    (fit,) = _fit_all(folder, home, model, {name: story.scan}, {name: ("neutral", 0.0)}, scale, clock, file)
+    (fit,) = _fit_all(home, model, {name: story.scan}, {name: ("neutral", 0.0)}, scale, clock, file)
     return Case(
         title=story.title,
         short=story.short,
@@ -328,7 +321,6 @@ def _case(folder: Path, home: Path, story: _Story, scale: DemoScale, clock: _Clo
 
 
 def _fit_all(
-    folder: Path,
     home: Path,
     model: ShapeModel,
     scans: Mapping[str, SimulatedScan | Mesh],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path, PurePath
 
 from shapespace.io.labels import LABELS_FILE, Label, read_labels
@@ -45,5 +44,4 @@ def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
     label = labels.get(PurePath(scan).stem if scan else fit.name) or labels.get(fit.name)
     if label is None or not label.text:
         return fit
-    entry = replace(fit.entry, expression=label.text, subject=label.subject, intensity=label.intensity)
-    return replace(fit, entry=entry)
+    return fit.with_entry(expression=label.text, subject=label.subject, intensity=label.intensity)

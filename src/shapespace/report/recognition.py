@@ -11,18 +11,7 @@ from typing import Any, TypeVar, cast
 
 from shapespace import __version__
 from shapespace.report import tables
-from shapespace.report.blocks import (
-    Block,
-    Cell,
-    Column,
-    Facts,
-    Folded,
-    Group,
-    Table,
-    Text,
-    facts_of,
-    text_table,
-)
+from shapespace.report.blocks import Block, Cell, Column, Facts, Folded, Group, Table, Text, facts_of, text_table
 from shapespace.report.page import Chapter, Make, Page, Step, rendered
 from shapespace.report.saved import Folder, has_fits
 from shapespace.report.study_parts import FILE, MOST_PARAGRAPH, MOST_ROWS, TITLES, StudyParts, paragraphs, wrong

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import read_bytes, read_error
@@ -194,6 +195,10 @@ class SavedFit:
         """The vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
         value = self.record.evidence.get("expected_error_mm")
         return float(value) if isinstance(value, int | float) else math.nan
+
+    def with_entry(self, **known: Any) -> SavedFit:
+        """Return the fit with more known beside its record, by the names of `FitEntry`."""
+        return SavedFit(structs.replace(self.entry, **known), self.record)
 
     def numbers(self, key: Literal["b", "z", "b_stddev", "shrinkage"]) -> FloatArray:
         """Return coefficients of the record, or what belongs to them, (K,).

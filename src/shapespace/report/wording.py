@@ -27,7 +27,7 @@ def anchor(text: str) -> str:
 
 def counted(count: int, one: str, many: str | None = None) -> str:
     """Return a number with its noun, such as `1 scan` or `3 scans`."""
-    return f"{count} {one if count == 1 else many or one + 's'}"
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def listed(items: Sequence[str], most: int = 12) -> str:
@@ -41,12 +41,17 @@ def mm(value: float) -> str:
     """Return a length with three or so digits and its unit."""
     if not isfinite(value):
         return DASH
-    return f"{value:.{0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2}f} mm"
+    digits = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{value:.{digits}f} mm".replace("-", "−")
 
 
 def percent(share: float) -> str:
-    """Return a share as a percentage."""
-    return f"{100 * share:.0f} %" if isfinite(share) else DASH
+    """Return a percentage that says 100 only when it is all, and 0 only when it is none."""
+    if not isfinite(share):
+        return DASH
+    if 0.0 < share < 0.01:
+        return f"{max(100 * share, 0.1):.1f} %"
+    return f"{min(100 * share, 99.9):.1f} %" if 0.99 < share < 1.0 else f"{100 * share:.0f} %"
 
 
 def plain(value: object) -> str:

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -147,12 +147,11 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
 
 
 def _picture(upload: Upload) -> None:
-    from shapespace.report.saved import Folder, SavedFit, find_fits, staged_fit
+    from shapespace.report.saved import Folder, find_fits, staged_fit
 
     folder = Folder(upload.folder)
     (found,) = find_fits(folder)
-    saved = SavedFit(replace(found.entry, name=upload.shown), found.record)
-    (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, saved)))
+    (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, found.with_entry(name=upload.shown))))
 
 
 def packed(staged: StagedFit) -> bytes:
