@@ -150,8 +150,12 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
         distances_mm: by stage, over the whole model and every scan point within its rim.
-        shown: distances of the final stage over what the scan shows, in mm of the model's frame,
-        shown_dense: and of the dense surface, where there is one; None in records of earlier versions.
+        size_mm: root mean square distance of the fitted surface's vertices from their middle.
+        shown: distances of the final stage over what the scan shows, in mm of the model's frame; None, as the next
+            three are, in records of earlier versions.
+        shown_scan_mm: the same in mm of the scan.
+        shown_dense: of the dense surface, where there is one,
+        shown_dense_scan_mm: and in mm of the scan.
     """
 
     CALLED: ClassVar = "the record of a fit"
@@ -171,6 +175,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...] = ()
     T_scan_model: Pose | None = None
     mm_per_scan_unit: float | None = None
+    size_mm: float | None = None
     b: tuple[float, ...] = ()
     z: tuple[float, ...] = ()
     b_stddev: tuple[float, ...] = ()
@@ -179,7 +184,9 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     evidence: Mapping[str, Any] = {}
     distances_mm: Mapping[str, BothWays] = {}
     shown: ShownDistances | None = None
+    shown_scan_mm: ShownDistances | None = None
     shown_dense: ShownDistances | None = None
+    shown_dense_scan_mm: ShownDistances | None = None
     history: tuple[Iteration, ...] = ()
     iterations: Mapping[str, int] = {}
     seconds: Mapping[str, float] = {}

@@ -15,6 +15,7 @@ from shapespace.errors import FileError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
 from shapespace.report.scene import pack_model
+from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
@@ -161,8 +162,10 @@ class Shown:
             "z": None,
         }
         row |= {
-            "model_to_scan_mm": _number(fit.distance_mm("model_to_scan")),
-            "scan_to_model_mm": _number(fit.distance_mm("scan_to_model")),
+            "shown": to_json(fit.record.shown),
+            "shown_scan_mm": to_json(fit.record.shown_scan_mm),
+            "model_to_scan_mm": _number(fit.summary_mm("final", "model_to_scan", "mean")),
+            "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
             "expected_error_mm": _number(fit.expected_error_mm),
         }
         if self._ours(fit) and fit.record.z:
