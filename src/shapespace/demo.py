@@ -11,7 +11,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -28,14 +28,7 @@ from shapespace.batch.run import fit_files, make_executor, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
-from shapespace.datasets.simulated_scan import (
-    Collar,
-    Hair,
-    Hole,
-    SimulatedScan,
-    random_similarity,
-    simulate_scan,
-)
+from shapespace.datasets.simulated_scan import Collar, Hair, Hole, SimulatedScan, random_similarity, simulate_scan
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.paper_method import Paper
 from shapespace.fit.state import IcpState
@@ -45,6 +38,18 @@ from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.line_structure import disjointness, line_scores
 from shapespace.report.html import require_report_extra, write_report
+from shapespace.schemas import (
+    Case,
+    Claim,
+    Demo,
+    Example,
+    ExpressionsOfOne,
+    FitEntry,
+    FitRecord,
+    ManyPeople,
+    VertexErrors,
+    to_json,
+)
 from shapespace.types import FloatArray, Mesh, Similarity
 
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
@@ -118,25 +123,25 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
         clock.lap("experiment1")
         second = _experiment_2(folder, faces, scale, clock)
         clock.lap("experiment2")
-        summary: dict[str, Any] = {
-            "version": __version__,
-            "quick": quick,
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "machine": f"{platform.machine()}, Python {platform.python_version()}, {platform.system()}",
-            "versions": _versions(("numpy", "scipy", "h5py", "libigl", "matplotlib")),
-            "seed": _SEED,
-            "settings": asdict(scale),
-            "seconds": {**clock.seconds, "total": sum(clock.seconds.values())},
-            "experiment1": first,
-            "experiment2": second,
-        }
-        summary["paper_table"] = _paper_table(folder, first, second)
-        write_text(folder / "demo.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        demo = Demo(
+            version=__version__,
+            quick=quick,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine=f"{platform.machine()}, Python {platform.python_version()}, {platform.system()}",
+            versions=_versions(("numpy", "scipy", "h5py", "libigl", "matplotlib")),
+            seed=_SEED,
+            settings=asdict(scale),
+            seconds={**clock.seconds, "total": sum(clock.seconds.values())},
+            experiment1=first,
+            experiment2=second,
+            paper_table=tuple(_paper_table(folder, first, second)),
+        )
+        write_text(folder / "demo.json", json.dumps(to_json(demo), indent=1, allow_nan=False) + "\n")
         clock.step("report")
         return write_report(folder)
 
 
-def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> dict[str, Any]:
+def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ExpressionsOfOne:
     """One person: 100 mixed expressions make the model, 16 unseen expressions and a neutral face are fitted."""
     rng = np.random.default_rng(_SEED)
     home = make_folder(folder / "experiment1")
@@ -165,46 +170,55 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
         scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
         labels[name] = (expression, level)
-    fits = _fit_all(folder, home, model, scans, labels, scale, clock)
-
-    trusted = [fit for fit in fits if fit["status"] in ("converged", "max_iterations")]
-    z = {fit["name"]: np.array(read_record(folder / fit["json"])["z"]) for fit in trusted}
-    scores: dict[str, Any] = {"left_out": [fit["name"] for fit in fits if fit not in trusted]}
-    tests = [fit for fit in trusted if fit["expression"] != "neutral"]
-    if "neutral" in z:
-        v = np.stack([z[fit["name"]] - z["neutral"] for fit in tests])
-        for expression in PAPER_EXPRESSIONS:
-            own = [i for i, fit in enumerate(tests) if fit["expression"] == expression]
-            if len(own) < 3:
-                continue  # too few trusted fits for a line; `left_out` names the others
-            line = line_scores(v[own], np.array([tests[i]["intensity"] for i in own]))
-            for key, value in asdict(line).items():
-                scores.setdefault(f"line_{key}", {})[expression] = value
-        if all(sum(fit["expression"] == e for fit in tests) >= 2 for e in PAPER_EXPRESSIONS):
-            scores["disjointness"] = asdict(disjointness(v, [fit["expression"] for fit in tests]))
+    fits = _fit_all(home, model, scans, labels, scale, clock)
 
     make_folder(home / "training")
-    examples: list[dict[str, str]] = []
+    examples: list[Example] = []
     for mesh in training[:12]:
         write_mesh(home / "training" / f"{mesh.name}.ply", mesh)
-        examples.append({"file": f"experiment1/training/{mesh.name}.ply", "label": mesh.name.replace("_", " ")})
-    return {
-        "title": "Expressions of one person",
-        "folder": "experiment1",
-        "model": "experiment1/model.h5",
-        "model_hash": model.content_hash,
-        "n_training": scale.training,
-        "n_modes": model.n_modes,
-        "modes_for_98_5": n_modes,
-        "cumulative_variance": everything.cumulative_variance[:20].tolist(),
-        "training_examples": examples,
-        "population_z": _population_z(model, training),
-        "fits": fits,
-        "scores": scores,
-    }
+        examples.append(Example(file=f"experiment1/training/{mesh.name}.ply", label=mesh.name.replace("_", " ")))
+    return ExpressionsOfOne(
+        title="Expressions of one person",
+        folder="experiment1",
+        model="experiment1/model.h5",
+        model_hash=model.content_hash,
+        n_training=scale.training,
+        n_modes=model.n_modes,
+        modes_for_98_5=n_modes,
+        cumulative_variance=tuple(everything.cumulative_variance[:20].tolist()),
+        training_examples=tuple(examples),
+        population_z=tuple(tuple((model.project(mesh) / model.stddev).round(4).tolist()) for mesh in training),
+        fits=tuple(fits),
+        scores=_scores(folder, fits),
+    )
 
 
-def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> dict[str, Any]:
+def _scores(folder: Path, fits: Sequence[FitEntry]) -> dict[str, Any]:
+    """Return whether each expression is a line through neutral, and whether they are disjoint, by trusted fits."""
+    trusted = [fit for fit in fits if fit.status in ("converged", "max_iterations")]
+    scores: dict[str, Any] = {"left_out": [fit.name for fit in fits if fit not in trusted]}
+    z = {fit.name: np.array(_record(folder, fit).z) for fit in trusted}
+    if "neutral" not in z:
+        return scores
+    tests = [fit for fit in trusted if fit.expression != "neutral"]
+    v = np.stack([z[fit.name] - z["neutral"] for fit in tests])
+    for expression in PAPER_EXPRESSIONS:
+        own = [i for i, fit in enumerate(tests) if fit.expression == expression]
+        if len(own) < 3:
+            continue  # too few trusted fits for a line; `left_out` names the others
+        line = line_scores(v[own], np.array([tests[i].intensity for i in own]))
+        for key, value in asdict(line).items():
+            scores.setdefault(f"line_{key}", {})[expression] = value
+    if all(sum(fit.expression == e for fit in tests) >= 2 for e in PAPER_EXPRESSIONS):
+        scores["disjointness"] = asdict(disjointness(v, [fit.expression for fit in tests]))
+    return scores
+
+
+def _record(folder: Path, fit: FitEntry) -> FitRecord:
+    return FitRecord.from_json(read_record(folder / str(fit.json)), str(fit.json))
+
+
+def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ManyPeople:
     """Many people: 100 neutral faces make the model, and scans of somebody else are fitted."""
     rng = np.random.default_rng(_SEED + 1)
     home = make_folder(folder / "experiment2")
@@ -232,90 +246,82 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         outlier_fraction=0.005,
         name="simulated_stranger",
     )
-    cases = [
-        _case(
-            folder, home, bundled, "bundled", simulated, scale, clock,
-            title="Simulated scan of a person outside the training set",
-                short="simulated scan",
-            note="Simulated, not a real scan: hair, a collar, three holes, 0.5 % outliers and 0.3 mm noise.",
-            labelled_simulated=True,
+    story = [
+        _Story(
+            "bundled",
+            bundled,
+            simulated,
+            "Simulated scan of a person outside the training set",
+            "simulated scan",
+            "Simulated, not a real scan: hair, a collar, three holes, 0.5 % outliers and 0.3 mm noise.",
         )
-    ]  # fmt: skip
+    ]
     if james_available():
         james = load_james()
         if ict_available():
-            ict = load_ict()
-            coefficients = ict.draw_people(scale.training, seed=_SEED)
-            model = ShapeModel.fit(
-                [ict.mesh(c, name=f"ict_{i:03}") for i, c in enumerate(coefficients)],
-                modes="auto",
-                gauge="shape",
-                landmarks=landmark_vertices("face"),
-                provenance=f"{scale.training} random people of ICT-FaceKit, face area, neutral",
-                licence="MIT",
-            )
+            note = "A real scan with hair and collar; the model is made of statistics of real people."
+            title = "James, a real 3dMD scan, with a model of ICT-FaceKit people"
+            story.append(_Story("ict", _ict_model(scale), james, title, "James, ICT model", note))
             clock.step("model of ICT people")
-            cases.append(
-                _case(
-                    folder, home, model, "ict", james, scale, clock,
-                    title="James, a real 3dMD scan, with a model of ICT-FaceKit people",
-                short="James, ICT model",
-                    note="A real scan with hair and collar; the model is made of statistics of real people.",
-                    labelled_simulated=False,
-                )
-            )  # fmt: skip
         main_modes = bundled.truncate(bundled.modes_for_variance(_MAIN_MODES_SHARE) or bundled.n_modes)
-        cases.append(
-            _case(
-                folder, home, main_modes, "bundled_main", james, scale, clock,
-                title="James, a real 3dMD scan, with the bundled model",
-                short="James, bundled model",
-                note="A real scan with hair and collar; the model knows only simulated people, shows ears that his "
-                "hair covers, and is held to the modes with 90 % of its variance.",
-                labelled_simulated=False,
-            )
-        )  # fmt: skip
-    return {"folder": "experiment2", "cases": cases}
+        title = "James, a real 3dMD scan, with the bundled model"
+        note = (
+            "A real scan with hair and collar; the model knows only simulated people, shows ears that his hair covers, "
+            "and is held to the modes with 90 % of its variance."
+        )
+        story.append(_Story("bundled_main", main_modes, james, title, "James, bundled model", note))
+    return ManyPeople(folder="experiment2", cases=tuple(_case(home, one, scale, clock) for one in story))
 
 
-def _case(
-    folder: Path,
-    home: Path,
-    model: ShapeModel,
-    model_name: str,
-    scan: SimulatedScan | Mesh,
-    scale: DemoScale,
-    clock: _Clock,
-    *,
-    title: str,
-    note: str,
-    short: str,
-    labelled_simulated: bool,
-) -> dict[str, Any]:
+def _ict_model(scale: DemoScale) -> ShapeModel:
+    ict = load_ict()
+    coefficients = ict.draw_people(scale.training, seed=_SEED)
+    return ShapeModel.fit(
+        [ict.mesh(c, name=f"ict_{i:03}") for i, c in enumerate(coefficients)],
+        modes="auto",
+        gauge="shape",
+        landmarks=landmark_vertices("face"),
+        provenance=f"{scale.training} random people of ICT-FaceKit, face area, neutral",
+        licence="MIT",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Story:
+    """A scan of experiment 2, the model that it is fitted by, and what is said of both."""
+
+    model_name: str
+    model: ShapeModel
+    scan: SimulatedScan | Mesh
+    title: str
+    short: str
+    note: str
+
+
+def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
     """Fit one scan of experiment 2 and return its entry."""
-    model_file = f"experiment2/{model_name}_model.h5"
-    if not (folder / model_file).exists():
-        model.save(folder / model_file)
-    mesh = scan.scan if isinstance(scan, SimulatedScan) else scan
-    name = f"{Path(mesh.name).stem}_{model_name}"
-    fits = _fit_all(folder, home, model, {name: scan}, {name: ("neutral", 0.0)}, scale, clock, f"{model_name}_model.h5")
-    return {
-        "title": title,
-        "short": short,
-        "simulated": labelled_simulated,
-        "note": note,
-        "model": model_file,
-        "model_hash": model.content_hash,
-        "n_training": model.n_training,
-        "n_modes": model.n_modes,
-        "modes_for_98_5": model.modes_for_variance(_PAPER_VARIANCE),
-        "cumulative_variance": model.cumulative_variance.tolist(),
-        "fit": fits[0],
-    }
+    model, file = story.model, f"{story.model_name}_model.h5"
+    if not (home / file).exists():
+        model.save(home / file)
+    mesh = story.scan.scan if isinstance(story.scan, SimulatedScan) else story.scan
+    name = f"{Path(mesh.name).stem}_{story.model_name}"
+    (fit,) = _fit_all(home, model, {name: story.scan}, {name: ("neutral", 0.0)}, scale, clock, file)
+    return Case(
+        title=story.title,
+        short=story.short,
+        simulated=isinstance(story.scan, SimulatedScan),
+        note=story.note,
+        model=f"experiment2/{file}",
+        model_hash=model.content_hash,
+        n_training=model.n_training,
+        n_modes=model.n_modes,
+        modes_for_98_5=model.modes_for_variance(_PAPER_VARIANCE),
+        cumulative_variance=tuple(model.cumulative_variance.tolist()),
+        fit=fit,
+    )
 
 
 def _fit_all(
-    folder: Path,
     home: Path,
     model: ShapeModel,
     scans: Mapping[str, SimulatedScan | Mesh],
@@ -323,7 +329,7 @@ def _fit_all(
     scale: DemoScale,
     clock: _Clock,
     model_name: str = "model.h5",
-) -> list[dict[str, Any]]:
+) -> list[FitEntry]:
     """Write `scans` as files, fit them as the command line does, and return an entry each."""
     make_folder(home / "scans")
     for name, scan in scans.items():
@@ -346,147 +352,122 @@ def _fit_all(
             on_done=lambda job, _: clock.step(f"fitted {job.name}"),
             on_state=show,
         )
-    entries: list[dict[str, Any]] = []
+    entries: list[FitEntry] = []
     for (name, scan), record in zip(scans.items(), records, strict=True):
-        base = f"{home.name}/fits/{name}"
-        entry: dict[str, Any] = {
-            "name": name,
-            "expression": labels[name][0],
-            "intensity": labels[name][1],
-            "status": record["status"],
-            "reason": record["reason"],
-            "scan": f"{home.name}/scans/{name}.ply",
-            "json": f"{base}.fit.json",
-            "stages": f"{base}.stages.npz" if record["status"] != "failed" else None,
-            "vertex_error_mm": None,
-            "floor_mm": None,
-        }
-        if isinstance(scan, SimulatedScan) and record["status"] != "failed":
+        base, fitted = f"{home.name}/fits/{name}", record["status"] != "failed"
+        errors: dict[str, VertexErrors] = {}
+        if isinstance(scan, SimulatedScan) and fitted:
             T = record["T_scan_model"]
             T_scan_model = Similarity(T["scale"], np.array(T["rotation"]), np.array(T["translation"]))
-            fitted = T_scan_model.apply(model.reconstruct(record["b"]))
-            entry["vertex_error_mm"] = _vertex_error(fitted, scan)
-            entry["floor_mm"] = _floor(model, scan)
-        entries.append(entry)
+            surface = T_scan_model.apply(model.reconstruct(record["b"]))
+            errors = {"vertex_error_mm": _vertex_error(surface, scan), "floor_mm": _floor(model, scan)}
+        entries.append(
+            FitEntry(
+                name=name,
+                expression=labels[name][0],
+                intensity=labels[name][1],
+                status=record["status"],
+                reason=record["reason"],
+                scan=f"{home.name}/scans/{name}.ply",
+                json=f"{base}.fit.json",
+                stages=f"{base}.stages.npz" if fitted else None,
+                vertex_error_mm=errors.get("vertex_error_mm"),
+                floor_mm=errors.get("floor_mm"),
+            )
+        )
     return entries
 
 
-def _vertex_error(vertices: FloatArray, scan: SimulatedScan) -> dict[str, float]:
+def _vertex_error(vertices: FloatArray, scan: SimulatedScan) -> VertexErrors:
     """Return how far `vertices`, in the scan's frame, lie from the true ones, in mm of the model's frame."""
     error = np.linalg.norm(vertices - scan.truth_vertices, axis=1) / scan.T_scan_model.scale
-    return {
-        "mean": float(error.mean()),
-        "rms": float(np.sqrt((error**2).mean())),
-        "max": float(error.max()),
-    }
+    return VertexErrors(mean=float(error.mean()), rms=float(np.sqrt((error**2).mean())), max=float(error.max()))
 
 
-def _floor(model: ShapeModel, scan: SimulatedScan) -> dict[str, float]:
+def _floor(model: ShapeModel, scan: SimulatedScan) -> VertexErrors:
     """Return the same for the model's best reconstruction from true correspondences: no fit can do much better."""
     best = model.reconstruct(model.project(scan.truth_vertices))
-    T_scan_model = fit_similarity(best, scan.truth_vertices)
-    return _vertex_error(T_scan_model.apply(best), scan)
+    return _vertex_error(fit_similarity(best, scan.truth_vertices).apply(best), scan)
 
 
-def _population_z(model: ShapeModel, training: Sequence[Mesh]) -> list[list[float]]:
-    """Return the training set's coefficients in standard deviations, rounded for the file."""
-    return [(model.project(mesh) / model.stddev).round(4).tolist() for mesh in training]
-
-
-def _paper_table(folder: Path, first: Mapping[str, Any], second: Mapping[str, Any]) -> list[dict[str, str | None]]:
+def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> list[Claim]:
     """Return what the paper states beside what this run measured."""
-    tests = [fit for fit in first["fits"] if fit["stages"] and fit["expression"] != "neutral"]
-    records = {fit["name"]: read_record(folder / fit["json"])["distances_mm"] for fit in tests}
-
-    def over(stage: str, measure: str, of: Callable[[list[float]], float]) -> float:
-        return of([record[stage]["model_to_scan"][measure] for record in records.values()])
-
-    worst = sorted(records.values(), key=lambda r: -r["before"]["model_to_scan"]["max"])[:2]
-    measured_falls = [
-        f"{r['before']['model_to_scan']['max']:.0f} → {r['initial']['model_to_scan']['max']:.1f} mm" for r in worst
-    ]
-    truth = _truth(tests)
-    rows: list[dict[str, str | None]] = [
-        {
-            "quantity": "Modes that hold 98.5 % of the variance, one person's expressions",
-            "paper": "5",
-            "measured": str(first["modes_for_98_5"]),
-            "truth": None,
-            "why": None
-            if first["modes_for_98_5"] == 5
-            else "Our simulated expressions mix other muscles than the paper's, so the spectrum falls differently.",
-        },
-        {
-            "quantity": "Largest closest distance, before → after phase 1 (the two test faces that start farthest)",
-            "paper": "60 → 10 mm; 54 → 6 mm",
-            "measured": "; ".join(measured_falls),
-            "truth": None,
-            "why": "Where a scan starts is arbitrary: ours start with centroids together and up to 20 degrees off.",
-        },
-        {
-            "quantity": "Largest closest distance after phase 2, over the test faces",
-            "paper": "just over 2 mm",
-            "measured": f"{over('final', 'max', max):.2f} mm at most, {over('final', 'max', _median):.2f} mm typically",
-            "truth": f"true vertex error {truth['max']:.2f} mm at most (floor {truth['floor_max']:.2f} mm)",
-            "why": "Ours is measured to the scan's triangles and carries 0.2 mm noise; the paper does not say how it "
+    tests = [fit for fit in first.fits if fit.stages and fit.expression != "neutral"]
+    distances = [_to_scan(folder, fit) for fit in tests]
+    worst = sorted(distances, key=lambda stages: -stages["before"].max)[:2]
+    largest, means = [stages["final"].max for stages in distances], [stages["final"].mean for stages in distances]
+    errors = [fit.vertex_error_mm for fit in tests if fit.vertex_error_mm]
+    floors = [fit.floor_mm for fit in tests if fit.floor_mm]
+    spectrum = "Our simulated expressions mix other muscles than the paper's, so the spectrum falls differently."
+    return [
+        Claim(
+            quantity="Modes that hold 98.5 % of the variance, one person's expressions",
+            paper="5",
+            measured=str(first.modes_for_98_5),
+            why=None if first.modes_for_98_5 == 5 else spectrum,
+        ),
+        Claim(
+            quantity="Largest closest distance, before → after phase 1 (the two test faces that start farthest)",
+            paper="60 → 10 mm; 54 → 6 mm",
+            measured="; ".join(f"{one['before'].max:.0f} → {one['initial'].max:.1f} mm" for one in worst),
+            why="Where a scan starts is arbitrary: ours start with centroids together and up to 20 degrees off.",
+        ),
+        Claim(
+            quantity="Largest closest distance after phase 2, over the test faces",
+            paper="just over 2 mm",
+            measured=f"{max(largest):.2f} mm at most, {np.median(largest):.2f} mm typically",
+            truth=f"true vertex error {max(error.max for error in errors):.2f} mm at most (floor "
+            f"{max(floor.max for floor in floors):.2f} mm)",
+            why="Ours is measured to the scan's triangles and carries 0.2 mm noise; the paper does not say how it "
             "measures.",
-        },
-        {
-            "quantity": "Mean closest distance after phase 2, over the test faces",
-            "paper": "1.24 mm",
-            "measured": f"{over('final', 'mean', _mean):.2f} mm",
-            "truth": f"true vertex error {truth['mean']:.2f} mm (floor {truth['floor_mean']:.2f} mm)",
-            "why": "Our faces are sampled more finely, so closest points lie nearer; the true error is what counts.",
-        },
+        ),
+        Claim(
+            quantity="Mean closest distance after phase 2, over the test faces",
+            paper="1.24 mm",
+            measured=f"{np.mean(means):.2f} mm",
+            truth=_truth(np.mean([error.mean for error in errors]), np.mean([floor.mean for floor in floors])),
+            why="Our faces are sampled more finely, so closest points lie nearer; the true error is what counts.",
+        ),
+        *(_claim(folder, case) for case in second.cases),
     ]
-    for case in second["cases"]:
-        fit = case["fit"]
-        if fit["stages"] is None:
-            measured, truth_text = f"failed: {fit['reason']}", None
-        else:
-            record = read_record(folder / fit["json"])["distances_mm"]
-            before, final = record["before"]["model_to_scan"], record["final"]["model_to_scan"]
-            measured = (
-                f"mean {before['mean']:.1f} → {final['mean']:.2f} mm, largest {before['max']:.0f} → "
-                f"{final['max']:.1f} mm"
-            )
-            if fit["status"] == "doubtful":
-                measured += " (doubtful)"
-            truth_text = None
-            if fit["vertex_error_mm"] and fit["floor_mm"]:
-                error, floor = fit["vertex_error_mm"]["mean"], fit["floor_mm"]["mean"]
-                truth_text = f"true vertex error {error:.2f} mm (floor {floor:.2f} mm)"
-        rows.append(
-            {
-                "quantity": f"Closest distance, before → after phase 2: {case['title']}",
-                "paper": "19 → 6 mm (its own real scan)",
-                "measured": measured,
-                "truth": truth_text,
-                "why": "Hair, collar and holes have no counterpart in the model, and the plain method forces a match "
-                "for every vertex."
-                if case["simulated"]
-                else "Another scan and another model than the paper's, with more modes.",
-            }
+
+
+def _claim(folder: Path, case: Case) -> Claim:
+    """Return what the paper states of its real scan beside one case of experiment 2."""
+    fit, truth = case.fit, None
+    measured = f"failed: {fit.reason}"
+    if fit.stages:
+        stages = _to_scan(folder, fit)
+        before, final = stages["before"], stages["final"]
+        measured = (
+            f"mean {before.mean:.1f} → {final.mean:.2f} mm, largest {before.max:.0f} → {final.max:.1f} mm"
+            f"{' (doubtful)' if fit.status == 'doubtful' else ''}"
         )
-    return rows
+        if fit.vertex_error_mm and fit.floor_mm:
+            truth = _truth(fit.vertex_error_mm.mean, fit.floor_mm.mean)
+    return Claim(
+        quantity=f"Closest distance, before → after phase 2: {case.title}",
+        paper="19 → 6 mm (its own real scan)",
+        measured=measured,
+        truth=truth,
+        why="Hair, collar and holes have no counterpart in the model, and the plain method forces a match for every "
+        "vertex."
+        if case.simulated
+        else "Another scan and another model than the paper's, with more modes.",
+    )
 
 
-def _truth(fits: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    known = [fit for fit in fits if fit["vertex_error_mm"]]
+def _to_scan(folder: Path, fit: FitEntry) -> dict[str, VertexErrors]:
+    """Return the distances from the model to the scan by stage, mm."""
+    found = {stage: both.model_to_scan for stage, both in _record(folder, fit).distances_mm.items()}
     return {
-        "mean": _mean([fit["vertex_error_mm"]["mean"] for fit in known]),
-        "max": max(fit["vertex_error_mm"]["max"] for fit in known),
-        "floor_mean": _mean([fit["floor_mm"]["mean"] for fit in known]),
-        "floor_max": max(fit["floor_mm"]["max"] for fit in known),
+        stage: VertexErrors(mean=one.mean or 0.0, rms=one.rms or 0.0, max=one.max or 0.0)
+        for stage, one in found.items()
     }
 
 
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values))
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values))
+def _truth(error_mm: float | np.floating, floor_mm: float | np.floating) -> str:
+    return f"true vertex error {error_mm:.2f} mm (floor {floor_mm:.2f} mm)"
 
 
 def _versions(packages: Sequence[str]) -> dict[str, str]:

@@ -93,7 +93,7 @@ def test_a_simulated_scan_is_called_simulated(page: str) -> None:
 
 def test_strings_from_files_stay_text(folder: Path) -> None:
     evil = "<script>alert(1)</script>\"'>&$x^ $"
-    paths = {"file", "scan", "json", "stages", "model", "created", "status"}
+    paths = {"file", "scan", "json", "stages", "model", "created", "status", "format"}
 
     def poison(value: Any, key: str = "") -> Any:
         if isinstance(value, str):

@@ -178,7 +178,8 @@ def test_damaged_stages_and_records_cost_only_themselves(fits: Path, sketched: N
     (fits / "dog.fit.json").write_text('{"format": ')
     edit(fits, lambda record: record.update(distances_mm=3, evidence=[], history="x", notes={"a": 1}), "easy.fit.json")
     words = Page(report(fits)).words
-    assert "dog.fit.json is not JSON" in words and "1 cannot be read" in words
+    assert "dog.fit.json is not JSON" in words and "2 cannot be read" in words
+    assert "easy.fit.json is damaged: expected" in words
     assert "baker.stages.npz is not an .npz file of arrays" in words
     assert "The fits together" in words and "charlie in detail" in words
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,9 +21,9 @@ from shapespace.geometry.surface import rms_size
 from shapespace.io.files import atomic_path, read_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord, to_json
 
-RECORD_FORMAT = "shapespace fit"
-RECORD_VERSION = 1
+RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -148,8 +147,11 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
+        FileFormatError: it is no record that `schemas.FitRecord` could read again.
     """
-    write_text(path, json.dumps(_finite(record), indent=1, allow_nan=False) + "\n")
+    plain = to_json(record)
+    FitRecord.from_json(plain, path.name)
+    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -165,6 +167,7 @@ def read_record(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
         raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
+    FitRecord.from_json(cast(object, record), str(path))
     return cast(dict[str, Any], record)
 
 
@@ -250,13 +253,3 @@ def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
         else value
         for key, value in row.items()
     }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in cast(Mapping[Any, Any], value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in cast(Sequence[Any], value)]
-    return value

@@ -15,31 +15,34 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.labels import Label
 from shapespace.io.meshes import read_mesh
-from shapespace.report import recognition, sections
-from shapespace.report.labels import find_labels, labelled
-from shapespace.report.markup import (
+from shapespace.report import recognition, sections, tables
+from shapespace.report.blocks import (
+    Block,
+    Card,
     Cell,
-    Column,
-    as_mapping,
-    counted,
-    esc,
-    facts,
-    folded,
-    listed,
-    mm,
-    notice,
-    paragraph,
-    table,
-    tiles,
-    words,
+    Command,
+    Facts,
+    Figure,
+    Folded,
+    Gallery,
+    Image,
+    Item,
+    Notice,
+    ScaleKey,
+    Text,
+    Tiles,
+    status,
+    text_table,
 )
-from shapespace.report.page import Page, Section, Step
+from shapespace.report.labels import find_labels, labelled
+from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder, SavedFit, model_of, staged_fit
-from shapespace.types import FloatArray, Mesh
+from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, setting, words
+from shapespace.schemas import Quality, read
+from shapespace.types import Mesh
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.sections import Card
     from shapespace.report.staged import StagedFit
 
 MOST_CARDS = 24
@@ -48,12 +51,10 @@ MOST_DETAILS = 3
 MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
-_WITHOUT_RESULT = ("failed", "unreadable")
 _FEWEST_POINTS = 20
 _FEWEST_LEVELS = 2
 _ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
-_DETAIL_BYTES = 1_300_000
 
 
 class FolderPage:
@@ -87,17 +88,18 @@ class FolderPage:
                 raise
             self.label_note = f"There are no labels: {error}"
         self.fits = sorted((labelled(fit, found) for fit in fits), key=sections.concern)
-        planned = (
-            sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main_fits()) * sections.FIT_PICTURES
-        )
-        self.page = Page(_ADVICE, planned, on_step)
+        self.main = _main_fits(self.fits)
+        planned = sections.MODEL_PICTURES + min(len(fits), MOST_CARDS) + 4 + len(self.main) * sections.FIT_PICTURES
+        self.page = Page(planned, on_step)
         self.model_path = model
         self._model: ShapeModel | None = None
         if model is not None:
             self.model()
         self._staged: dict[str, StagedFit] = {}
-        self._details: dict[str, str] = {}
-        self._cards: dict[str, str] = {}
+        self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main}
+        carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
+        self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in carded}
+        self.carded = carded
 
     # What is read, once
 
@@ -117,163 +119,124 @@ class FolderPage:
 
     def html(self) -> str:
         """Return the page."""
-        count = len(self.fits)
         name = self.folder.root.resolve().name
-        self._details = {fit.name: self.page.place(f"pictures-of-{fit.name}") for fit in self.main_fits()}
-        if count > 1 or not self._details:
-            self._cards = {fit.name: self.page.place(f"fit-{fit.name}") for fit in self.carded()}
-        parts = [
-            Section("Summary", "Summary", self.summary),
-            Section("The model", "Model", self.model_part),
-            Section("The fits", "Fits", self.fits_part),
+        chapters = [
+            Chapter("Summary", self.summary),
+            Chapter("The model", self.model_part, "Model"),
+            Chapter("The fits", self.fits_part, "Fits"),
+            Chapter("Settings, versions and hashes", self.settings, "Settings"),
         ]
         if self.recognised:
-            parts.append(Section("Recognition", "Recognition", self.recognition))
-        parts.append(Section("Settings, versions and hashes", "Settings", self.settings))
-        lead = paragraph(
-            "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
-        )
-        return self.page.html(
-            f"{counted(count, 'fit')} in {name}",
-            lead,
-            f"Made by shapespace {__version__} from the files in {name}.",
-            parts,
-        )
+            found = Chapter("Recognition", lambda: recognition.recognition_section(self.page, self.folder))
+            chapters.insert(3, found)
+        lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
+        made = f"Made by shapespace {__version__} from the files in {name}."
+        return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
 
-    def model_part(self) -> str:
+    def model_part(self) -> list[Block]:
         """Return the model, with what quality.json says of it where there is such a file."""
         out = sections.model_part(self.page, self.model())
         if (self.folder.root / "quality.json").is_file():
-            out += self.page.tried(lambda: sections.quality_part(self.page, self.folder.json("quality.json")))
+            out += self.page.tried(self.quality)
         return out
 
-    def main_fits(self) -> list[SavedFit]:
-        """Return the fits shown with every picture: the worst doubtful one, the worst and the median of the others."""
-        pictured = [fit for fit in self.fits if fit.pictured]
-        if len(pictured) <= MOST_DETAILS:
-            return pictured
-        doubtful = [fit for fit in pictured if fit.status == "doubtful"]
-        others = [fit for fit in pictured if fit.status != "doubtful"]
-        chosen = doubtful[: 1 if others else MOST_DETAILS]
-        if others:
-            chosen += [others[k] for k in sorted({0, len(others) // 2})]
-        return chosen
+    def quality(self) -> Block:
+        """Return what quality.json says."""
+        measured = read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
+        return sections.quality_part(self.page, measured)
 
-    def carded(self) -> list[SavedFit]:
-        """Return the fits of the gallery; where not all have room, those without a result leave some to the others."""
-        if len(self.fits) <= MOST_CARDS:
-            return self.fits
-        empty = [fit for fit in self.fits if fit.status in _WITHOUT_RESULT]
-        rest = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT]
-        first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
-        return [*first, *rest[: MOST_CARDS - len(first)]]
-
-    def summary(self) -> str:
+    def summary(self) -> list[Block]:
         """Return what was fitted and how much of it is to be trusted."""
         counts = Counter(fit.status for fit in self.fits)
-        total, trusted = len(self.fits), [fit for fit in self.fits if fit.status == "converged"]
-        models = sorted(
-            {str(as_mapping(fit.record.get("model")).get("name") or "an unknown model") for fit in self.fits}
-        )
-        methods = sorted({str(fit.record["method"]) for fit in self.fits if fit.record.get("method")})
-        told = f"{counted(total, 'scan was', 'scans were')} fitted with {listed(models)}"
-        told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
-        told += counted(len(trusted), "fit") if trusted else "None"
-        told += (
-            " converged with nothing found against them" if len(trusted) != 1 else " converged with nothing against it"
-        )
-        rest = [
-            f"{counts[key]} {word}"
-            for key, word in (
-                ("max_iterations", "stopped at the limit of steps"),
-                ("doubtful", "doubtful"),
-                ("failed", "could not be fitted"),
-                ("unreadable", "cannot be read"),
-            )
-            if counts[key]
-        ]
-        told += f"; {listed(rest)}." if rest else "."
-        expected = _median([sections.expected_error_mm(fit) for fit in trusted])
-        to_model = _median([fit.summary_mm("final", "scan_to_model", "mean") for fit in trusted])
-        to_scan = _median([fit.summary_mm("final", "model_to_scan", "mean") for fit in trusted])
-        rows = [
-            (str(len(trusted)), f"of {total}", "with nothing found against them"),
+        trusted = [fit for fit in self.fits if fit.status == "converged"]
+        tiles = [
+            (str(len(trusted)), f"of {len(self.fits)}", "with nothing found against them"),
             (str(counts["doubtful"] + counts["max_iterations"]), "", "to be looked at before use"),
             (str(counts["failed"] + counts["unreadable"]), "", "without a result"),
         ]
+        to_scan = "from model to scan, over what the scan shows"
+        if not all(fit.shown for fit in trusted):
+            to_scan = "from the whole model to the scan"
         for value, what in (
-            (expected, "vertex error that such a fit expects of itself, median"),
-            (to_model, "mean distance from scan to model, median of those"),
-            (to_scan, "mean distance from model to scan, median of those"),
+            (_median([fit.expected_error_mm for fit in trusted]), "vertex error that such a fit expects of itself"),
+            (_median([fit.distance_mm("model_to_scan") for fit in trusted]), f"mean distance {to_scan}"),
+            (_median([fit.distance_mm("scan_to_model") for fit in trusted]), "mean distance from scan to model"),
         ):
-            if np.isfinite(value):
-                rows.append((mm(value).removesuffix(" mm"), "mm", what))
-        return (
-            paragraph(told)
-            + tiles(rows)
-            + self.other_models()
-            + self.doubts()
-            + self.page.guarded("Main figures", self.main_figures)
-        )
+            if isfinite(value):
+                tiles.append((mm(value).removesuffix(" mm"), "mm", f"{what}, median of those"))
+        return [
+            Text(self.told(counts)),
+            Tiles(tiles),
+            *self.other_models(),
+            self.doubts(),
+            self.page.section("Main figures", self.main_figures),
+        ]
 
-    def other_models(self) -> str:
+    def told(self, counts: Mapping[str, int]) -> str:
+        """Return in a sentence or two what was fitted, and how many fits have which status."""
+        models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
+        methods = sorted({fit.record.method for fit in self.fits} - {""})
+        told = f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}"
+        told += f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}. " if methods else ". "
+        trusted = counts["converged"]
+        told += counted(trusted, "fit") if trusted else "None"
+        told += f" converged with nothing {'found against them' if trusted != 1 else 'against it'}"
+        rest = {
+            "max_iterations": "stopped at the limit of steps",
+            "doubtful": "doubtful",
+            "failed": "could not be fitted",
+            "unreadable": "cannot be read",
+        }
+        others = listed([f"{counts[key]} {word}" for key, word in rest.items() if counts[key]])
+        return f"{told}; {others}." if others else f"{told}."
+
+    def other_models(self) -> list[Block]:
         """Return which fits are by another model than the one shown, where one was given."""
         if self.model_path is None:
-            return ""
+            return []
         shown = self.model_hash()
-        others = [
-            fit.name
-            for fit in self.fits
-            if fit.status not in _WITHOUT_RESULT and _source(fit, "model", "hash") != shown
-        ]
-        return notice(f"Fitted with another model than {self.model_path.name}", others)
+        others = [fit.name for fit in self.fits if fit.fitted and fit.record.model.hash != shown]
+        return [Notice(f"Fitted with another model than {self.model_path.name}", others)]
 
-    def doubts(self) -> str:
+    def doubts(self) -> Notice:
         """Return the fits that need a look, by name and reason."""
         bad = [fit for fit in self.fits if fit.status != "converged"]
-        if not bad:
-            return ""
-        items = ""
-        for fit in bad[:_MOST_NAMED]:
-            place = self._cards.get(fit.name) or self._details.get(fit.name)
-            name = f'<a href="#{esc(place)}">{esc(fit.name)}</a>' if place else esc(fit.name)
-            items += f"<li>{name}: {esc(_words_of(fit))}. {esc(fit.reason)}</li>"
-        more = len(bad) - _MOST_NAMED
-        if more > 0:
-            items += f"<li>{counted(more, 'other')}, in the table of all fits.</li>"
-        return f'<div class="notice"><strong>Not to be trusted without a look</strong><ul>{items}</ul></div>\n'
+        places = self._details | self._cards
+        items: list[str | Item] = [
+            Item(f"{STATUS_WORDS[fit.status]}. {fit.reason}", Cell(fit.name, place=places.get(fit.name)))
+            for fit in bad[:_MOST_NAMED]
+        ]
+        if len(bad) > _MOST_NAMED:
+            items.append(f"{counted(len(bad) - _MOST_NAMED, 'other')}, in the table of all fits.")
+        return Notice("Not to be trusted without a look", items)
 
-    def main_figures(self) -> str:
+    def main_figures(self) -> list[Block]:
         """Return the main fits side by side, and how near all of them come."""
         from shapespace.report import figures
 
-        shown, problems = sections.usable(self.main_fits(), self.staged)
+        shown, problems = sections.usable(self.main, self.staged)
         if not shown:
             return self.without_stages(problems)
-        status = {fit.name: _words_of(fit) for fit in self.fits}
-        figure = figures.portrait_figure(
-            shown,
-            [f"{fit.name} ({status[fit.name]})" for fit in shown],
-            title="Raw scans and the model fitted to them",
-        )
+        labels = [f"{fit.name} ({STATUS_WORDS[fit.status]})" for fit in shown]
         which = (
-            "All fits. "
+            "All fits."
             if len(shown) == len(self.fits)
-            else "The doubtful fit that needs a look most, and of the others the worst and the median. "
+            else "The doubtful fit that needs a look most, and of the others the worst and the median."
             if any(fit.status == "doubtful" for fit in shown)
-            else "The worst and the median fit. "
+            else "The worst and the median fit."
         )
-        pictures = self.page.figure(
-            figure,
-            f"{which}The last column maps the distance from the model to the scan, all rows on one scale.",
-            alt="Scan, fitted model, both over each other, and a distance map, for "
-            + listed([f"{fit.name} ({status[fit.name]})" for fit in shown]),
-        )
+        pictures: list[Block] = [
+            self.page.figure(
+                figures.portrait_figure(shown, labels, title="Raw scans and the model fitted to them"),
+                f"{which} The last column maps the distance from the model to the scan, all rows on one scale.",
+                alt=f"Scan, fitted model, both over each other, and a distance map, for {listed(labels)}",
+            )
+        ]
         if len(self.fits) > 1:
             pictures += self.page.tried(self.curves)
-        return sections.in_columns(pictures) + notice("Not in the pictures", problems)
+        return [sections.in_columns(*pictures), Notice("Not in the pictures", problems)]
 
-    def curves(self) -> str:
+    def curves(self) -> Figure:
         """Return which share of the surface lies within each distance."""
         from shapespace.report import figures
 
@@ -288,92 +251,108 @@ class FolderPage:
             chart=True,
         )
 
-    def without_stages(self, problems: Sequence[str]) -> str:
-        """Return why there are no pictures of the fit itself, what adds them, and stills of what there is."""
-        fitted = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT]
+    def without_stages(self, problems: Sequence[str]) -> list[Block]:
+        """Return why there are no pictures of the fit itself, and what adds them."""
+        fitted = [fit for fit in self.fits if fit.fitted]
         if not fitted:
-            return paragraph("There is no fit to show.", "broken")
-        model = _source(fitted[0], "model", "path") or "MODEL.h5"
-        scan = _source(fitted[0], "scan", "path") or "SCAN"
-        scans = str(Path(str(scan)).parent) if len(fitted) > 1 else str(scan)
-        out = ""
+            return [Text("There is no fit to show.", "broken")]
+        record = fitted[0].record
+        scan = record.scan.path or "SCAN"
+        scans = str(Path(scan).parent) if len(fitted) > 1 else scan
+        out: list[Block] = []
         if not any(fit.pictured for fit in fitted):
-            out += (
-                "<p>The stages of these fits were not saved, so there are no distance maps, overlays and surfaces to "
-                "turn; this adds them, run in the folder of the results:</p>\n"
-                f"<pre><code>{esc(f'shapespace fit {model} {scans} -o . --stages --resume')}</code></pre>\n"
-            )
-        return out + notice("Not in the pictures", problems)
+            out = [
+                Text(
+                    "The stages of these fits were not saved, so there are no distance maps, overlays and surfaces to "
+                    "turn; this adds them, run in the folder of the results:"
+                ),
+                Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages --resume"),
+            ]
+        return [*out, Notice("Not in the pictures", problems)]
 
     # Fits
 
-    def fits_part(self) -> str:
+    def fits_part(self) -> list[Block]:
         """Return the gallery, the table, the fits together, and the main ones in detail."""
         page = self.page
-        parts: list[str] = []
+        parts: list[Block] = []
         if self._cards:
             heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
-            parts.append(page.guarded(heading, self.gallery))
-        parts.append(page.guarded("Every fit in numbers", self.numbers))
-        if sum(fit.status not in _WITHOUT_RESULT for fit in self.fits) > 1:
-            parts.append(page.guarded("The fits together", self.together))
-        for fit in self.main_fits():
-            parts.append(
-                page.guarded(f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name])
-            )
-        return "\n".join(parts)
+            parts.append(page.section(heading, self.gallery))
+        parts.append(page.section("Every fit in numbers", self.numbers))
+        if sum(fit.fitted for fit in self.fits) > 1:
+            parts.append(page.section("The fits together", self.together))
+        for fit in self.main:
+            place = self._details[fit.name]
+            parts.append(page.section(f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=place))
+        return parts
 
-    def gallery(self) -> str:
+    def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
         from shapespace.report import stills
 
-        chosen = self.carded()
-        sample, _ = sections.usable([fit for fit in chosen if fit.pictured], self.staged)
+        sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
         good = [fit for fit in sample if fit.status == "converged"]
         limit = sections.common_limit_mm(good or sample)
-        cards: list[Card] = []
-        for fit in chosen:
-            still, alt, why = None, "", ""
-            try:
-                if fit.pictured:
-                    staged = self.staged(fit)
-                    still, alt = stills.fit_strip(staged, limit), sections.strip_alt(staged, limit)
-                elif fit.entry.get("fitted") and fit.status not in _WITHOUT_RESULT:
-                    still, alt = stills.mesh_still(self.posed(fit)), f"The fitted surface of {fit.name}"
-                else:
-                    still, alt = stills.mesh_still(self.raw_scan(fit)), f"The raw scan {fit.name}, as its axes stand"
-            except ShapespaceError as error:
-                why = f"No picture: {error}"
-            cards.append(sections.Card(fit, self._cards[fit.name], still, alt, why, self._details.get(fit.name)))
-            self.page.step(fit.name)
-        out = paragraph("Failed and doubtful ones first, then by the error expected of them.")
-        if len(self.fits) > len(chosen):
-            out += paragraph(
-                f"{counted(len(self.fits) - len(chosen), 'other fit')} have no picture here, so that this file stays "
-                "below 8 MB; the table has them all."
-            )
+        out: list[Block] = [Text("Failed and doubtful ones first, then by the error expected of them.")]
+        if len(self.fits) > len(self.carded):
+            others = counted(len(self.fits) - len(self.carded), "other fit")
+            more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
+            out.append(Text(more))
         if sample:
-            out += sections.scale_key(self.page, limit)
-        return out + sections.gallery(self.page, cards)
+            bar = stills.colour_bar()
+            out.append(ScaleKey(limit, self.page.image(bar.data, bar.size, "from blue over pale to red")))
+        return [*out, Gallery([self.card(fit, limit) for fit in self.carded])]
+
+    def card(self, fit: SavedFit, limit_mm: float) -> Card:
+        """Return one fit of the gallery, its map on a scale that ends at `limit_mm`."""
+        image, why = None, ""
+        try:
+            image = self.still(fit, limit_mm)
+        except ShapespaceError as error:
+            why = f"No picture: {error}"
+        self.page.step(fit.name)
+        seen = fit.distance_mm("scan_to_model")
+        told = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
+        return Card(
+            self._cards[fit.name],
+            fit.name,
+            status(fit.status),
+            fit.label if fit.label != fit.name else "",
+            told + fit.reason,
+            image,
+            why,
+            self._details.get(fit.name),
+        )
+
+    def still(self, fit: SavedFit, limit_mm: float) -> Image:
+        """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
+        from shapespace.report import stills
+
+        if fit.pictured:
+            staged = self.staged(fit)
+            still, alt = stills.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
+        elif fit.entry.fitted and fit.fitted:
+            still, alt = stills.mesh_still(self.posed(fit)), f"The fitted surface of {fit.name}"
+        else:
+            still, alt = stills.mesh_still(self.raw_scan(fit)), f"The raw scan {fit.name}, as its axes stand"
+        return self.page.image(still.data, still.size, alt)
 
     def posed(self, fit: SavedFit) -> Mesh:
         """Return NAME.fitted.ply in the model's frame, so that it looks at the camera."""
-        mesh = self.folder.mesh(fit.entry["fitted"])
-        T = as_mapping(fit.record.get("T_scan_model"))
-        try:
-            turned = (mesh.vertices - np.array(T["translation"], dtype=float)) @ np.array(T["rotation"], dtype=float)
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_ADVICE}.") from error
-        return mesh.with_vertices(turned / float(T["scale"]))
+        T = fit.record.T_scan_model
+        if T is None or not T.scale > 0:
+            raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_ADVICE}.")
+        mesh = self.folder.mesh(fit.entry.fitted)
+        return mesh.with_vertices((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale)
 
     def raw_scan(self, fit: SavedFit) -> Mesh:
         """Return the scan that could not be fitted, if it is still where it was, with the content it had."""
-        source = as_mapping(fit.record.get("scan"))
-        path = source.get("path")
-        if not isinstance(path, str) or not path or "\0" in path:
+        source = fit.record.scan
+        if not source.path or "\0" in source.path:
             raise FileFormatError("the record does not say where the scan is.")
-        file = self.folder.root / path
-        if not file.is_file() or sha256_of_file(file) != source.get("hash"):
+        file = self.folder.root / source.path
+        if not file.is_file() or sha256_of_file(file) != source.hash:
             raise FileFormatError("the scan is no longer where it was, or has changed.")
         try:
             mesh = read_mesh(file)
@@ -383,28 +362,19 @@ class FolderPage:
             raise FileFormatError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
         return mesh
 
-    def numbers(self) -> str:
+    def numbers(self) -> list[Block]:
         """Return the table of all fits."""
-        places = self._cards | self._details
         shown = self.fits[:MOST_ROWS]
-        out = sections.fits_table(
-            shown, places, caption="Every fit: distances and errors at the end in mm. A dash: not known."
-        )
+        caption = "Every fit: distances and errors at the end in mm. A dash: not known."
+        out: list[Block] = [tables.fits_table(shown, self._cards | self._details, caption=caption)]
         if len(self.fits) > len(shown):
-            out += paragraph(
-                f"{counted(len(self.fits) - len(shown), 'other fit')} are left out here; coefficients.csv has all."
-            )
-        if self.label_note:
-            out += paragraph(self.label_note, "soft")
-        return out
+            left = counted(len(self.fits) - len(shown), "other fit")
+            out.append(Text(f"{left} are left out here; coefficients.csv has all."))
+        return [*out, *([Text(self.label_note, "soft")] if self.label_note else [])]
 
     def of_one_model(self, model_hash: str) -> list[SavedFit]:
         """Return the fits by one model that have coefficients: only these can be compared."""
-        return [
-            fit
-            for fit in self.fits
-            if fit.status not in _WITHOUT_RESULT and fit.record.get("b") and _source(fit, "model", "hash") == model_hash
-        ]
+        return [fit for fit in self.fits if fit.fitted and fit.record.b and fit.record.model.hash == model_hash]
 
     def model_hash(self) -> str:
         """Return the content hash of the model whose fits are compared.
@@ -414,7 +384,7 @@ class FolderPage:
         """
         if self.model_path is not None:
             return self.model().content_hash
-        hashes = {str(_source(fit, "model", "hash")) for fit in self.fits if fit.status not in _WITHOUT_RESULT}
+        hashes = {fit.record.model.hash for fit in self.fits if fit.fitted}
         if len(hashes) > 1:
             raise InputError(
                 f"The fits are by {len(hashes)} different models, so their coefficients cannot be compared; "
@@ -422,93 +392,75 @@ class FolderPage:
             )
         return hashes.pop() if hashes else ""
 
-    def together(self) -> str:
+    def together(self) -> list[Block]:
         """Return the coefficients of all fits by one model against each other, and the lines of one subject's."""
         compared = self.of_one_model(self.model_hash())
         out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
-        expressive = [fit for fit in compared if fit.entry.get("intensity")]
-        subjects = {str(fit.entry.get("subject") or "") for fit in expressive}
-        levels = Counter(str(fit.entry.get("expression")) for fit in expressive)
+        expressive = [fit for fit in compared if fit.entry.intensity]
+        subjects = {fit.entry.subject for fit in expressive}
+        levels = Counter(fit.entry.expression for fit in expressive)
         if len(subjects) != 1 or "" in subjects or max(levels.values(), default=0) < _FEWEST_LEVELS:
             return out
         points = [sections.coefficients_of(fit) for fit in expressive]
         if any(len(point.b) < 2 for point in points):
             return out
-        neutral = next(
-            (
-                sections.coefficients_of(fit)
-                for fit in compared
-                if fit.entry.get("intensity") == 0 and str(fit.entry.get("subject") or "") in subjects
-            ),
-            None,
-        )
-        return out + self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))
+        own = (fit for fit in compared if fit.entry.intensity == 0 and fit.entry.subject in subjects)
+        neutral = next(map(sections.coefficients_of, own), None)
+        return [*out, *self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))]
 
-    def detail(self, fit: SavedFit) -> str:
+    def detail(self, fit: SavedFit) -> list[Block]:
         """Return one fit with every picture, as far as the file's size allows."""
         staged = self.staged(fit)
-        out = sections.fit_facts(fit)
-        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
-        if self.page.left < _DETAIL_BYTES + reserve:
-            return out + paragraph("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")
-        same = self.of_one_model(str(_source(fit, "model", "hash")))
+        same = self.of_one_model(fit.record.model.hash)
         others = [other.numbers("z") for other in same if other.name != fit.name]
-        population: FloatArray | None = None
-        if len(others) > 2 and len({len(z) for z in others}) == 1:
-            population = np.stack(others)
-        return out + sections.fit_to_turn(self.page, staged) + sections.fit_pictures(self.page, staged, population)
+        population = np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
+        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
+        return [*sections.fit_facts(fit), *sections.fit_in_full(self.page, staged, population, reserve=reserve)]
 
     # The rest
 
-    def recognition(self) -> str:
-        """Return what recognition.json holds."""
-        return recognition.recognition_section(self.page, self.folder)
-
-    def settings(self) -> str:
+    def settings(self) -> list[Block]:
         """Return settings that the fits share, versions and hashes."""
-        known = [fit for fit in self.fits if fit.status not in _WITHOUT_RESULT] or self.fits
-        configs = [as_mapping(fit.record.get("config")) for fit in known if fit.record.get("config")]
-        rows: list[tuple[str, str]] = [("Report", f"shapespace {__version__}")]
-        versions = sorted({str(fit.record["version"]) for fit in self.fits if fit.record.get("version")})
+        known = [fit for fit in self.fits if fit.fitted] or self.fits
+        configs = [fit.record.config for fit in known if fit.record.config]
+        rows = [("Report", f"shapespace {__version__}")]
+        versions = sorted({fit.record.version for fit in self.fits} - {""})
         if versions:
             rows.append(("Fits", f"shapespace {listed(versions)}"))
         dense = any(config.get("dense") for config in configs)
-        keys = dict.fromkeys(key for config in configs for key in config if dense or key != "dense_settings")
-        for key in keys:
-            values = list(dict.fromkeys(sections.setting(config.get(key)) for config in configs))
+        for key in dict.fromkeys(key for config in configs for key in config if dense or key != "dense_settings"):
+            values = list(dict.fromkeys(setting(config.get(key)) for config in configs))
             rows.append((words(key), values[0] if len(values) == 1 else f"differs: {'; '.join(values[:4])}"))
         files = [
-            [
-                Cell(fit.name),
-                *(
-                    Cell(str(as_mapping(fit.record.get(of)).get(what) or "–"))
-                    for of, what in (("scan", "name"), ("scan", "hash"))
-                ),
-                Cell(str(as_mapping(fit.record.get("model")).get("hash") or "–")),
-            ]
+            [fit.name, *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash))]
             for fit in self.fits[:MOST_ROWS]
         ]
-        return facts(rows, caption="Settings and versions") + folded(
-            "Content hashes (SHA-256)",
-            table(
-                [Column("Fit"), Column("Scan"), Column("Hash of the scan"), Column("Hash of the model")],
-                files,
-                caption="Content hashes of the files that took part",
-                stack=True,
-            ),
-        )
+        heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
+        hashes = text_table(heads, files, "Content hashes of the files that took part")
+        return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
 
 
-def _source(fit: SavedFit, of: str, what: str) -> object:
-    return as_mapping(fit.record.get(of)).get(what)
+def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    """Return the fits shown with every picture: the worst doubtful one, the worst and the median of the others."""
+    pictured = [fit for fit in fits if fit.pictured]
+    if len(pictured) <= MOST_DETAILS:
+        return pictured
+    doubtful = [fit for fit in pictured if fit.status == "doubtful"]
+    others = [fit for fit in pictured if fit.status != "doubtful"]
+    if not others:
+        return doubtful[:MOST_DETAILS]
+    return doubtful[:1] + [others[k] for k in sorted({0, len(others) // 2})]
 
 
-def _words_of(fit: SavedFit) -> str:
-    from shapespace.report.markup import STATUS_WORDS
-
-    return STATUS_WORDS.get(fit.status, fit.status)
+def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    """Return the fits of the gallery; where not all have room, those without a result leave some to the others."""
+    if len(fits) <= MOST_CARDS:
+        return list(fits)
+    empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
+    first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
+    return [*first, *rest[: MOST_CARDS - len(first)]]
 
 
 def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.median(known)) if known else float("nan")
+    known = [value for value in values if isfinite(value)]
+    return float(np.median(known)) if known else np.nan

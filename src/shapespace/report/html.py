@@ -20,7 +20,7 @@ def require_report_extra() -> None:
     Raises:
         ShapespaceError: they are not; the sentence says how to install them.
     """
-    missing = [name for name in ("matplotlib", "PIL") if find_spec(name) is None]
+    missing = [name for name in ("jinja2", "matplotlib", "PIL") if find_spec(name) is None]
     if missing:
         raise ShapespaceError(
             f"The report needs {' and '.join(missing)}, which is not installed; run pip install 'shapespace[report]'."
@@ -65,7 +65,7 @@ def write_report(
             raise InputError(
                 f"{folder} is a demo, which names its models and labels itself; leave out --model and --labels."
             )
-        page = DemoPage(results, results.json("demo.json"), on_step).html()
+        page = DemoPage(results, on_step).html()
     elif is_study(results):
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a study without fits; leave out --model and --labels.")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any
 
 from shapespace.io.labels import LABELS_FILE, Label, read_labels
-from shapespace.report.markup import as_mapping, listed
 from shapespace.report.saved import Folder, SavedFit
+from shapespace.report.wording import listed
 
 
 def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) -> tuple[dict[str, Label], str]:
@@ -25,8 +23,8 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) ->
         return read_labels(given), f"Labels are from {given.name}."
     places = [folder.root / LABELS_FILE]
     for fit in fits:
-        path = as_mapping(fit.record.get("scan")).get("path")
-        if isinstance(path, str) and path and "\0" not in path:
+        path = fit.record.scan.path
+        if path and "\0" not in path:
             beside = (folder.root / path).parent / LABELS_FILE
             if beside not in places:
                 places.append(beside)
@@ -42,11 +40,8 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) ->
 
 def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
     """Return `fit` with its label, found by the scan's file name or the name of the fit; as it is without one."""
-    scan = as_mapping(fit.record.get("scan")).get("name")
-    label = labels.get(PurePath(scan).stem if isinstance(scan, str) else fit.name) or labels.get(fit.name)
+    scan = fit.record.scan.name
+    label = labels.get(PurePath(scan).stem if scan else fit.name) or labels.get(fit.name)
     if label is None or not label.text:
         return fit
-    more: dict[str, Any] = {"expression": label.text, "subject": label.subject}
-    if label.intensity is not None:
-        more["intensity"] = label.intensity
-    return replace(fit, entry={**fit.entry, **more})
+    return fit.with_entry(expression=label.text, subject=label.subject, intensity=label.intensity)

@@ -1,4 +1,4 @@
-"""The shell of a self-contained page: style, scripts, pictures and payloads inside; sections fail by themselves."""
+"""A self-contained page: style, scripts, pictures and payloads inside; sections fail by themselves."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from shapespace.errors import ShapespaceError
-from shapespace.report.markup import anchor, esc
+from shapespace.report.blocks import Block, Figure, Image, Section, Text, Turning
+from shapespace.report.wording import anchor
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""
@@ -25,33 +26,28 @@ _RESERVE_BYTES = 700_000
 Step = Callable[[str, int], None]
 """Told what was just made, and about how many such things there will be, for a progress bar."""
 
+Make: TypeAlias = Callable[[], Block | Sequence[Block]]
+"""Makes a part of a page."""
+
 
 @dataclass(frozen=True)
-class Section:
-    """A part of the page that its navigation leads to.
-
-    Args:
-        heading: of the part.
-        link: what the navigation calls it.
-        make: returns its HTML.
-    """
+class Chapter:
+    """A part of the page that its navigation leads to: its heading, what makes it, and its link's text if shorter."""
 
     heading: str
-    link: str
-    make: Callable[[], str]
+    make: Make
+    link: str = ""
 
 
 class Page:
     """A page in the making: what it embeds, how large it is so far, and where its sections failed.
 
     Args:
-        advice: what a reader can do about a result file that is wrong, such as `run the demo again`.
         planned: about how many pictures there will be.
         on_step: told of each picture.
     """
 
-    def __init__(self, advice: str, planned: int, on_step: Step | None = None) -> None:
-        self.advice = advice
+    def __init__(self, planned: int, on_step: Step | None = None) -> None:
         self._planned = planned
         self._on_step = on_step
         self._payloads: list[str] = []
@@ -82,78 +78,51 @@ class Page:
         self._anchors.add(name)
         return name
 
-    def guarded(self, heading: str, make: Callable[[], str], level: int = 3, place: str | None = None) -> str:
+    def section(self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "") -> Section:
         """Return a section, or its heading and why it could not be made."""
         place = place or self.place(heading)
-        top = f'<h{level} id="{esc(place)}">{esc(heading)}</h{level}>\n'
-        body = self.tried(make)
-        return f'<section aria-labelledby="{esc(place)}">\n{top}{body}\n</section>'
+        return Section(heading, place, self.tried(make), level, link or heading)
 
-    def tried(self, make: Callable[[], str]) -> str:
+    def tried(self, make: Make) -> Sequence[Block]:
         """Return what `make` gives, or why it could not."""
         try:
-            return make()
+            made = make()
         except ShapespaceError as error:
-            return f'<p class="broken">This part could not be made. {esc(str(error))}</p>\n'
-        except Exception as error:
-            # Result files can be wrong in more ways than can be listed, and one of them must not cost the rest.
-            what = f"{type(error).__name__}: {error}"
-            return (
-                '<p class="broken">This part could not be made, because a result file does not have the expected form '
-                f"({esc(what)}); {esc(self.advice)}.</p>\n"
-            )
+            return [Text(f"This part could not be made. {error}", "broken")]
+        return made if isinstance(made, Sequence) else [made]
 
-    def figure(self, figure: Figure, caption: str, *, alt: str, chart: bool = False) -> str:
+    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` says what is seen in it."""
         from shapespace.report.figures import encode_webp
 
         data, size = encode_webp(figure, lossless=chart)
-        return self.picture(data, size, caption, alt=alt, kind="chart" if chart else "drawing")
-
-    def picture(
-        self,
-        data: bytes,
-        size: tuple[int, int],
-        caption: str,
-        *,
-        alt: str,
-        kind: Literal["chart", "drawing", "plain"] = "plain",
-    ) -> str:
-        """Return WebP `data` of `size` pixels with its caption."""
         self.step(caption)
-        return (
-            f'<figure class="{kind}"><div class="plate">{self.image(data, size, alt=alt)}</div>\n'
-            f"<figcaption>{esc(caption)}</figcaption></figure>\n"
-        )
+        return Figure(self.image(data, size, alt), caption, "chart" if chart else "drawing")
 
-    def image(self, data: bytes, size: tuple[int, int], *, alt: str) -> str:
-        """Return WebP `data` of `size` pixels as an image."""
-        source = base64.b64encode(data).decode("ascii")
-        self._spent += len(source)
-        return (
-            f'<img alt="{esc(alt)}" width="{size[0]}" height="{size[1]}" decoding="async" '
-            f'src="data:image/webp;base64,{source}">'
-        )
+    def image(self, data: bytes, size: tuple[int, int], alt: str) -> Image:
+        """Return WebP `data` of `size` pixels as an image of this page."""
+        self._spent += 4 * -(-len(data) // 3)
+        return Image(data, size, alt)
 
     def turning(
         self,
         widget: Literal["modes", "fit", "scatter"],
         payload: bytes,
-        poster: str,
+        poster: Image,
         caption: str,
         *,
         label: str,
         still: str,
-    ) -> str:
-        """Return something that turns where the browser can, and is a still on paper and without a script.
+    ) -> Turning | Figure:
+        """Return something that turns, or its still alone where the page would grow too large.
 
         Args:
-            widget: a name of `Shapespace.widgets` in widgets.js.
+            widget: as of `blocks.Turning`, as all the others but
             payload: what it shows, from `report.scene`.
-            poster: HTML of the still, from `image`.
+            poster: the still.
             caption: of both.
-            label: what it is, for screen readers.
-            still: what the still shows, told with it alone.
+            label: what it is.
+            still: what the still shows.
         """
         from shapespace.report import scene
 
@@ -164,63 +133,75 @@ class Page:
         self.step(caption)
         if len(text) > self.left - _RESERVE_BYTES:
             why = f"It does not turn, so that this file stays below {LARGEST_REPORT_BYTES // 1_000_000} MB."
-            said = esc(f"{caption} {still} {why}")
-            return (
-                f'<figure class="plain"><div class="plate">{poster}</div>\n<figcaption>{said}</figcaption></figure>\n'
-            )
+            return Figure(poster, f"{caption} {still} {why}")
         self._spent += len(text)
         self._payloads.append(text)
-        return (
-            f'<figure class="turning"><div class="widget" data-widget="{widget}" data-payload="{name}" role="group" '
-            f'aria-label="{esc(label)}"></div>\n<div class="plate poster">{poster}</div>\n'
-            f'<figcaption>{esc(caption)} <span class="still">{esc(still)}</span></figcaption></figure>\n'
-        )
+        return Turning(widget, name, poster, caption, label, still)
 
-    def html(self, title: str, lead: str, made: str, sections: Sequence[Section]) -> str:
+    def html(self, title: str, lead: Sequence[Block], made: str, chapters: Sequence[Chapter]) -> str:
         """Return the whole page.
 
         Args:
-            title: of the page, text.
-            lead: HTML below the title.
-            made: by what and when, text.
-            sections: its parts in order.
+            title: of the page.
+            lead: below the title.
+            made: by what and when.
+            chapters: its parts in order.
         """
-        places = [self.place(section.heading) for section in sections]
-        body = "\n".join(
-            self.guarded(section.heading, section.make, 2, place)
-            for section, place in zip(sections, places, strict=True)
-        )
-        links = "".join(
-            f'<li><a href="#{esc(place)}">{esc(section.link)}</a></li>'
-            for section, place in zip(sections, places, strict=True)
-        )
-        style, early, late = _asset("report.css"), _script(_asset("theme.js")), _script(_asset("report.js"))
-        scripts = [late]
+        from markupsafe import Markup
+
+        # Their places come first, so that no part inside takes the name of a chapter.
+        places = [self.place(chapter.heading) for chapter in chapters]
+        sections = [
+            self.section(chapter.heading, chapter.make, 2, place, chapter.link)
+            for chapter, place in zip(chapters, places, strict=True)
+        ]
+        style, early, scripts = _asset("report.css"), _script(_asset("theme.js")), [_script(_asset("report.js"))]
         if self._payloads:
             from shapespace.report import scene
 
             style += scene.style()
-            scripts = [_script(scene.scripts()), late]
+            scripts.insert(0, _script(scene.scripts()))
         policy = (
             "default-src 'none'; img-src data: blob:; "
             f"style-src {_hash(style)}; script-src {' '.join(_hash(text) for text in (early, *scripts))}; "
             "base-uri 'none'; form-action 'none'"
         )
-        return (
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            '<link rel="icon" href="data:,">\n'
-            f"<title>{esc(title)}</title>\n<style>{style}</style>\n<script>{early}</script>\n</head>\n<body>\n"
-            '<a class="skip" href="#content">Skip to the content</a>\n'
-            f'<header>\n<button type="button" id="theme" hidden>Dark colours</button>\n<h1>{esc(title)}</h1>\n{lead}'
-            f'<nav aria-label="Sections"><ul>{links}</ul></nav>\n</header>\n'
-            f'<main id="content" tabindex="-1">\n{body}\n</main>\n'
-            f"<footer>{esc(made)}</footer>\n"
-            + "".join(self._payloads)
-            + "".join(f"<script>{text}</script>\n" for text in scripts)
-            + "</body>\n</html>\n"
+        template = _environment().get_template("page.html")
+        return template.render(
+            title=title,
+            lead=lead,
+            made=made,
+            sections=sections,
+            # Ours, and hashed by the policy above: these alone are not escaped.
+            policy=Markup(policy),
+            style=Markup(style),
+            early=Markup(early),
+            scripts=[Markup(text) for text in scripts],
+            payloads=[Markup(text) for text in self._payloads],
         )
+
+
+def rendered(blocks: Sequence[Block]) -> str:
+    """Return blocks as HTML."""
+    from markupsafe import Markup
+
+    macros: Any = _environment().get_template("blocks.html").module
+    return Markup("").join(getattr(macros, type(block).__name__)(block) for block in blocks)
+
+
+@cache
+def _environment() -> Any:  # what Jinja2 keeps for templates is untyped
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    made: Any = Environment(
+        loader=PackageLoader("shapespace.report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    made.globals["blocks"] = rendered
+    return made
 
 
 @cache

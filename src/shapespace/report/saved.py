@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import zipfile
 import zlib
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
+from shapespace.schemas import FitEntry, FitRecord
 from shapespace.types import FloatArray, Mesh
 
 _LARGEST_JSON = 64 * 2**20
 _LARGEST_ARRAY = 2**30
 _AGAIN = "make it again with shapespace fit --stages"
 _RECORD = ".fit.json"
+
+Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
+Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,7 @@ class Folder:
         with self._named_shortly():
             _bounded(path, _LARGEST_JSON, self.again)
             try:
-                content: object = json.loads(read_bytes(path))
+                content: object = json.loads(read_bytes(path), parse_constant=lambda _: None)
             except (ValueError, RecursionError) as error:
                 raise FileFormatError(f"{path} is not JSON, or it is cut short; {self.again}.") from error
             if not isinstance(content, dict):
@@ -126,82 +132,98 @@ class Folder:
 
 @dataclass(frozen=True, eq=False)
 class SavedFit:
-    """One fit, as its record tells it and what is known beside it.
+    """One fit: its record, and what is known beside it, from demo.json or from the files of a folder."""
 
-    Args:
-        entry: `name`, and where there are such `json`, `stages`, `fitted`, `dense`, `expression`, `intensity`: from
-            demo.json, or from the files of a folder.
-        record: NAME.fit.json.
-    """
-
-    entry: Mapping[str, Any]
-    record: Mapping[str, Any]
+    entry: FitEntry
+    record: FitRecord
 
     @property
     def name(self) -> str:
         """What it is called."""
-        return str(self.entry["name"])
+        return self.entry.name
 
     @property
     def label(self) -> str:
         """Expression and intensity in words."""
-        if not float(self.entry.get("intensity") or 0):
-            return str(self.entry.get("expression") or self.name)
-        return f"{self.entry['expression']} {100 * float(self.entry['intensity']):.0f} %"
+        expression, intensity = self.entry.expression or self.name, self.entry.intensity
+        return f"{expression} {100 * intensity:.0f} %" if intensity else expression
 
     @property
     def status(self) -> str:
         """`converged`, `max_iterations`, `doubtful` or `failed`; `unreadable` where the record is."""
-        return str(self.record.get("status", "unreadable"))
+        return self.record.status
 
     @property
     def reason(self) -> str:
         """Why it has that status."""
-        return str(self.record.get("reason", ""))
+        return self.record.reason
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is a result, be it a doubtful one."""
+        return self.status not in ("failed", "unreadable")
 
     @property
     def pictured(self) -> bool:
         """Whether surfaces were kept."""
-        return bool(self.entry.get("stages")) and self.status not in ("failed", "unreadable")
+        return bool(self.entry.stages) and self.fitted
 
-    def summary_mm(self, stage: str, direction: str, measure: str) -> float:
-        """Return a distance summary in mm, or not-a-number where the record has none."""
-        value: Any = self.record.get("distances_mm")
-        for key in (stage, direction, measure):
-            value = cast(Mapping[str, Any], value).get(key) if isinstance(value, Mapping) else None
-        return float("nan") if value is None else float(value)
+    def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
+        """Return a distance over the whole model, or all of the scan, in mm; not-a-number where there is none."""
+        found = self.record.distances_mm.get(stage)
+        return _known(getattr(getattr(found, direction), measure)) if found else math.nan
 
-    def numbers(self, key: str) -> FloatArray:
-        """Return a list of numbers of the record, such as `b` or `z`, (K,).
+    def distance_mm(self, direction: Direction, measure: Measure = "mean") -> float:
+        """Return a distance of the final stage over what the scan shows, in mm; not-a-number where there is none.
+
+        Records of earlier versions do not have it, see `shown`; of them it is that of `summary_mm`.
+        """
+        found = self.record.shown
+        return (
+            _known(getattr(getattr(found, direction), measure))
+            if found
+            else self.summary_mm("final", direction, measure)
+        )
+
+    @property
+    def shown(self) -> bool:
+        """Whether distances are over what the scan shows."""
+        return self.record.shown is not None
+
+    @property
+    def expected_error_mm(self) -> float:
+        """The vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
+        value = self.record.evidence.get("expected_error_mm")
+        return float(value) if isinstance(value, int | float) else math.nan
+
+    def with_entry(self, **known: Any) -> SavedFit:
+        """Return the fit with more known beside its record, by the names of `FitEntry`."""
+        return SavedFit(structs.replace(self.entry, **known), self.record)
+
+    def numbers(self, key: Literal["b", "z", "b_stddev", "shrinkage"]) -> FloatArray:
+        """Return coefficients of the record, or what belongs to them, (K,).
 
         Raises:
-            FileFormatError: it is absent or holds something else.
+            FileFormatError: there are none, or not as many as coefficients.
         """
-        try:
-            values = np.asarray(self.record[key], dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"The record of {self.name} holds no list of numbers {key!r}; {_AGAIN}.") from error
-        if values.ndim != 1 or not np.isfinite(values).all():
-            raise FileFormatError(f"The record of {self.name} holds no list of finite numbers {key!r}; {_AGAIN}.")
+        values = np.array(getattr(self.record, key), dtype=np.float64)
+        if not len(values) or len(values) != len(self.record.b):
+            raise FileFormatError(f"The record of {self.name} holds no list of numbers {key!r}; {_AGAIN}.")
         return values
 
-    def history(self) -> list[tuple[int, int, float]]:
-        """Return (phase, iteration, RMS in mm) in order."""
-        return [
-            (int(row["phase"]), int(row["iteration"]), float(row["rms_mm"]))
-            for row in cast(list[Mapping[str, Any]], self.record.get("history") or [])
-            if row["rms_mm"] is not None
-        ]
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
-def read_fit(folder: Folder, entry: Mapping[str, Any]) -> SavedFit:
+def read_fit(folder: Folder, entry: FitEntry) -> SavedFit:
     """Read the record of one fit.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is damaged.
     """
-    return SavedFit(entry, folder.json(entry.get("json")))
+    return SavedFit(entry, FitRecord.from_json(folder.json(entry.json), str(entry.json), _AGAIN))
 
 
 def has_fits(folder: Folder) -> bool:
@@ -237,19 +259,21 @@ def _records(folder: Folder) -> list[str]:
 
 def _found(folder: Folder, file: str) -> SavedFit:
     name = file.removesuffix(_RECORD)
-    beside = {
-        key: f"{name}.{ending}"
-        for key, ending in (("stages", "stages.npz"), ("fitted", "fitted.ply"), ("dense", "dense.ply"))
-        if (folder.root / f"{name}.{ending}").is_file()
-    }
-    entry = {"name": _printable(name), "json": file, **beside}
+
+    def beside(ending: str) -> str | None:
+        return f"{name}.{ending}" if (folder.root / f"{name}.{ending}").is_file() else None
+
+    entry = FitEntry(
+        name=str(_printable(name)),
+        json=file,
+        stages=beside("stages.npz"),
+        fitted=beside("fitted.ply"),
+        dense=beside("dense.ply"),
+    )
     try:
-        record = folder.json(file)
-        if record.get("format") != "shapespace fit":
-            raise FileFormatError(f"{file} is not the record of a fit; {_AGAIN}.")
+        return read_fit(folder, entry)
     except ShapespaceError as error:
-        record = {"status": "unreadable", "reason": str(error)}
-    return SavedFit(entry, record)
+        return SavedFit(entry, FitRecord(status="unreadable", reason=str(error)))
 
 
 def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
@@ -259,11 +283,10 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
         FileError: its stages cannot be read.
         FileFormatError: they were not saved, or are damaged.
     """
-    stages = fit.entry.get("stages")
-    if not stages:
+    if not fit.entry.stages:
         raise FileFormatError(f"{fit.name}: its stages were not saved; fit the scan again with --stages.")
     return StagedFit.from_arrays(
-        folder.arrays(stages),
+        folder.arrays(fit.entry.stages),
         name=fit.name,
         label=fit.label,
         status=fit.status,
@@ -288,15 +311,13 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
         FileFormatError: it is damaged.
         InputError: it is not where the records say, or not the one they name.
     """
-    sources = [
-        cast(Mapping[str, Any], fit.record["model"]) for fit in fits if isinstance(fit.record.get("model"), dict)
-    ]
-    hashes = {str(source.get("hash")) for source in sources}
+    sources = [fit.record.model for fit in fits if fit.record.model.hash]
+    hashes = {source.hash for source in sources}
     if not sources:
         raise InputError(f"{folder.root}: no record names a model; give it with --model.")
     if len(hashes) > 1 and given is None:
         raise InputError(f"{folder.root}: its fits are by {len(hashes)} different models; give one with --model.")
-    path = given or folder.root / str(sources[0].get("path") or sources[0].get("name"))
+    path = given or folder.root / (sources[0].path or sources[0].name)
     if given is None and not path.is_file():
         raise InputError(f"{folder.root}: the model {path.name} is no longer at {path}; give it with --model.")
     model = ShapeModel.load(path)

@@ -229,15 +229,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         "b_stddev": staged.b_stddev,
     }
     if not small:
-        moments = staged.history
-        K = len(staged.b)
-        arrays |= {
-            "history_b": np.array([moment.b for moment in moments]).reshape(-1, K),
-            "history_T": np.array([_matrix(moment.T_final_now) for moment in moments]).reshape(-1, 3, 4),
-            "history_phase": np.array([moment.phase for moment in moments], dtype=np.int32),
-            "history_iteration": np.array([moment.iteration for moment in moments], dtype=np.int32),
-            "history_rms_mm": np.array([moment.rms_mm for moment in moments], dtype=np.float32),
-        }
+        arrays |= _history(staged)
     facts = {
         "kind": "fit",
         "name": staged.name,
@@ -257,6 +249,18 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
+
+
+def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
+    """Return the iterations as arrays."""
+    moments, K = staged.history, len(staged.b)
+    return {
+        "history_b": np.array([moment.b for moment in moments]).reshape(-1, K),
+        "history_T": np.array([_matrix(moment.T_final_now) for moment in moments]).reshape(-1, 3, 4),
+        "history_phase": np.array([moment.phase for moment in moments], dtype=np.int32),
+        "history_iteration": np.array([moment.iteration for moment in moments], dtype=np.int32),
+        "history_rms_mm": np.array([moment.rms_mm for moment in moments], dtype=np.float32),
+    }
 
 
 def pack_scatter(

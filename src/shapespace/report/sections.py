@@ -1,82 +1,70 @@
-"""Parts that the pages share: the model, one fit in detail, a gallery and a table of fits, fits together, scores."""
+"""Parts that the pages share: the model, one fit in detail, a table of fits, fits together, scores."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from shapespace.errors import ShapespaceError
-from shapespace.report.markup import (
-    Cell,
-    Column,
-    as_list,
-    as_mapping,
-    counted,
-    esc,
-    facts,
-    folded,
-    length,
-    listed,
-    mm,
-    number,
-    paragraph,
-    percent,
-    plain,
+from shapespace.report.blocks import (
+    Block,
+    Facts,
+    Figure,
+    Folded,
+    Group,
+    Notes,
+    Text,
+    Turning,
+    Verdict,
+    facts_of,
     status,
-    table,
-    words,
 )
 from shapespace.report.page import Page
 from shapespace.report.saved import SavedFit
+from shapespace.report.wording import counted, isfinite, listed, mm, percent
 from shapespace.types import FloatArray
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.figures import Coefficients
     from shapespace.report.staged import StagedFit
-    from shapespace.report.stills import Still
+    from shapespace.schemas import Quality
 
 ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
 """Statuses, those first that somebody must look at."""
 
 MODEL_PICTURES, FIT_PICTURES = 4, 9
-"""How many pictures `model_part`, and `fit_to_turn` with `fit_pictures`, make."""
+"""How many pictures `model_part` and `fit_in_full` make."""
 
 MODES_IN_WIDGET = 8
 SCAN_TRIANGLES = 8_000
 """How many triangles of a scan turn in the page; the file of the scan has them all."""
 
+_From = TypeVar("_From")
+_To = TypeVar("_To")
+_DETAIL_BYTES = 1_300_000
 _VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
 
 
 def concern(fit: SavedFit) -> tuple[int, float]:
     """Return a key that sorts fits by how much they need a look: by status, then by the error expected or seen."""
-    rank = ORDER_OF_CONCERN.index(fit.status) if fit.status in ORDER_OF_CONCERN else 0
-    error = expected_error_mm(fit)
-    if not math.isfinite(error):
-        error = fit.summary_mm("final", "scan_to_model", "mean")
-    return rank, -error if math.isfinite(error) else 0.0
+    error = fit.expected_error_mm
+    if not isfinite(error):
+        error = fit.distance_mm("scan_to_model")
+    return ORDER_OF_CONCERN.index(fit.status), -error if isfinite(error) else 0.0
 
 
-def expected_error_mm(fit: SavedFit) -> float:
-    """Return the vertex error that the fit expects of itself, mm; not-a-number where it does not say."""
-    value = as_mapping(fit.record.get("evidence")).get("expected_error_mm")
-    return float(value) if isinstance(value, int | float) else float("nan")
-
-
-def in_columns(pictures: str) -> str:
+def in_columns(*pictures: Block) -> Group:
     """Return pictures in two columns where the window has room for them."""
-    return f'<div class="columns">{pictures}</div>\n'
+    return Group("columns", pictures)
 
 
 # The model
 
 
-def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: int = MODES_IN_WIDGET) -> str:
+def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: int = MODES_IN_WIDGET) -> list[Block]:
     """Return what the model is and does: facts, modes to move by hand, modes as stills, spectrum.
 
     Args:
@@ -102,29 +90,33 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         ("Licence", model.licence or "not stated"),
     ]
     shown = min(5, model.n_modes)
-    out = facts(rows, caption="The shape model") + modes_to_move(page, model, to_move)
-    pictures = page.figure(
-        figures.modes_figure(model, modes=shown),
-        f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each point "
-        "moves at 3. One scale for all rows.",
-        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard deviations, with maps "
-        "of the displacement",
-    )
-    pictures += page.figure(
-        figures.spectrum_figure(model),
-        "Share of the training set's variance that the first modes hold.",
-        alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
-        chart=True,
-    )
-    sides = page.figure(
-        figures.mean_figure(model),
-        "The mean shape from three sides" + (", with the model's landmarks." if model.landmarks else "."),
-        alt="The mean shape from three sides",
-    )
-    return out + in_columns(pictures + sides)
+    return [
+        Facts(rows, "The shape model"),
+        modes_to_move(page, model, to_move),
+        in_columns(
+            page.figure(
+                figures.modes_figure(model, modes=shown),
+                f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each "
+                "point moves at 3. One scale for all rows.",
+                alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard deviations, "
+                "with maps of the displacement",
+            ),
+            page.figure(
+                figures.spectrum_figure(model),
+                "Share of the training set's variance that the first modes hold.",
+                alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
+                chart=True,
+            ),
+            page.figure(
+                figures.mean_figure(model),
+                "The mean shape from three sides" + (", with the model's landmarks." if model.landmarks else "."),
+                alt="The mean shape from three sides",
+            ),
+        ),
+    ]
 
 
-def quality_part(page: Page, quality: Mapping[str, Any]) -> str:
+def quality_part(page: Page, quality: Quality) -> Figure:
     """Return how good the shape space is by its number of modes, from the measures of it that are there."""
     from shapespace.report import figures
 
@@ -137,21 +129,21 @@ def quality_part(page: Page, quality: Mapping[str, Any]) -> str:
     )
 
 
-def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
+def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
     """Return the model's modes with sliders, as stills of the mean where nothing turns."""
     from shapespace.report import stills
     from shapespace.report.scene import pack_model
-    from shapespace.types import Mesh
 
     count = min(most, model.n_modes)
-    still = stills.mesh_still(Mesh(model.mean_vertices, model.faces, name="mean"), (420, 420))
+    still = stills.mesh_still(model.mesh(), (420, 420))
+    which = f"The first {counted(count, 'mode')} of {model.n_modes}"
+    if count == model.n_modes:
+        which = f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}"
     return page.turning(
         "modes",
         pack_model(model, count, small=True),
-        page.image(still.data, still.size, alt="The mean shape"),
-        f"The first {counted(count, 'mode')} of {model.n_modes}, to be moved by hand."
-        if count < model.n_modes
-        else f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}, to be moved by hand.",
+        page.image(still.data, still.size, "The mean shape"),
+        f"{which}, to be moved by hand.",
         label="Modes of the model, one slider each",
         still="The still shows the mean.",
     )
@@ -160,7 +152,25 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> str:
 # One fit
 
 
-def fit_to_turn(page: Page, fit: StagedFit) -> str:
+def fit_in_full(
+    page: Page, fit: StagedFit, population: FloatArray | None = None, *, reserve: int = 0, of_paper: bool = False
+) -> list[Block]:
+    """Return one fit to turn and every picture of it, as far as the file's size allows.
+
+    Args:
+        page: that they go to.
+        fit: with its stages.
+        population: (N, K) coefficients of others in standard deviations, or None.
+        reserve: bytes of the page that are kept free.
+        of_paper: whether captions name the figures of the paper.
+    """
+    if page.left < _DETAIL_BYTES + reserve:
+        return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
+    turning = page.tried(lambda: fit_to_turn(page, fit))
+    return [*turning, fit_pictures(page, fit, population, of_paper=of_paper)]
+
+
+def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     """Return scan and model of one fit, as a strip of stills where nothing turns."""
     from shapespace.report import stills
     from shapespace.report.scene import pack_fit
@@ -175,7 +185,7 @@ def fit_to_turn(page: Page, fit: StagedFit) -> str:
     return page.turning(
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
-        page.image(still.data, still.size, alt=strip_alt(fit, limit_mm)),
+        page.image(still.data, still.size, strip_alt(fit, limit_mm)),
         f"{fit.label}: the scan, and the model at each stage.",
         label=f"Scan and model of {fit.label}, to be turned",
         still=f"The still shows the scan, both over each other, and {scale}",
@@ -201,76 +211,59 @@ def _known(fit: StagedFit, stage: str) -> FloatArray:
     return distances[np.isfinite(distances)]
 
 
-def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None = None) -> str:
-    """Return every picture of one fit.
-
-    Args:
-        page: that they go to.
-        fit: with its stages.
-        population: (N, K) coefficients of others in standard deviations, or None.
-    """
+def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Group:
+    """Return every picture of one fit, as `fit_in_full` has them."""
     from shapespace.report import figures
 
-    shares = [f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)]
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
-    largest = [
-        f"{mm(float(_known(fit, stage).max(initial=0.0)))} {said}"
-        for stage, said in stages.items()
-        if stage in fit.surfaces
-    ]
-    z = fit.z
-    parts: list[Callable[[], str]] = [
-        lambda: page.figure(
-            figures.stages_figure(fit),
-            "The scan, and the model at each stage of the fit, in the frame of the final pose.",
-            alt=f"Scan and model of {fit.label} by stage; largest distance from model to scan {listed(largest)}",
-        ),
-        lambda: page.figure(
-            figures.overlay_figure(fit),
-            "Scan and model over each other, the nearer one shown: where they alternate finely, they coincide.",
-            alt=f"Scan and model of {fit.label} over each other at each stage",
-        ),
-        lambda: page.figure(
-            figures.signed_maps(fit),
-            "Signed distances both ways, positive where the scan lies outside of the model; those of a scan of points "
-            "only have no sign. Scan points beyond the model's rim are not counted.",
-            alt=f"Signed distance maps of {fit.label}, model to scan and scan to model",
-        ),
-        lambda: page.figure(
-            figures.regions_figure(fit),
-            "What the fit made of each part of the model: it followed the scan, rejected what the scan shows there, "
-            "lay at the scan's border, or was not seen.",
-            alt=f"Regions of {fit.label}: {region_shares(fit)}",
-        ),
-        lambda: page.figure(
-            figures.threshold_figure([fit]),
-            "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the vertices that the scan "
-            "shows.",
-            alt=f"Maps of {fit.label}: {listed(shares)}",
-        ),
-        lambda: page.figure(
-            figures.distance_histograms(fit),
-            "Closest distances both ways, by stage.",
-            alt=f"Histograms of closest distances of {fit.label}; largest from model to scan {listed(largest)}",
-        ),
-        lambda: page.figure(
-            figures.history_figure(fit),
-            "RMS of the closest distances that the fit itself sees, by phase.",
-            alt=f"RMS of {fit.label} falls from {mm(fit.history[0].rms_mm)} to {mm(fit.history[-1].rms_mm)} in "
-            f"{counted(len(fit.history), 'step')}"
-            if fit.history
-            else f"RMS of {fit.label}: no iteration was saved",
-            chart=True,
-        ),
-        lambda: page.figure(
-            figures.coefficients_figure(fit, population=population),
-            "Coefficients in standard deviations of the training set, with their own uncertainty. Beyond about 3 they "
-            "are rare in it.",
-            alt=f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in z[:10]),
-            chart=True,
-        ),
-    ]
-    return in_columns("".join(page.tried(part) for part in parts))
+    largest = "largest distance from model to scan " + listed(
+        [f"{mm(float(_known(fit, stage).max(initial=0.0)))} {stages[stage]}" for stage in fit.surfaces]
+    )
+    within = listed([f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)])
+    rms = [moment.rms_mm for moment in fit.history]
+    fall = f"falls from {mm(rms[0])} to {mm(rms[-1])} in {counted(len(rms), 'step')}" if rms else "was not saved"
+    alts = {
+        "stages_figure": f"Scan and model of {fit.label} by stage; {largest}",
+        "overlay_figure": f"Scan and model of {fit.label} over each other at each stage; {largest}",
+        "signed_maps": f"Signed distance maps of {fit.label}, model to scan and scan to model",
+        "regions_figure": f"Regions of {fit.label}: {region_shares(fit)}",
+        "threshold_figure": f"Maps of {fit.label}: {within}",
+        "distance_histograms": f"Histograms of closest distances of {fit.label}; {largest}",
+        "history_figure": f"RMS of {fit.label} {fall}",
+        "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
+    }
+
+    def picture(name: str, alt: str) -> Figure:
+        more = {"population": population} if name == "coefficients_figure" else {}
+        drawing = getattr(figures, name)(fit, **more)
+        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
+        return page.figure(drawing, caption, alt=alt, chart=name in ("history_figure", "coefficients_figure"))
+
+    return in_columns(
+        *(block for name, alt in alts.items() for block in page.tried(lambda name=name, alt=alt: picture(name, alt)))
+    )
+
+
+_CAPTIONS = {
+    "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
+    "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "
+    "coincide.",
+    "signed_maps": "Signed distances both ways, positive where the scan lies outside of the model; those of a scan of "
+    "points only have no sign. Scan points beyond the model's rim are not counted.",
+    "regions_figure": "What the fit made of each part of the model: it followed the scan, rejected what the scan shows "
+    "there, lay at the scan's border, or was not seen.",
+    "threshold_figure": "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the vertices "
+    "that the scan shows.",
+    "distance_histograms": "Closest distances both ways, by stage. Scan points beyond the model's rim are not counted.",
+    "history_figure": "RMS of the closest distances that the fit itself sees, by phase.",
+    "coefficients_figure": "Coefficients in standard deviations of the training set, with their own uncertainty. "
+    "Beyond about 3 they are rare in it.",
+}
+_OF_PAPER = {
+    "overlay_figure": "Paper, figures 4 to 7. ",
+    "distance_histograms": "Paper, figures 4 to 7. ",
+    "threshold_figure": "Paper, figure 11. ",
+}
 
 
 def region_shares(fit: StagedFit) -> str:
@@ -281,79 +274,34 @@ def region_shares(fit: StagedFit) -> str:
     return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
 
 
-def fit_facts(fit: SavedFit) -> str:
-    """Return status, reason and notes of one fit, and its evidence folded away."""
-    notes = [str(note) for note in as_list(fit.record.get("notes"))]
-    out = f"<p>{status(fit.status).html}: {esc(fit.reason)}</p>\n"
-    if notes:
-        out += '<ul class="soft">' + "".join(f"<li>{esc(note)}</li>" for note in notes) + "</ul>\n"
-    evidence = as_mapping(fit.record.get("evidence"))
-    if evidence:
-        rows = [(words(key), plain(value)) for key, value in evidence.items()]
-        out += folded("What the verdict goes by", facts(rows, caption=f"Evidence of {fit.name}"))
+def fit_facts(fit: SavedFit) -> list[Block]:
+    """Return status, reason, distances and notes of one fit, and its evidence folded away."""
+    out: list[Block] = [Verdict(status(fit.status), fit.reason), Text(distances_told(fit))]
+    if fit.record.notes:
+        out.append(Notes(fit.record.notes))
+    if fit.record.evidence:
+        out.append(Folded("What the verdict goes by", [facts_of(fit.record.evidence, f"Evidence of {fit.name}")]))
     return out
 
 
-# Many fits
-
-
-@dataclass(frozen=True)
-class Card:
-    """One fit in the gallery.
-
-    Args:
-        fit: what is known of it.
-        place: name of the card in the page.
-        still: its picture, or None.
-        alt: the picture in words.
-        why_none: why there is no picture.
-        detail: name of the place with all its pictures, or None.
-    """
-
-    fit: SavedFit
-    place: str
-    still: Still | None
-    alt: str = ""
-    why_none: str = ""
-    detail: str | None = None
-
-
-def gallery(page: Page, cards: Sequence[Card]) -> str:
-    """Return cards in the order given, each with picture, verdict and the reason for it."""
-
-    def card(one: Card) -> str:
-        fit = one.fit
-        picture = (
-            f'<div class="plate">{page.image(one.still.data, one.still.size, alt=one.alt)}</div>'
-            if one.still
-            else f'<p class="plate none">{esc(one.why_none)}</p>'
-        )
-        seen = fit.summary_mm("final", "scan_to_model", "mean")
-        told = f"Scan to model {mm(seen)} on average. " if math.isfinite(seen) else ""
-        more = f'<p><a href="#{esc(one.detail)}">All pictures of {esc(fit.name)}</a></p>' if one.detail else ""
-        label = fit.label if fit.label != fit.name else ""
-        return (
-            f'<li class="card" id="{esc(one.place)}">{picture}<h4>{esc(fit.name)}</h4>'
-            f"<p>{status(fit.status).html}{f' · {esc(label)}' if label else ''}</p>"
-            f'<p class="soft">{esc(told + fit.reason)}</p>{more}</li>\n'
-        )
-
-    return '<ul class="gallery">\n' + "".join(card(one) for one in cards) + "</ul>\n"
-
-
-def scale_key(page: Page, limit_mm: float) -> str:
-    """Return the key of the strips in a gallery: their colours and the scale of their maps."""
-    from shapespace.report import stills
-
-    bar = stills.colour_bar()
-    colours = page.image(bar.data, bar.size, alt="from blue over pale to red")
+def distances_told(fit: SavedFit) -> str:
+    """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
+    to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
+    shown = fit.record.shown
+    if shown is None:
+        return f"On average: the whole model to the scan {to_scan}, the scan to the model {to_model}."
+    seen, covered = shown.model_seen_share, shown.scan_covered_share
     return (
-        '<div class="key"><p>Each strip, from the left: the scan; scan (orange) and model (blue) over each other, the '
-        "nearer one shown; the distance from the model to the scan, one scale for all:</p>"
-        f'<p class="bar"><span>−{limit_mm:g} mm, scan inside</span>{colours}'
-        f"<span>+{limit_mm:g} mm, scan outside</span></p><p>Grey is what the scan does not show. Distances to a "
-        f"scan of points only have no sign: their map runs from 0 to {limit_mm:g} mm.</p></div>\n"
+        f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
+        f"{to_model}{_over(covered, 'scan')}."
     )
+
+
+def _over(share: float | None, of: str) -> str:
+    return "" if share is None else f" ({percent(share)} of the {of})"
+
+
+# Many fits
 
 
 def common_limit_mm(fits: Sequence[StagedFit]) -> float:
@@ -363,81 +311,13 @@ def common_limit_mm(fits: Sequence[StagedFit]) -> float:
     return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
 
 
-def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: str) -> str:
-    """Return a table of all fits that sorts, without the columns that would be empty.
-
-    Args:
-        fits: in the order wanted.
-        places: where in the page a fit is shown, by its name.
-        caption: of the table.
-    """
-
-    def name(fit: SavedFit) -> Cell:
-        place = places.get(fit.name)
-        return Cell(fit.name, None, f'<a href="#{esc(place)}">{esc(fit.name)}</a>' if place else None)
-
-    def steps(fit: SavedFit) -> Cell:
-        values = [int(value) for value in as_mapping(fit.record.get("iterations")).values()]
-        return number(float(sum(values)) if values else float("nan"), 0)
-
-    def seconds(fit: SavedFit) -> Cell:
-        values = [float(value) for value in as_mapping(fit.record.get("seconds")).values()]
-        return number(sum(values) if values else float("nan"), 1)
-
-    def spread(fit: SavedFit) -> Cell:
-        z = fit.record.get("z")
-        return number(float(np.sqrt(np.mean(np.square(fit.numbers("z"))))) if z else float("nan"), 1)
-
-    def counted_share(fit: SavedFit) -> Cell:
-        return number(100 * fit.summary_mm("final", "scan_to_model", "fraction"), 0)
-
-    def label(fit: SavedFit) -> Cell:
-        return Cell(fit.label if fit.label != fit.name else "")
-
-    def inner(key: str, measure: str) -> Callable[[SavedFit], Cell]:
-        def value(fit: SavedFit) -> Cell:
-            found = as_mapping(fit.entry.get(key)).get(measure)
-            return length(float("nan") if found is None else float(found))
-
-        return value
-
-    def distance(direction: str, measure: str) -> Callable[[SavedFit], Cell]:
-        return lambda fit: length(fit.summary_mm("final", direction, measure))
-
-    columns: list[tuple[Column, Callable[[SavedFit], Cell]]] = [
-        (Column("Scan"), name),
-        (Column("Label"), label),
-        (Column("Status"), lambda fit: status(fit.status)),
-        (Column("True vertex error, mean", "number"), inner("vertex_error_mm", "mean")),
-        (Column("True vertex error, max", "number"), inner("vertex_error_mm", "max")),
-        (Column("Floor of that, mean", "number"), inner("floor_mm", "mean")),
-        (Column("Expected vertex error", "number"), lambda fit: length(expected_error_mm(fit))),
-        (Column("Scan to model, mean", "number"), distance("scan_to_model", "mean")),
-        (Column("Scan to model, 95 %", "number"), distance("scan_to_model", "p95")),
-        (Column("Model to scan, mean", "number"), distance("model_to_scan", "mean")),
-        (Column("Model to scan, max", "number"), distance("model_to_scan", "max")),
-        (Column("Scan counted, %", "number"), counted_share),
-        (Column("RMS of z", "number"), spread),
-        (Column("Steps", "number"), steps),
-        (Column("Seconds", "number"), seconds),
-    ]
-    cells = [(column, [make(fit) for fit in fits]) for column, make in columns]
-    kept = [
-        (column, made)
-        for column, made in cells
-        if any(cell.text if cell.value is None else math.isfinite(cell.value) for cell in made)
-    ]
-    rows = [[made[k] for _, made in kept] for k in range(len(fits))]
-    return table([column for column, _ in kept], rows, caption=caption, sortable=len(fits) > 1)
-
-
-def usable(fits: Sequence[SavedFit], load: Callable[[SavedFit], StagedFit]) -> tuple[list[StagedFit], list[str]]:
-    """Return the fits whose stages can be read, and one sentence for each that cannot."""
-    found: list[StagedFit] = []
+def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
+    """Return what `load` gives, and one sentence for each of the items that it refuses."""
+    found: list[_To] = []
     problems: list[str] = []
-    for fit in fits:
+    for item in items:
         try:
-            found.append(load(fit))
+            found.append(load(item))
         except ShapespaceError as error:
             problems.append(str(error))
     return found, problems
@@ -450,34 +330,29 @@ def coefficients_of(fit: SavedFit) -> Coefficients:
     """Return the coefficients of one fit with its label."""
     from shapespace.report.figures import Coefficients
 
-    return Coefficients(
-        fit.name,
-        str(fit.entry.get("expression") or ""),
-        float(fit.entry.get("intensity") or 0),
-        fit.numbers("b"),
-        fit.numbers("z"),
-    )
+    entry = fit.entry
+    return Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
 
 
-def scatter(page: Page, points: Sequence[Coefficients]) -> str:
+def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
     """Return the first coefficients of many fits against each other, coloured by label."""
     from shapespace.report import figures
 
     labels = list(dict.fromkeys(point.expression for point in points if point.expression))
     coloured = f", coloured by label: {listed(labels)}" if len(labels) > 1 else ""
-    out = page.figure(
+    matrix = page.figure(
         figures.scatter_matrix(points),
         f"The first coefficients of {counted(len(points), 'fit')} against each other{coloured}.",
         alt=f"Scatter matrix of the first coefficients of {counted(len(points), 'fit')}{coloured}",
     )
-    if all(len(point.b) >= 3 for point in points):
-        out += page.tried(lambda: scatter_to_turn(page, points))
-    return out
+    if any(len(point.b) < 3 for point in points):
+        return [matrix]
+    return [matrix, *page.tried(lambda: scatter_to_turn(page, points))]
 
 
 def lines_through_neutral(
     page: Page, points: Sequence[Coefficients], neutral: Coefficients | None, *, figures_of: Sequence[str] = ("", "")
-) -> str:
+) -> Group:
     """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
 
     Args:
@@ -491,29 +366,31 @@ def lines_through_neutral(
     about = (
         "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
         "coefficients, each in its standard deviations."
+        if neutral
+        else "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
     )
-    if neutral is None:
-        about = "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
-    lines: dict[str, FloatArray | None] = {
-        "neutral_b": None if neutral is None else neutral.b,
-        "neutral_z": None if neutral is None else neutral.z,
-    }
-    pictures = page.figure(
-        figures.b_plane(points, title="Expressions in the first two coefficients", **lines),
-        f"{figures_of[0]}{about}",
-        alt=f"Scatter plot of b1 and b2 for {counted(len(points), 'face')}: each expression runs along its own line",
-        chart=True,
-    )
-    if all(len(point.b) >= 3 for point in points):
-        pictures += page.figure(
-            figures.b_space(points, title="The first three coefficients, from two sides", **lines),
-            f"{figures_of[1]}Grey lines drop to the floor of the box.",
-            alt=f"Two views of b1, b2 and b3 for {counted(len(points), 'face')} with a line for each expression",
+    through = {"neutral_b": neutral.b if neutral else None, "neutral_z": neutral.z if neutral else None}
+    faces = counted(len(points), "face")
+    pictures: list[Block] = [
+        page.figure(
+            figures.b_plane(points, title="Expressions in the first two coefficients", **through),
+            f"{figures_of[0]}{about}",
+            alt=f"Scatter plot of b1 and b2 for {faces}: each expression runs along its own line",
+            chart=True,
         )
-    return in_columns(pictures)
+    ]
+    if all(len(point.b) >= 3 for point in points):
+        pictures.append(
+            page.figure(
+                figures.b_space(points, title="The first three coefficients, from two sides", **through),
+                f"{figures_of[1]}Grey lines drop to the floor of the box.",
+                alt=f"Two views of b1, b2 and b3 for {faces} with a line for each expression",
+            )
+        )
+    return in_columns(*pictures)
 
 
-def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> str:
+def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Figure:
     """Return b1, b2 and b3 in space, as a still where nothing turns."""
     from shapespace.report import figures
     from shapespace.report.scene import pack_scatter
@@ -528,71 +405,8 @@ def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> str:
             [point.name for point in points],
             axes=[f"b{k + 1}" for k in range(first.shape[1])],
         ),
-        page.image(data, size, alt=f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
+        page.image(data, size, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
         "Coefficients of all fits in space, in mm.",
         label="Scatter of three coefficients, to be turned",
         still="The still shows the first three from two sides.",
     )
-
-
-def setting(value: object) -> str:
-    """Return a setting as text; one with parts is told by those that are plain."""
-    inner = as_mapping(value)
-    if inner:
-        return plain({key: item for key, item in inner.items() if not isinstance(item, dict | list)})
-    return plain(value)
-
-
-# Scores
-
-
-SCORE_WORDS: Mapping[str, str] = {
-    "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
-    "line_r2_free": "R² of the best line anywhere, of the scatter about the mean (a smaller whole, so it may be lower)",
-    "line_sign_consistency": "Share of faces on the same side of neutral",
-    "line_spearman": "Rank correlation of position on the line with intensity",
-    "line_permutation_p": "Its permutation p-value",
-    "disjointness": "All expressions",
-    "leave_one_out_accuracy": "Leave-one-out accuracy of the nearest mean direction",
-    "chance": "Accuracy of guessing",
-    "cosine_silhouette": "Silhouette of the directions (−1 to 1)",
-    "separability": "Between-class over within-class scatter",
-    "accuracy_p": "Permutation p-value of the accuracy",
-    "silhouette_p": "Permutation p-value of the silhouette",
-    "left_out": "Faces left out because their fit is not trusted",
-}
-
-
-def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> str:
-    """Return scores as tables: those given for each of several things as one, single values as another.
-
-    Args:
-        scores: name -> value, or name -> {thing: value}.
-        many: caption of the first.
-        single: caption of the second.
-    """
-
-    def said(key: str) -> str:
-        return SCORE_WORDS.get(key, words(key))
-
-    by_thing = {key: as_mapping(value) for key, value in scores.items() if key.startswith("line_")}
-    out = ""
-    if by_thing:
-        names = list(dict.fromkeys(str(name) for value in by_thing.values() for name in value))
-        rows = [[Cell(said(key)), *(Cell(score(value.get(name))) for name in names)] for key, value in by_thing.items()]
-        out += table([Column("Score"), *(Column(name, "number") for name in names)], rows, caption=many)
-    rest: list[list[Cell]] = []
-    for key, value in scores.items():
-        if key in by_thing:
-            continue
-        inner = as_mapping(value)
-        pairs = inner.items() if inner else [(key, value)]
-        rest += [[Cell(said(str(name))), Cell(score(item))] for name, item in pairs]
-    if rest:
-        out += table([Column("Score"), Column("Value", "number")], rest, caption=single)
-    return out or paragraph("There are no scores.")
-
-
-def score(value: object) -> str:
-    """Return a score with three decimals, as they are compared with each other."""
-    return f"{value:.3f}" if isinstance(value, float) and abs(value) < 10 else plain(value)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from shapespace import __version__
 from shapespace.errors import InputError
 from shapespace.recognise import evaluate
+from shapespace.schemas import Recognition
 from shapespace.types import FloatArray
 
 Part = dict[str, Any]
@@ -149,10 +150,10 @@ def document(
     settings: Mapping[str, Any],
     model_hashes: Sequence[str],
 ) -> dict[str, Any]:
-    """Return the whole of recognition.json."""
-    return {
-        "format": "shapespace recognition",
-        "format_version": 1,
+    """Return the whole of recognition.json, checked as the report will."""
+    whole = {
+        "format": Recognition.FORMAT,
+        "format_version": Recognition.VERSION,
         "version": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "title": title,
@@ -163,3 +164,5 @@ def document(
         "versions": {name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
         "model_hashes": list(model_hashes),
     }
+    Recognition.from_json(whole)
+    return whole

@@ -151,12 +151,11 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
 
 
 def _picture(upload: Upload) -> None:
-    from shapespace.report.saved import Folder, SavedFit, find_fits, staged_fit
+    from shapespace.report.saved import Folder, find_fits, staged_fit
 
     folder = Folder(upload.folder)
     (found,) = find_fits(folder)
-    saved = SavedFit({**found.entry, "name": upload.shown}, found.record)
-    (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, saved)))
+    (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, found.with_entry(name=upload.shown))))
 
 
 def packed(staged: StagedFit) -> bytes:

@@ -7,14 +7,15 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.errors import FileError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
 from shapespace.report.scene import pack_model
+from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
@@ -22,7 +23,6 @@ MODEL_BYTES = 48 * 2**20
 """Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
-_SHOWN = ("shown", "shown_scan_mm")
 _FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
 
 
@@ -68,10 +68,8 @@ class Shown:
         folder = Folder(path)
         fits = find_fits(folder)
         found = model_of(folder, fits, model)
-        sources = [
-            cast(Mapping[str, Any], fit.record["model"]) for fit in fits if isinstance(fit.record.get("model"), dict)
-        ]
-        return Shown(found, model.name if model else str(sources[0].get("name")), path)
+        name = next(fit.record.model.name for fit in fits if fit.record.model.hash)
+        return Shown(found, model.name if model else name, path)
 
     def packed_model(self) -> tuple[bytes, int]:
         """Return the model for the page, and how many of its modes that holds."""
@@ -135,7 +133,7 @@ class Shown:
             KeyError: there is no such fit.
         """
         assert self.folder is not None
-        return self.folder.mesh(self.fits()[name].entry.get("fitted"))
+        return self.folder.mesh(self.fits()[name].entry.fitted)
 
     def _packed_fit(self, name: str) -> bytes:
         assert self.folder is not None
@@ -145,8 +143,7 @@ class Shown:
         return packed(staged_fit(self.folder, fit))
 
     def _ours(self, fit: SavedFit) -> bool:
-        source: object = fit.record.get("model")
-        return isinstance(source, dict) and (cast(Mapping[str, Any], source).get("hash") == self.model.content_hash)
+        return fit.record.model.hash == self.model.content_hash
 
     def _row(self, fit: SavedFit) -> dict[str, Any]:
         pictured, why = fit.pictured, ""
@@ -161,21 +158,18 @@ class Shown:
             "reason": self.told(_by_name(fit)),
             "pictured": pictured,
             "why_not": why,
-            "fitted": "fitted" in fit.entry and fit.status not in ("failed", "unreadable"),
+            "fitted": fit.entry.fitted is not None and fit.fitted,
             "z": None,
-            **dict.fromkeys(_SHOWN),
         }
-        directions = {"model_to_scan_mm": "model_to_scan", "scan_to_model_mm": "scan_to_model"}
-        row |= dict.fromkeys((*directions, "expected_error_mm"))
-        try:
-            row |= {key: _number(fit.summary_mm("final", direction, "mean")) for key, direction in directions.items()}
-            row["expected_error_mm"] = _expected_error_mm(fit)
-            row |= {key: _shown(fit.record[key]) for key in _SHOWN if key in fit.record}
-            if self._ours(fit) and "z" in fit.record:
-                row["z"] = _rounded(fit.numbers("z"))
-        except (ShapespaceError, KeyError, TypeError, ValueError):
-            reason = f"The record of {fit.name} is damaged; fit the scan again."
-            row |= {"status": "unreadable", "reason": reason, "pictured": False}
+        row |= {
+            "shown": to_json(fit.record.shown),
+            "shown_scan_mm": to_json(fit.record.shown_scan_mm),
+            "model_to_scan_mm": _number(fit.summary_mm("final", "model_to_scan", "mean")),
+            "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
+            "expected_error_mm": _number(fit.expected_error_mm),
+        }
+        if self._ours(fit) and fit.record.z:
+            row["z"] = _rounded(fit.record.z)
         return row
 
 
@@ -196,29 +190,11 @@ def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
 
 def _by_name(fit: SavedFit) -> str:
     """Return the reason of `fit` with its scan's name in place of an absolute path, which may hold spaces."""
-    scan: object = fit.record.get("scan")
-    name = str(cast(Mapping[str, Any], scan).get("name") or "") if isinstance(scan, dict) else ""
+    name = fit.record.scan.name
     if not name:
         return fit.reason
     path = re.compile(rf"(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/][^\n]*?[\\/]{re.escape(name)}")
     return path.sub(lambda _: name, fit.reason)
-
-
-def _expected_error_mm(fit: SavedFit) -> float | None:
-    evidence: object = fit.record.get("evidence")
-    value = cast(Mapping[str, Any], evidence).get("expected_error_mm") if isinstance(evidence, dict) else None
-    return _optional(value)
-
-
-def _shown(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the page says of distances over what scan and model both show."""
-    shares = {key: _optional(told[key]) for key in ("model_seen_share", "scan_covered_share")}
-    ways = ("model_to_scan", "scan_to_model")
-    return {way: {key: _optional(told[way][key]) for key in ("mean", "p95")} for way in ways} | shares
-
-
-def _optional(value: Any) -> float | None:
-    return None if value is None else _number(float(value))
 
 
 def _rank(status: str) -> int:

@@ -11,6 +11,7 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
+from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_3d, scatter_matrix
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit import (
     THRESHOLDS_MM,
@@ -24,27 +25,16 @@ from shapespace.report.figures.fit import (
     threshold_figure,
 )
 from shapespace.report.figures.many import (
-    Coefficients,
     Entry,
     aligned_grid,
-    b_plane,
-    b_space,
     distance_maps,
     error_curves,
     faces_grid,
     gallery,
     portrait_figure,
-    scatter_3d,
-    scatter_matrix,
     worst_first,
 )
-from shapespace.report.figures.model import (
-    mean_figure,
-    mode_animation,
-    modes_figure,
-    quality_figure,
-    spectrum_figure,
-)
+from shapespace.report.figures.model import mean_figure, mode_animation, modes_figure, quality_figure, spectrum_figure
 from shapespace.report.figures.recognition import (
     calibration_figure,
     confusion_figure,

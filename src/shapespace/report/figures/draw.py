@@ -25,6 +25,9 @@ from PIL import Image as PillowImage
 from shapespace.errors import InputError
 from shapespace.report.colours import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
+from shapespace.report.wording import counted as counted
+from shapespace.report.wording import mm as mm
+from shapespace.report.wording import percent as percent
 from shapespace.types import FloatArray, Mesh
 
 if TYPE_CHECKING:
@@ -188,6 +191,19 @@ def grid(
     if note:
         y += 4 + write(_EDGE, note, total_w - 2 * _EDGE, SMALL, color=GREY)
     total_h = int(np.ceil(y + 6))
+    figure = _drawn(pictures, texts, total_w, total_h)
+    if scale is not None:
+        _colour_bar(figure, scale, bar_at, total_w, total_h)
+    return figure
+
+
+def _drawn(
+    pictures: Sequence[tuple[int, float, Image, Colour | None]],
+    texts: Sequence[tuple[float, float, str, dict[str, Any]]],
+    total_w: int,
+    total_h: int,
+) -> Figure:
+    """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
     figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image, frame in pictures:
         high, wide = image.shape[:2]
@@ -202,8 +218,6 @@ def grid(
                 spine.set(color=frame, linewidth=2.2)
     for x, top, text, style in texts:
         figure.text(x / total_w, 1 - top / total_h, escaped(text), **style)
-    if scale is not None:
-        _colour_bar(figure, scale, bar_at, total_w, total_h)
     return figure
 
 
@@ -445,29 +459,6 @@ def short(text: str, most: int = 28) -> str:
 def in_rows(items: Sequence[_Item], columns: int) -> list[list[_Item]]:
     """Cut `items` into rows of at most `columns`."""
     return [list(items[k : k + columns]) for k in range(0, len(items), columns)]
-
-
-def mm(value: float) -> str:
-    """Return a length with three or so digits and its unit."""
-    if not np.isfinite(value):
-        return "–"
-    size = abs(value)
-    digits = 0 if size >= 99.95 else 1 if size >= 9.995 else 2
-    return f"{value:.{digits}f} mm".replace("-", "−")
-
-
-def percent(share: float) -> str:
-    """Return a percentage that says 100 only when it is all, and 0 only when it is none."""
-    if share in (0.0, 1.0):
-        return f"{100 * share:.0f} %"
-    if share < 0.01:
-        return f"{max(100 * share, 0.1):.1f} %"
-    return f"{min(100 * share, 99.9):.1f} %" if share > 0.99 else f"{100 * share:.0f} %"
-
-
-def counted(number: int, word: str) -> str:
-    """Return `1 shape` or `60 shapes`."""
-    return f"{number:,} {word}" + ("" if number == 1 else "s")
 
 
 def scan_over(mesh: Mesh) -> Layer:

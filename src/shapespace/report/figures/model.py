@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
-from shapespace.errors import InputError
+from shapespace.errors import FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.colours import CLAY, SEQUENTIAL
 from shapespace.report.figures.draw import (
@@ -35,6 +34,7 @@ from shapespace.report.figures.draw import (
 )
 from shapespace.report.render import Camera, Image, Layer, render, render_layers
 from shapespace.report.staged import nice_ceiling
+from shapespace.schemas import Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
 
 SHARES = (0.90, 0.95, 0.98, 0.99)
@@ -267,7 +267,7 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
     return finish(figure)
 
 
-def quality_figure(quality: Mapping[str, Any], *, title: str = "") -> Figure:
+def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") -> Figure:
     """Draw compactness, generalisation and specificity, those of them that are there, over the number of modes.
 
     Args:
@@ -278,7 +278,13 @@ def quality_figure(quality: Mapping[str, Any], *, title: str = "") -> Figure:
     Raises:
         InputError: none of the three is there, or one is no such list.
     """
-    parts = {key: _measured(key, quality[key]) for key in _QUALITY if quality.get(key) is not None}
+    if not isinstance(quality, Quality):
+        try:
+            quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
+        except FileFormatError as error:
+            raise InputError(str(error)) from error
+    measures = {key: getattr(quality, key) for key in _QUALITY}
+    parts = {key: _measured(key, value) for key, value in measures.items() if value is not None}
     if not parts:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
     most = int(max(modes.max() for modes, _, _ in parts.values()))
@@ -302,23 +308,12 @@ def quality_figure(quality: Mapping[str, Any], *, title: str = "") -> Figure:
     return finish(figure, h_pad=1.2)
 
 
-def _measured(key: str, value: object) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    try:
-        if isinstance(value, Mapping):
-            inner = cast(Mapping[str, Any], value)
-            mean = np.asarray(inner["mean"], dtype=np.float64)
-            modes = np.asarray(inner.get("modes", np.arange(1, len(mean) + 1)), dtype=np.float64)
-            spread = None if inner.get("stddev") is None else np.asarray(inner["stddev"], dtype=np.float64)
-        else:
-            mean = np.asarray(value, dtype=np.float64)
-            modes, spread = np.arange(1.0, len(mean) + 1), None
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.") from error
-    if (
-        mean.ndim != 1
-        or not len(mean)
-        or modes.shape != mean.shape
-        or (spread is not None and spread.shape != mean.shape)
-    ):
+def _measured(key: str, value: Measured | tuple[float, ...]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return numbers of modes, the measure for each, and its standard deviation where it is known, (n,) each."""
+    measured = value if isinstance(value, Measured) else Measured(mean=value)
+    mean = np.array(measured.mean)
+    modes = np.arange(1.0, len(mean) + 1) if measured.modes is None else np.array(measured.modes)
+    spread = None if measured.stddev is None else np.array(measured.stddev)
+    if not len(mean) or modes.shape != mean.shape or (spread is not None and spread.shape != mean.shape):
         raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
     return modes, mean, spread

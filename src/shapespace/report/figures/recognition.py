@@ -162,23 +162,7 @@ def calibration_figure(
     Raises:
         InputError: lists of different lengths, no answer in any bin, or shares that are not within 0 to 1.
     """
-    many = _numbers(count, "the counts of a calibration", finite=False)
-    known = np.nan_to_num(many) > 0
-    parts: list[FloatArray] = []
-    for name, values in (("low", low), ("high", high), ("confidence", confidence), ("accuracy", accuracy)):
-        found = _numbers(values, f"the {name} of a calibration", finite=False)
-        if found.shape != many.shape:
-            raise InputError(f"The bins of a calibration have {len(many)} counts but {len(found)} numbers for {name}.")
-        found = found[known]
-        if name in ("low", "high"):
-            found = np.clip(found, 0, 1)
-        if not ((found >= 0) & (found <= 1)).all():
-            raise InputError(f"The {name} of a calibration must lie within 0 to 1.")
-        parts.append(100 * found)
-    many = many[known]
-    if not len(many):
-        raise InputError("There is nothing to draw of a calibration without answers.")
-    start, end, stated, right = parts
+    (start, end, stated, right), many = _bins(low, high, confidence, accuracy, count)
     said = "How often answers are right, against the probability stated for them"
     if ece is not None:
         said = f"Stated probabilities are off by {100 * ece:.1f} points on average"
@@ -204,6 +188,29 @@ def calibration_figure(
     below.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
     below.locator_params(axis="y", nbins=3, integer=True)
     return finish(figure, h_pad=0.8)
+
+
+def _bins(
+    low: npt.ArrayLike, high: npt.ArrayLike, confidence: npt.ArrayLike, accuracy: npt.ArrayLike, count: npt.ArrayLike
+) -> tuple[list[FloatArray], FloatArray]:
+    """Return the first four in percent, and the counts, of bins with an answer."""
+    many = _numbers(count, "the counts of a calibration", finite=False)
+    known = np.nan_to_num(many) > 0
+    parts: list[FloatArray] = []
+    for name, values in (("low", low), ("high", high), ("confidence", confidence), ("accuracy", accuracy)):
+        found = _numbers(values, f"the {name} of a calibration", finite=False)
+        if found.shape != many.shape:
+            raise InputError(f"The bins of a calibration have {len(many)} counts but {len(found)} numbers for {name}.")
+        found = found[known]
+        if name in ("low", "high"):
+            found = np.clip(found, 0, 1)
+        if not ((found >= 0) & (found <= 1)).all():
+            raise InputError(f"The {name} of a calibration must lie within 0 to 1.")
+        parts.append(100 * found)
+    many = many[known]
+    if not len(many):
+        raise InputError("There is nothing to draw of a calibration without answers.")
+    return parts, many
 
 
 def learning_curve_figure(
@@ -351,12 +358,11 @@ def face_map_figure(
     if ranked:
         panels.append(np.full_like(panels[0], 255))
         captions.append("share of each region")
-    said = "Where on the face the decision lies"
-    if ranked and ranked[0][1] > 0:
-        said = f"The region that carries most of the decision: {ranked[0][0]}, {percent(ranked[0][1])}"
+    most = ranked[0] if ranked and ranked[0][1] > 0 else None
+    said = f"The region that carries most of the decision: {most[0]}, {percent(most[1])}" if most else ""
     figure = grid(
         [Row(panels, captions)],
-        title=title or said,
+        title=title or said or "Where on the face the decision lies",
         scale=Scale(unit, SEQUENTIAL, low, high, "high" if known.max() > high else "neither"),
         note="Grey: no value." if len(known) < len(scalars) else "",
     )

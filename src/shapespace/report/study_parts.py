@@ -1,0 +1,308 @@
+"""Each kind of part of a recognition.json as blocks of a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.report import sections
+from shapespace.report.blocks import Block, Cell, Column, Figure, Folded, Notice, Table, Text, length
+from shapespace.report.page import Page
+from shapespace.report.saved import Folder
+from shapespace.report.wording import DASH, counted, listed, percent
+from shapespace.schemas import (
+    PARTS,
+    STUDY_AGAIN,
+    CalibrationPart,
+    ConfusionPart,
+    CurvePart,
+    FaceMapPart,
+    LearningCurvePart,
+    LinesPart,
+    MeshesPart,
+    ModesPart,
+    Part,
+    Point,
+    Still,
+    TableColumn,
+    TablePart,
+    TextPart,
+    read,
+)
+from shapespace.types import Mesh
+
+if TYPE_CHECKING:
+    from shapespace.report.figures import Coefficients
+
+FILE = "recognition.json"
+
+MOST_ROWS, MOST_PARAGRAPH = 500, 2000
+_MOST_COLUMNS = 30
+TITLES = {
+    "table": "Table",
+    "confusion": "Confusion matrix",
+    "calibration": "Calibration",
+    "learning_curve": "Learning curve",
+    "modes": "Modes that carry the decision",
+    "face_map": "Regions of the face that carry the decision",
+    "lines": "Lines through neutral",
+    "meshes": "Meshes",
+    "curve": "Curve",
+    "text": "Notes",
+}
+"""Of parts without one, by kind."""
+Drawn = tuple[Any, str, str]
+"""A drawing, its caption where the part has no note, and what is seen in it."""
+
+
+class StudyParts:
+    """What turns parts into blocks of a page.
+
+    Args:
+        page: that they go to.
+        folder: with the arrays and meshes that they name.
+    """
+
+    def __init__(self, page: Page, folder: Folder) -> None:
+        self.page = page
+        self.folder = folder
+
+    def blocks(self, part: Part, title: str) -> list[Block]:
+        """Return a part by its kind.
+
+        Raises:
+            ShapespaceError: it cannot be shown.
+        """
+        return _MAKERS[type(part)](self, part, title, part.note or "")
+
+    def drawn(self, drawing: Drawn, note: str, *, chart: bool = True) -> Figure:
+        """Return a drawing with its caption, or the part's note in its place."""
+        figure, about, alt = drawing
+        return self.page.figure(figure, note or about, alt=alt, chart=chart)
+
+    def text(self, part: TextPart, title: str, note: str) -> list[Block]:
+        """Return paragraphs."""
+        return [*paragraphs(part.text), *([Text(note, "soft")] if note else [])]
+
+    def table(self, part: TablePart, title: str, note: str) -> list[Block]:
+        """Return a table that sorts."""
+        if not 1 <= len(part.columns) <= _MOST_COLUMNS:
+            raise wrong(f"a table has {len(part.columns)} columns, not 1 to {_MOST_COLUMNS}")
+        if any(len(row) != len(part.columns) for row in part.rows):
+            raise wrong(f"a row of a table has another number of cells than its {len(part.columns)} columns")
+        heads = [
+            Column(
+                f"{column.name} (mm)"
+                if column.kind == "mm" and "mm" not in column.name.strip("()").split()
+                else column.name,
+                "text" if column.kind == "text" else "number",
+            )
+            for column in part.columns
+        ]
+        cells = [
+            [_cell(value, column) for value, column in zip(row, part.columns, strict=True)]
+            for row in part.rows[:MOST_ROWS]
+        ]
+        out: list[Block] = [Table(heads, cells, note or title, sortable=len(cells) > 1)]
+        if len(part.rows) > MOST_ROWS:
+            out.append(Text(f"{counted(len(part.rows) - MOST_ROWS, 'other row')} are left out."))
+        return out
+
+    def confusion(self, part: ConfusionPart, title: str, note: str) -> list[Block]:
+        """Return a confusion matrix as a picture, and folded away as a table."""
+        from shapespace.report import figures
+
+        classes = part.classes
+        if {len(row) for row in part.counts} - {len(classes)}:
+            raise wrong(f"a confusion matrix of {len(classes)} classes has rows of another length")
+        figure = figures.confusion_figure(part.counts, classes)
+        totals = [sum(row) for row in part.counts]
+        right = [f"{name} {percent(part.counts[k][k] / totals[k])}" for k, name in enumerate(classes) if totals[k]]
+        about = (
+            "Rows: the true class. Columns: the predicted class. Percent of the row, and below it how many; an empty "
+            "cell is none. Framed: right answers."
+        )
+        alt = f"Confusion matrix of {counted(len(classes), 'class', 'classes')}; right answers: {listed(right, 40)}"
+        rows = [
+            [name, *(f"{value:g} ({percent(value / total)})" if total else DASH for value in row)]
+            for name, row, total in zip(classes, part.counts, totals, strict=True)
+        ]
+        heads = [Column("True class"), *(Column(f"predicted {name}", "number") for name in classes)]
+        table = Table(heads, [list(map(Cell, row)) for row in rows], f"Confusion matrix: {title}")
+        picture = self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)
+        return [picture, Folded("The same as a table", [table])]
+
+    def calibration(self, part: CalibrationPart, title: str, note: str) -> list[Block]:
+        """Return how well stated probabilities hold."""
+        from shapespace.report import figures
+
+        low, high, confidence, accuracy, count = (
+            np.array(
+                [(one.low, one.high, one.confidence, one.accuracy, one.count) for one in part.bins], dtype=np.float64
+            )
+            .reshape(-1, 5)
+            .T
+        )
+        figure = figures.calibration_figure(low, high, confidence, accuracy, count, ece=part.ece, brier=part.brier)
+        told = [
+            f"stated {percent(c)}, right {percent(a)}"
+            for c, a, n in zip(confidence, accuracy, count, strict=True)
+            if n > 0
+        ]
+        said = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
+        about = (
+            "How often answers are right, against the probability stated for them: under the dashed line they are "
+            "right less often than stated. Larger dots stand for more answers, which the bars count."
+        )
+        alt = f"Calibration: {listed(told, 20)}{said}"
+        return [self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)]
+
+    def learning_curve(self, part: LearningCurvePart, title: str, note: str) -> list[Block]:
+        """Return the accuracy against how many people were learned from."""
+        from shapespace.report import figures
+
+        low, high = (None if ends is None else np.array(ends, dtype=np.float64) for ends in (part.low, part.high))
+        figure = figures.learning_curve_figure(
+            part.subjects, part.mean, low=low, high=high, band=part.band or "interval", ceiling=part.ceiling
+        )
+        told = [
+            f"{100 * mean:.1f} % from {count:g} people" for count, mean in zip(part.subjects, part.mean, strict=True)
+        ]
+        said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
+        about = "Share of right answers on people who were not learned from, against how many were."
+        return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
+
+    def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
+        """Return how much each mode carries of the decision."""
+        from shapespace.report import figures
+
+        values, unit = part.importance, part.unit
+        figure = figures.importance_figure(values, part.names, unit=unit)
+        called = part.names or [f"mode {k + 1}" for k in range(len(values))]
+        ranked = sorted(zip(values, called, strict=True), key=lambda pair: -pair[0])
+        told = listed([f"{name} {value:.3g}" for value, name in ranked[:10]])
+        alt = f"Importance of {counted(len(values), 'mode')} in {unit}, the largest: {told}"
+        return [self.drawn((figure, f"How much each mode carries of the decision, in {unit}.", alt), note)]
+
+    def face_map(self, part: FaceMapPart, title: str, note: str) -> list[Block]:
+        """Return where on the face the decision lies, and the share of each region."""
+        from shapespace.report import figures
+
+        arrays = self.folder.arrays(part.arrays)
+        names = (part.vertices, part.faces, part.values)
+        absent = [name for name in names if name not in arrays]
+        if absent:
+            raise FileFormatError(f"{part.arrays} holds no array {absent[0]!r}; {STUDY_AGAIN}.")
+        vertices, faces, values = (arrays[name] for name in names)
+        numbers = all(array.dtype.kind in "iuf" for array in (vertices, values))
+        if not numbers or faces.dtype.kind not in "iu" or vertices.ndim != 2 or not np.isfinite(vertices).all():
+            raise wrong("the arrays of a map are no places, triangles and numbers")
+        shares = sorted(part.regions.items(), key=lambda item: -item[1])
+        figure = figures.face_map_figure(vertices.astype(float), faces, values, unit=part.unit, regions=dict(shares))
+        told = listed([f"{name} {percent(share)}" for name, share in shares], 30)
+        alt = f"The face from the front and from aside, coloured by {part.unit}{f'; by region: {told}' if told else ''}"
+        out: list[Block] = [
+            self.drawn((figure, f"Where on the face the decision lies: {part.unit}.", alt), note, chart=False)
+        ]
+        if shares:
+            rows = [[Cell(name), Cell(f"{100 * share:.1f} %", share)] for name, share in shares[:MOST_ROWS]]
+            heads = [Column("Region"), Column("Share of the decision", "number")]
+            out.append(Folded("The shares as a table", [Table(heads, rows, title)]))
+        return out
+
+    def lines(self, part: LinesPart, title: str, note: str) -> list[Block]:
+        """Return the lines of the expressions in the first coefficients (figures 9 and 10 of the paper)."""
+        points = list(map(_coefficients, part.points))
+        neutral = _coefficients(part.neutral) if part.neutral else None
+        if not points or len({len(point.b) for point in (*points, *([neutral] if neutral else []))}) != 1:
+            raise wrong("the points of lines must be one or more, all with as many coefficients as the neutral face")
+        lines = sections.lines_through_neutral(self.page, points, neutral)
+        return [*([Text(note)] if note else []), lines]
+
+    def meshes(self, part: MeshesPart, title: str, note: str) -> list[Block]:
+        """Return stills of meshes in rows; one that cannot be read leaves a grey field and says why."""
+        from shapespace.report import figures
+
+        problems: list[str] = []
+
+        def mesh(entry: Still) -> Mesh | None:
+            try:
+                found = self.folder.mesh(entry.file)
+                if not len(found.vertices) or not np.isfinite(found.vertices).all():
+                    raise wrong(f"the mesh {entry.file!r} has no vertices, or some that are not finite")
+                return found
+            except ShapespaceError as error:
+                problems.append(f"{entry.label}: {error}")
+                return None
+
+        rows = [(row.label, [(entry.label, mesh(entry)) for entry in row.meshes]) for row in part.rows]
+        if problems and len(problems) == sum(len(pictures) for _, pictures in rows):
+            return [Notice("None of these meshes can be shown", problems, "broken")]
+        told = [f"{heading}: {listed([label for label, _ in pictures])}" for heading, pictures in rows]
+        drawing = (
+            figures.mesh_rows_figure(rows, title=title),
+            "One camera, one light and one scale for all.",
+            "; ".join(told)[:MOST_PARAGRAPH] or title,
+        )
+        return [self.drawn(drawing, note, chart=False), Notice("Not in the picture", problems, "broken")]
+
+    def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
+        """Return one measure against another."""
+        from shapespace.report import figures
+
+        x, y = part.x or "x", part.y or "y"
+        figure = figures.curve_figure([(one.label, one.x, one.y) for one in part.series], x=x, y=y)
+        told = [
+            f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
+            for one in part.series
+        ]
+        about = f"{y[:1].upper()}{y[1:]} against {x}."
+        return [self.drawn((figure, about, f"{about} {listed(told)}"), note)]
+
+
+_MAKERS: Mapping[type[Part], Callable[[StudyParts, Any, str, str], list[Block]]] = {
+    kind: getattr(StudyParts, name) for name, kind in PARTS.items()
+}
+
+
+def wrong(what: str) -> FileFormatError:
+    """Return the error that says `what` is wrong with the file."""
+    return FileFormatError(f"{FILE} is damaged: {what}; {STUDY_AGAIN}.")
+
+
+def paragraphs(said: str | tuple[str, ...]) -> list[Block]:
+    """Return sentences as paragraphs."""
+    return [Text(text) for text in ((said,) if isinstance(said, str) else said)[:MOST_ROWS]]
+
+
+def _coefficients(point: Point) -> Coefficients:
+    from shapespace.report.figures import Coefficients
+
+    if len(point.b) != len(point.z):
+        raise wrong(f"a point of lines has {len(point.b)} coefficients in mm but {len(point.z)} in standard deviations")
+    return Coefficients(point.label, point.expression, point.intensity or 0.0, np.array(point.b), np.array(point.z))
+
+
+def _cell(value: object, column: TableColumn) -> Cell:
+    """Return a cell of a table by the kind of its column."""
+    where = f"{FILE}: the column {column.name!r}"
+    if column.kind == "text":
+        return Cell(DASH if value in (None, "") else str(value))
+    if value is None:
+        return Cell(DASH, float("nan"))
+    if column.kind == "interval":
+        low, high = read(tuple[float, float], value, where, STUDY_AGAIN)
+        return Cell(f"{100 * low:.1f} to {100 * high:.1f} %", low)
+    found = read(float, value, where, STUDY_AGAIN)
+    if column.kind == "mm":
+        return length(found)
+    told = {
+        "percent": f"{100 * found:.1f} %",
+        "p": "< 0.001" if found < 0.001 else f"{found:.3f}",
+        "count": f"{found:,.0f}",
+        "number": f"{found:,.0f}" if abs(found) >= 1000 else f"{found:.3g}",
+    }
+    return Cell(told[column.kind], found)

@@ -1,0 +1,90 @@
+"""Numbers, counts and settings as people write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from math import isfinite
+from typing import Any, cast
+
+STATUS_WORDS: Mapping[str, str] = {
+    "converged": "converged",
+    "max_iterations": "stopped at the limit",
+    "doubtful": "doubtful",
+    "failed": "failed",
+    "unreadable": "unreadable",
+}
+"""What each status is called, the best first."""
+
+DASH = "–"
+
+
+def anchor(text: str) -> str:
+    """Return `text` as the name of a place in the page: letters, digits and hyphens only."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "part"
+
+
+def counted(count: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun, such as `1 scan` or `3 scans`."""
+    return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def listed(items: Sequence[str], most: int = 12) -> str:
+    """Return items with commas, the last after `and`; beyond `most` the rest is counted."""
+    if len(items) > most:
+        return f"{', '.join(items[:most])} and {len(items) - most} more"
+    return " and ".join(filter(None, (", ".join(items[:-1]), *items[-1:])))
+
+
+def mm(value: float) -> str:
+    """Return a length with three or so digits and its unit."""
+    if not isfinite(value):
+        return DASH
+    digits = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{value:.{digits}f} mm".replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """Return a percentage that says 100 only when it is all, and 0 only when it is none."""
+    if not isfinite(share):
+        return DASH
+    if 0.0 < share < 0.01:
+        return f"{max(100 * share, 0.1):.1f} %"
+    return f"{min(100 * share, 99.9):.1f} %" if 0.99 < share < 1.0 else f"{100 * share:.0f} %"
+
+
+def plain(value: object) -> str:
+    """Return a setting or a score as text, numbers with three digits or so."""
+    if value is None:
+        return DASH
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return DASH if not isfinite(value) else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    if isinstance(value, list):
+        return ", ".join(map(plain, cast(list[object], value))) or "none"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{words(key)} {plain(item)}" for key, item in cast(Mapping[str, object], value).items())
+    return str(value)
+
+
+def setting(value: object) -> str:
+    """Return a setting as text; one with parts is told by those that are plain."""
+    if isinstance(value, Mapping):
+        inner = cast(Mapping[str, Any], value)
+        return plain({key: item for key, item in inner.items() if not isinstance(item, dict | list)})
+    return plain(value)
+
+
+def moment(value: str) -> str:
+    """Return an ISO time stamp as people write it, or the text as it is."""
+    try:
+        return datetime.fromisoformat(value).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    except (ValueError, OverflowError):
+        return value
+
+
+def words(key: str) -> str:
+    """Return the name of a setting as words."""
+    return key.replace("_", " ")

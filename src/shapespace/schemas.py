@@ -1,0 +1,547 @@
+"""What the result files hold, for writers and readers: NAME.fit.json, demo.json, recognition.json, quality.json.
+
+Each file is a frozen `Struct`: what a dataclass is, made in a tenth of the time, checked by msgspec. `to_json` turns
+one into plain JSON; `from_json`, or `read` for a part of a file, checks what was found and says in one sentence what is
+wrong with it. Keys that a version does not know are passed over, so that what later versions add can be read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, TypeVar, cast
+
+import msgspec
+from msgspec import Struct
+
+from shapespace.errors import FileFormatError
+
+Status = Literal["converged", "max_iterations", "doubtful", "failed"]
+FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
+_T = TypeVar("_T")
+
+
+def read(kind: type[_T], content: object, where: str, again: str) -> _T:
+    """Return JSON content as an object of `kind`, a class of this module or a plain type.
+
+    Args:
+        kind: what it is to be.
+        content: as `json.loads` gives it.
+        where: the file, or the part of it, for the sentence.
+        again: what a reader can do about it.
+
+    Raises:
+        FileFormatError: it is something else.
+    """
+    try:
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError as error:
+        said = str(error).replace("`", "").replace("$.", "").replace("Object missing", "missing")
+        raise FileFormatError(f"{where} is damaged: {said[:1].lower()}{said[1:]}; {again}.") from error
+
+
+def to_json(content: object) -> Any:
+    """Return a class of this module, or anything made of plain values, as JSON has it.
+
+    Numbers that are not finite become null, and numbers of numpy plain ones.
+    """
+    return _finite(msgspec.to_builtins(content, enc_hook=lambda value: value.item()))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in cast(dict[Any, Any], value).items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in cast(Sequence[Any], value)]
+    return value
+
+
+def check_format(content: object, kind: type[FitRecord] | type[Recognition], where: str, again: str) -> None:
+    """Refuse what is not a file of the format of `kind` and its version; a file without a version is of the first.
+
+    Raises:
+        FileFormatError: it is not.
+    """
+    known: Mapping[str, Any] = cast(dict[str, Any], content) if isinstance(content, dict) else {}
+    if known.get("format") != kind.FORMAT:
+        raise FileFormatError(f"{where} is not {kind.CALLED} ({kind.FORMAT!r}); {again}.")
+    found = known.get("format_version", 1)
+    if found != kind.VERSION:
+        raise FileFormatError(
+            f"{where} has the format version {str(found)[:40]}, of which this version of shapespace knows only "
+            f"{kind.VERSION}; update shapespace, or {again}."
+        )
+
+
+# NAME.fit.json
+
+
+class File(Struct, frozen=True, kw_only=True):
+    """A file that took part: its name, the SHA-256 of its content, and where it was, empty where that is not known."""
+
+    name: str = ""
+    hash: str = ""
+    path: str = ""
+
+
+class Distances(Struct, frozen=True, kw_only=True):
+    """Closest distances in mm, None where there is none, how many they are and which share of the points counted."""
+
+    mean: float | None = None
+    median: float | None = None
+    rms: float | None = None
+    p95: float | None = None
+    max: float | None = None
+    count: int | None = None
+    fraction: float | None = None
+
+
+class BothWays(Struct, frozen=True, kw_only=True):
+    """Distances from the model's vertices to the scan, and from the scan's points to the model."""
+
+    model_to_scan: Distances = Distances()
+    scan_to_model: Distances = Distances()
+
+
+class ShownDistances(BothWays, frozen=True, kw_only=True):
+    """Distances over what the scan shows.
+
+    Args:
+        model_seen_share: share of the model's vertices that the scan shows, 0 to 1.
+        scan_covered_share: share of the scan's points that lie within the model, 0 to 1.
+    """
+
+    model_seen_share: float | None = None
+    scan_covered_share: float | None = None
+
+
+class Pose(Struct, frozen=True, kw_only=True):
+    """A similarity x -> scale · rotation · x + translation."""
+
+    scale: float
+    rotation: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    translation: tuple[float, float, float]
+
+
+class Iteration(Struct, frozen=True, kw_only=True):
+    """One step of a fit; lengths in mm."""
+
+    phase: int
+    iteration: int
+    rms_mm: float | None = None
+    motion_mm: float | None = None
+    scale: float | None = None
+
+
+class FitRecord(Struct, frozen=True, kw_only=True):
+    """A NAME.fit.json.
+
+    Args:
+        status: the verdict; `unreadable` stands in place of a record that cannot be read, and in no file.
+        reason: one sentence on why.
+        scan: that was fitted,
+        model: by which,
+        landmarks: and the landmarks it started from.
+        T_scan_model: pose, in the scan's own frame and unit; None for a scan that could not be fitted, as are the rest.
+        b: (K,) coefficients in mm,
+        z: and in standard deviations.
+        b_stddev: (K,) mm.
+        shrinkage: (K,) in [0, 1].
+        distances_mm: by stage, over the whole model and every scan point within its rim.
+        size_mm: root mean square distance of the fitted surface's vertices from their middle.
+        shown: distances of the final stage over what the scan shows, in mm of the model's frame; None, as the next
+            three are, in records of earlier versions.
+        shown_scan_mm: the same in mm of the scan.
+        shown_dense: of the dense surface, where there is one,
+        shown_dense_scan_mm: and in mm of the scan.
+    """
+
+    CALLED: ClassVar = "the record of a fit"
+    FORMAT: ClassVar = "shapespace fit"
+    VERSION: ClassVar = 1
+
+    format: str = FORMAT
+    format_version: int = VERSION
+    status: Status | Literal["unreadable"]
+    reason: str = ""
+    scan: File = File()
+    model: File = File()
+    landmarks: File | None = None
+    method: str = ""
+    config: Mapping[str, Any] = {}
+    start: str | None = None
+    notes: tuple[str, ...] = ()
+    T_scan_model: Pose | None = None
+    mm_per_scan_unit: float | None = None
+    size_mm: float | None = None
+    b: tuple[float, ...] = ()
+    z: tuple[float, ...] = ()
+    b_stddev: tuple[float, ...] = ()
+    b_stddev_calibrated: bool = False
+    shrinkage: tuple[float, ...] = ()
+    evidence: Mapping[str, Any] = {}
+    distances_mm: Mapping[str, BothWays] = {}
+    shown: ShownDistances | None = None
+    shown_scan_mm: ShownDistances | None = None
+    shown_dense: ShownDistances | None = None
+    shown_dense_scan_mm: ShownDistances | None = None
+    history: tuple[Iteration, ...] = ()
+    iterations: Mapping[str, int] = {}
+    seconds: Mapping[str, float] = {}
+    version: str = ""
+
+    @staticmethod
+    def from_json(content: object, where: str, again: str = FIT_AGAIN) -> FitRecord:
+        """Return a record, checked.
+
+        Raises:
+            FileFormatError: it is no record of a fit, of another version, or damaged.
+        """
+        check_format(content, FitRecord, where, again)
+        return read(FitRecord, content, where, again)
+
+
+# demo.json
+
+
+class VertexErrors(Struct, frozen=True, kw_only=True):
+    """Distances between vertices that correspond, mm."""
+
+    mean: float
+    rms: float
+    max: float
+
+
+class FitEntry(Struct, frozen=True, kw_only=True):
+    """One fit beside its record: what was fitted, and the files it left, relative to the folder of the results.
+
+    Args:
+        intensity: of the expression, 0 to 1; None where it is not known.
+        subject: whom the scan shows; empty where that is not known.
+        json: the record.
+        vertex_error_mm: to the truth, where it is known,
+        floor_mm: and of the model's best reconstruction of it.
+    """
+
+    name: str
+    expression: str = ""
+    intensity: float | None = None
+    subject: str = ""
+    status: str = ""
+    reason: str = ""
+    scan: str | None = None
+    json: str | None = None
+    stages: str | None = None
+    fitted: str | None = None
+    dense: str | None = None
+    vertex_error_mm: VertexErrors | None = None
+    floor_mm: VertexErrors | None = None
+
+
+class Example(Struct, frozen=True, kw_only=True):
+    """A mesh of the training set, kept to be shown."""
+
+    file: str
+    label: str = ""
+
+
+class DemoModel(Struct, frozen=True, kw_only=True):
+    """The model of an experiment."""
+
+    title: str = ""
+    model: str = ""
+    model_hash: str = ""
+    n_training: int | None = None
+    n_modes: int | None = None
+    modes_for_98_5: int | None = None
+    cumulative_variance: tuple[float, ...] = ()
+
+
+class ExpressionsOfOne(DemoModel, frozen=True, kw_only=True):
+    """Experiment 1: a model of one person's expressions, fitted to unseen ones.
+
+    Args:
+        population_z: (N, K) coefficients of the training set in standard deviations.
+        scores: of recognition, by name.
+    """
+
+    folder: str = ""
+    training_examples: tuple[Example, ...] = ()
+    population_z: tuple[tuple[float, ...], ...] = ()
+    fits: tuple[FitEntry, ...] = ()
+    scores: Mapping[str, Any] = {}
+
+
+class Case(DemoModel, frozen=True, kw_only=True):
+    """One scan of experiment 2, fitted by a model of other people."""
+
+    short: str = ""
+    simulated: bool = False
+    note: str = ""
+    fit: FitEntry
+
+
+class ManyPeople(Struct, frozen=True, kw_only=True):
+    """Experiment 2: models of many people, fitted to scans of somebody else."""
+
+    folder: str = ""
+    cases: tuple[Case, ...] = ()
+
+
+class Claim(Struct, frozen=True, kw_only=True):
+    """What the paper states of a quantity, what the demo measured, the true error, and why they differ."""
+
+    quantity: str
+    paper: str
+    measured: str
+    truth: str | None = None
+    why: str | None = None
+
+
+class Demo(Struct, frozen=True, kw_only=True):
+    """A demo.json; times in seconds."""
+
+    version: str = ""
+    quick: bool = False
+    created: str = ""
+    machine: str = ""
+    versions: Mapping[str, str] = {}
+    seed: int | None = None
+    settings: Mapping[str, Any] = {}
+    seconds: Mapping[str, float] = {}
+    experiment1: ExpressionsOfOne = ExpressionsOfOne()
+    experiment2: ManyPeople = ManyPeople()
+    paper_table: tuple[Claim, ...] = ()
+
+
+# quality.json
+
+
+class Measured(Struct, frozen=True, kw_only=True):
+    """A measure by the number of modes; without `modes`, of 1, 2, 3 and so on."""
+
+    mean: tuple[float, ...]
+    modes: tuple[float, ...] | None = None
+    stddev: tuple[float, ...] | None = None
+
+
+class Quality(Struct, frozen=True, kw_only=True):
+    """A quality.json: shares of the variance (0 to 1), and errors in mm, those that were measured."""
+
+    compactness: tuple[float, ...] | Measured | None = None
+    generalisation: tuple[float, ...] | Measured | None = None
+    specificity: tuple[float, ...] | Measured | None = None
+
+
+# recognition.json
+
+
+class Target(Struct, frozen=True, kw_only=True):
+    """What a study aimed at, and what it reached; `met` is None where there is no verdict."""
+
+    what: str = ""
+    target: str = ""
+    reached: str = ""
+    met: bool | None = None
+    note: str | None = ""
+
+
+class Part(Struct, frozen=True, kw_only=True):
+    """What each part of a study has; one of `level` 2 begins a chapter."""
+
+    kind: str
+    title: str | None = ""
+    note: str | None = ""
+    level: int | None = None
+
+
+class TextPart(Part, frozen=True, kw_only=True):
+    """Paragraphs."""
+
+    text: str | tuple[str, ...]
+
+
+class TableColumn(Struct, frozen=True, kw_only=True):
+    """A column of a table; shares are 0 to 1, an interval is two of them."""
+
+    name: str = ""
+    kind: Literal["text", "percent", "interval", "number", "mm", "p", "count"] = "text"
+
+
+class TablePart(Part, frozen=True, kw_only=True):
+    """A table, its cells by the kinds of their columns; null where nothing is known."""
+
+    columns: tuple[TableColumn, ...]
+    rows: tuple[tuple[Any, ...], ...]
+
+
+class ConfusionPart(Part, frozen=True, kw_only=True):
+    """How many scans of each true class (rows) were taken for each class (columns)."""
+
+    classes: tuple[str, ...]
+    counts: tuple[tuple[float, ...], ...]
+
+
+class Bin(Struct, frozen=True, kw_only=True):
+    """Answers that state a probability from `low` to `high`: the mean of it, the share that is right, how many."""
+
+    low: float
+    high: float
+    confidence: float | None = None
+    accuracy: float | None = None
+    count: float = 0
+
+
+class CalibrationPart(Part, frozen=True, kw_only=True):
+    """How often answers are right against the probability stated."""
+
+    bins: tuple[Bin, ...]
+    ece: float | None = None
+    brier: float | None = None
+
+
+class LearningCurvePart(Part, frozen=True, kw_only=True):
+    """Accuracy against the number of people learned from; `band` says what `low` and `high` are."""
+
+    subjects: tuple[float, ...]
+    mean: tuple[float, ...]
+    low: tuple[float | None, ...] | None = None
+    high: tuple[float | None, ...] | None = None
+    band: str | None = None
+    ceiling: float | None = None
+
+
+class ModesPart(Part, frozen=True, kw_only=True):
+    """How much each mode carries of the decision, in `unit`."""
+
+    importance: tuple[float, ...]
+    names: tuple[str, ...] = ()
+    unit: str = "importance"
+
+
+class FaceMapPart(Part, frozen=True, kw_only=True):
+    """A surface in an .npz file with a value a vertex, and the share of each region."""
+
+    arrays: str
+    vertices: str = "vertices"
+    faces: str = "faces"
+    values: str = "values"
+    unit: str = "share of the decision"
+    regions: Mapping[str, float] = {}
+
+
+class Point(Struct, frozen=True, kw_only=True):
+    """Coefficients of one scan, in mm and in standard deviations."""
+
+    b: tuple[float, ...]
+    z: tuple[float, ...]
+    label: str = ""
+    expression: str = ""
+    intensity: float | None = None
+
+
+class LinesPart(Part, frozen=True, kw_only=True):
+    """Expressions as lines through the neutral face."""
+
+    points: tuple[Point, ...]
+    neutral: Point | None = None
+
+
+class Still(Struct, frozen=True, kw_only=True):
+    """A mesh in a file."""
+
+    file: str
+    label: str = ""
+
+
+class RowOfMeshes(Struct, frozen=True, kw_only=True):
+    """Meshes that stand beside each other."""
+
+    meshes: tuple[Still, ...]
+    label: str = ""
+
+
+class MeshesPart(Part, frozen=True, kw_only=True):
+    """Stills of meshes in rows."""
+
+    rows: tuple[RowOfMeshes, ...]
+
+
+class Series(Struct, frozen=True, kw_only=True):
+    """One line of a curve."""
+
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    label: str = ""
+
+
+class CurvePart(Part, frozen=True, kw_only=True):
+    """One measure against another; `x` and `y` say what they are."""
+
+    series: tuple[Series, ...]
+    x: str = "x"
+    y: str = "y"
+
+
+PARTS: Mapping[str, type[Part]] = {
+    "text": TextPart,
+    "table": TablePart,
+    "confusion": ConfusionPart,
+    "calibration": CalibrationPart,
+    "learning_curve": LearningCurvePart,
+    "modes": ModesPart,
+    "face_map": FaceMapPart,
+    "lines": LinesPart,
+    "meshes": MeshesPart,
+    "curve": CurvePart,
+}
+"""What a part is, by its kind."""
+
+
+def read_part(content: object, where: str, again: str = STUDY_AGAIN) -> Part:
+    """Return one part of a study by its kind.
+
+    Raises:
+        FileFormatError: it is damaged, or of a kind that this version does not know.
+    """
+    kind = read(Part, content, where, again).kind
+    if kind not in PARTS:
+        raise FileFormatError(
+            f"{where} is damaged: it has a part of the kind {kind[:80]!r}, which this version does not know; {again}."
+        )
+    return read(PARTS[kind], content, where, again)
+
+
+class Recognition(Struct, frozen=True, kw_only=True):
+    """A recognition.json; `parts` are read one by one with `read_part`, so that one that is damaged costs no other."""
+
+    CALLED: ClassVar = "the result of a study of recognition"
+    FORMAT: ClassVar = "shapespace recognition"
+    VERSION: ClassVar = 1
+
+    format: str = FORMAT
+    format_version: int = VERSION
+    version: str = ""
+    created: str = ""
+    title: str = ""
+    summary: str | tuple[str, ...] = ()
+    targets: tuple[Target, ...] = ()
+    parts: tuple[Any, ...] = ()
+    settings: Mapping[str, Any] = {}
+    versions: Mapping[str, Any] = {}
+    model_hashes: tuple[str, ...] = ()
+
+    @staticmethod
+    def from_json(content: object, where: str = "recognition.json", again: str = STUDY_AGAIN) -> Recognition:
+        """Return a study, with all of its parts checked.
+
+        Raises:
+            FileFormatError: it is no study of recognition, of another version, or damaged.
+        """
+        check_format(content, Recognition, where, again)
+        study = read(Recognition, content, where, again)
+        for part in study.parts:
+            read_part(part, where, again)
+        return study
