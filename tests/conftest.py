@@ -1,10 +1,17 @@
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-# Tests leave nothing in the user's cache; those of what is kept there name a folder of their own.
-os.environ["SHAPESPACE_KEEP"] = "no"
+
+@pytest.fixture(scope="session", autouse=True)
+def kept(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Iterator[None]:
+    """A folder for what is kept between runs, one for all workers of pytest-xdist and none of the user's."""
+    folder = tmp_path_factory.getbasetemp()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHAPESPACE_KEEP", str((folder if worker_id == "master" else folder.parent) / "kept"))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -115,6 +115,8 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty current folder, without open data unless a test names them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(webbrowser, "open", lambda _: True)
+    # The meshes need not be split for so many, which takes four times as long as all the rest of a scan.
+    monkeypatch.setattr("shapespace.datasets.simulated_scan.PLAIN_TRIANGLES", 16_000)
     for name in ("SHAPESPACE_DATA", "SHAPESPACE_DATA_URL"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "cache"))

@@ -84,6 +84,13 @@ def test_it_can_be_switched_off(folder: Path, monkeypatch: pytest.MonkeyPatch, w
     assert kept.recall("x") is None and [file.stem for file in folder.iterdir()] == ["x"]
 
 
+def test_it_can_stand_in_another_folder(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SHAPESPACE_KEEP", str(tmp_path / "elsewhere"))
+    kept.keep("x", ARRAYS)
+    assert equal(kept.recall("x")) and [file.name for file in (tmp_path / "elsewhere").iterdir()] == ["x.kept"]
+    assert not folder.exists()
+
+
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path / "file"))

@@ -17,6 +17,8 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity
 
+pytestmark = pytest.mark.xdist_group("recovery")  # what it needs is made once
+
 FACTORS = np.random.default_rng(11).uniform(-1.2, 1.2, (4, 5))
 
 
@@ -74,9 +76,9 @@ def ict_model(shared_data: Path) -> ShapeModel:
     return ShapeModel.fit([faces.mesh(c) for c in faces.draw_people(60, seed=0)], modes=15, gauge="form")
 
 
-@pytest.mark.parametrize("person", range(2))
+@pytest.mark.parametrize(("person", "measured_mm"), [(0, 2.15), (1, 1.86)])
 def test_an_unseen_ict_face_is_recovered_from_a_scan_with_holes(
-    ict_model: ShapeModel, shared_data: Path, person: int
+    ict_model: ShapeModel, shared_data: Path, person: int, measured_mm: float
 ) -> None:
     rng = np.random.default_rng(person)
     faces = load_ict(shared_data / "ict-facekit")
@@ -88,5 +90,6 @@ def test_an_unseen_ict_face_is_recovered_from_a_scan_with_holes(
     error, floor = errors_mm(ict_model, result, scan.truth_vertices)
     mean_error = np.linalg.norm(result.surface(ict_model, "before").vertices - scan.truth_vertices, axis=1).mean()
     assert error < 0.5 * mean_error
-    assert error < floor + 2.5
+    # The floors are 1.77 and 1.73 mm.
+    assert floor < error < 1.05 * measured_mm
     assert result.distances.model_to_scan.mean < 1.5

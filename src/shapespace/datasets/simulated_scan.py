@@ -21,6 +21,10 @@ from shapespace.geometry.surface import faces_of, vertex_normals
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
 
 
+PLAIN_TRIANGLES = 20_000
+"""Of a plain scan."""
+
+
 @dataclass(frozen=True, eq=False)
 class Hole:
     """A ball cut out of the scan.
@@ -172,11 +176,11 @@ def simulate_scan(
 
 
 def plain_scan(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return `mesh` as a scanner would give it: 20,000 other triangles, any pose, 0.2 mm of noise, two small holes."""
+    """Return `mesh` as a scanner would give it: with `PLAIN_TRIANGLES`, in any pose, 0.2 mm of noise, two holes."""
     return simulate_scan(
         mesh,
         rng,
-        triangles=20_000,
+        triangles=PLAIN_TRIANGLES,
         T_scan_model=random_similarity(rng, max_angle_deg=180.0),
         holes=(Hole(8.0), Hole(5.0)),
         split=False,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.fit.method import Ended, Method
-from shapespace.fit.posterior import new_shapes
 from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
@@ -30,6 +29,8 @@ def verdict(method: Method, ended: Ended) -> tuple[Status, str]:
 
 def doubts_of_returned(ended: Ended) -> list[str]:
     """Return how pose, coefficients and surface contradict each other; none where they agree."""
+    from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
+
     model, fitted, found = ended.model, ended.fitted, list[str]()
     z = np.abs(fitted.b) / np.sqrt(new_shapes(model)[: len(fitted.b)])
     worst = int(z.argmax())

@@ -34,9 +34,10 @@ def cache_folder() -> Path:
 
 
 def _file(name: str) -> Path | None:
-    if os.environ.get("SHAPESPACE_KEEP", "").lower() in _OFF:
+    word = os.environ.get("SHAPESPACE_KEEP", "")
+    if word.lower() in _OFF:
         return None
-    return cache_folder() / _FOLDER / f"{name}.kept"
+    return (Path(word) if word else cache_folder() / _FOLDER) / f"{name}.kept"
 
 
 def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
