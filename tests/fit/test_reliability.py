@@ -15,7 +15,7 @@ from synthetic_shapes import blob_model, training_meshes
 
 EVIDENCE: Mapping[str, float] = {
     "posterior_error_mm": 0.5, "size_mm": 80.0, "spread_mm": 0.4, "model_spread_mm": 6.0, "model_lack_mm": 0.5,
-    "scan_allowed_share": 0.95, "z2": 1.0, "layered_share": 0.0,
+    "z2": 1.0, "layered_share": 0.0,
 }  # fmt: skip
 
 
@@ -23,7 +23,7 @@ EVIDENCE: Mapping[str, float] = {
     ("name", "worse"),
     [
         ("posterior_error_mm", 2.0), ("spread_mm", 2.0), ("model_spread_mm", 0.02), ("model_lack_mm", 3.0),
-        ("scan_allowed_share", 0.3), ("z2", 9.0), ("layered_share", 0.3),
+        ("z2", 9.0), ("layered_share", 0.3),
     ],
 )  # fmt: skip
 def test_worse_evidence_never_makes_the_expected_error_smaller(name: str, worse: float) -> None:
@@ -42,7 +42,7 @@ def test_the_interval_holds_the_expected_error_and_every_figure_is_free_of_units
 
 
 def test_evidence_of_nothing_at_all_still_gives_figures() -> None:
-    worst = {**EVIDENCE, "posterior_error_mm": 1e9, "spread_mm": 1e6, "scan_allowed_share": 0.0, "z2": 1e12}
+    worst = {**EVIDENCE, "posterior_error_mm": 1e9, "spread_mm": 1e6, "z2": 1e12}
     assert reliability(worst).expected_error_mm == worst["size_mm"]
     best = dict.fromkeys(EVIDENCE, 0.0) | {"size_mm": 80.0}
     assert np.isfinite(astuple(reliability(best))).all()
