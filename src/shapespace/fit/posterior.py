@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from shapespace.fit.moving_model import POSE, small_poses
 from shapespace.geometry.surface import rms_size
+from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
 
@@ -28,8 +29,6 @@ _HALF = 0.5
 _LEADING = 10
 _NEAR = 0.05
 """A match counts at half weight; so many modes lead; near is this share of the model's size."""
-_FEWEST_SHAPES = 10
-_ALL_KEPT = 1e-6
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 _NOISE_TEMPERATURE = 1.7
@@ -102,39 +101,10 @@ def posterior(fit: JointFit, T_scan_model: Similarity, b: FloatArray, beyond_mod
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
 
-    Modes are chosen to fit the training shapes, so their variances there say too little of others: far too little for
-    the last of N - 1 modes of N shapes. Nonlinear shrinkage estimates it from the spectrum alone (Ledoit and Wolf,
-    Annals of Statistics 48(5), 2020, section 4.5 for more coordinates than shapes). Never below the model's own, which
-    are taken as they are where they were found on shapes left out.
+    Those of the model are taken as they are where they were found on shapes left out.
     """
-    own, n = model.stddev**2, model.n_training
-    left = model.total_variance - float(own.sum())
-    rest = n - 1 - model.n_modes
-    if n < _FEWEST_SHAPES or model.held_out:
-        return own
-    spectrum = own
-    if rest > 0 and left > _ALL_KEPT * model.total_variance:
-        spectrum = np.concatenate([own, np.full(rest, left / rest)])
-    c = len(spectrum) / (n - 1)
-    density, transform = _smoothed(spectrum, n)
-    if c < 1:
-        shrunk = spectrum / ((np.pi * c * spectrum * density) ** 2 + (1 - c - np.pi * c * spectrum * transform) ** 2)
-    else:
-        shrunk = 1.0 / (np.pi**2 * spectrum * (density**2 + transform**2))
-    return np.maximum(own, shrunk[: len(own)])
-
-
-def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return the density (D,) of the eigenvalues and its Hilbert transform (D,), by an Epanechnikov kernel."""
-    width = n ** (-1.0 / 3.0) * spectrum
-    x = (spectrum[:, None] - spectrum) / width
-    root = np.sqrt(5.0)
-    near = np.maximum(1.0 - x**2 / 5.0, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curved = np.nan_to_num((1.0 - x**2 / 5.0) * np.log(np.abs((root - x) / (root + x))))
-    density = (0.75 / root * near / width).mean(axis=1)
-    transform = ((-0.3 * x + 0.75 / root * curved) / np.pi / width).mean(axis=1)
-    return density, transform
+    own = model.stddev**2
+    return own if model.held_out else variances_of_new_shapes(own, model.total_variance, model.n_training)
 
 
 def temperature(fit: JointFit, matches: float, beyond_model_mm: float, patches: float) -> float:
