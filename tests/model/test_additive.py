@@ -8,6 +8,7 @@ import pytest
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.posterior import variance_of_new_shapes
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel, still_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
@@ -264,10 +265,11 @@ def test_what_identity_leaves_outside_its_modes_becomes_local_modes_of_identity(
     neutral = [world.face(a, np.zeros(EXPRESSIONS)) for a in rng.standard_normal((20, 4))]
 
     def left_over(model: AdditiveModel) -> float:
-        found = [model.shape.reconstruct(model.shape.project(mesh)) - mesh.vertices for mesh in neutral]
-        return float((np.stack(found) ** 2).mean())
+        found = [model.shape.reconstruct(model.shape.project(mesh)) for mesh in neutral]
+        pairs = [(fit_similarity(x, mesh.vertices, with_scale=False).apply(x), mesh) for x, mesh in zip(found, neutral)]
+        return float(np.mean([((x - mesh.vertices) ** 2).mean() for x, mesh in pairs]))
 
-    assert left_over(whole) < 0.5 * left_over(lacking)
+    assert left_over(whole) < 0.8 * left_over(lacking)
     assert (whole.shape.stddev**2).sum() <= whole.shape.total_variance * (1 + 1e-9)
 
 
