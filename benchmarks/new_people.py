@@ -1,7 +1,7 @@
 """Compare rules for how much new people vary along the modes of a few: the likelihood of people who took no part.
 
 Each figure is what a normal distribution with a rule's variances loses in log-likelihood, in nats a new person over all
-modes that hold 0.99999 of the variance, against one with the true variances along the same modes; the mean of the seeds.
+modes that hold 0.99999 of the variance, against one with the true variances along them; the mean of the seeds.
 The last column is what is left outside the modes by those left out, over what new people have there.
 """
 
@@ -66,7 +66,7 @@ def compare(draw: Draw, people: int, seed: int) -> tuple[list[float], float]:
     _, size, rows = np.linalg.svd(shapes - mean, full_matrices=False)
     spectrum = size**2 / (len(shapes) - 1)
     k = min(modes_for_variance(spectrum, SHARE), len(shapes) - 1)
-    sample, total = spectrum[:k], float(spectrum.sum())
+    sample, total, whole = spectrum[:k], float(spectrum.sum()), spectrum[spectrum > 1e-10 * spectrum[0]]
     along = (others - mean) @ rows[:k].T
     true = (along**2).mean(axis=0)
     outside = float(((others - mean) ** 2).sum(axis=1).mean() - true.sum())
@@ -80,8 +80,8 @@ def compare(draw: Draw, people: int, seed: int) -> tuple[list[float], float]:
         sample,
         floor,
         isotonic_regression(alone / len(shapes), increasing=False).x,
-        variances_of_new_shapes(sample, total, len(shapes)),
-        variances_of_new_shapes(sample, total, len(shapes), held),
+        variances_of_new_shapes(whole, total, len(shapes))[:k],
+        variances_of_new_shapes(whole, total, len(shapes), held),
     )
     lost = [float((0.5 * (true / v - 1 - np.log(true / v))).sum()) for v in found]
     return lost, held.left_mm2 / outside if outside > 1e-4 * total else float("nan")

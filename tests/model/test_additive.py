@@ -266,7 +266,10 @@ def test_what_identity_leaves_outside_its_modes_becomes_local_modes_of_identity(
 
     def left_over(model: AdditiveModel) -> float:
         found = [model.shape.reconstruct(model.shape.project(mesh)) for mesh in neutral]
-        pairs = [(fit_similarity(x, mesh.vertices, with_scale=False).apply(x), mesh) for x, mesh in zip(found, neutral)]
+        pairs = [
+            (fit_similarity(x, mesh.vertices, with_scale=False).apply(x), mesh)
+            for x, mesh in zip(found, neutral, strict=True)
+        ]
         return float(np.mean([((x - mesh.vertices) ** 2).mean() for x, mesh in pairs]))
 
     assert left_over(whole) < 0.8 * left_over(lacking)

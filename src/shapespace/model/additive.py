@@ -24,7 +24,7 @@ from shapespace.io.hdf5 import read_hdf5, write_hdf5
 from shapespace.model import model_file
 from shapespace.model.held_out import held_out_shapes
 from shapespace.model.local_modes import local_modes
-from shapespace.model.new_shapes import variances_of_new_shapes
+from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
@@ -159,12 +159,12 @@ class AdditiveModel:
         gram = moved @ moved.T
         B, sample = _modes_through_zero(moved, gram, expression_modes)
         whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
-        a_held = held_out_shapes(centred @ centred.T, whose[0], len(identity.variance), centred=True)
+        a_gram = centred @ centred.T
+        a_held = held_out_shapes(a_gram, whose[0], len(identity.variance), centred=True)
         e_held = held_out_shapes(gram, whose[1], len(sample), centred=False)
-        a_variance = variances_of_new_shapes(identity.variance, identity.total_variance, len(neutrals), a_held)
+        a_variance = _of_new_people(a_gram / (len(neutrals) - 1), len(neutrals), a_held)
         # Modes through zero are one more than those through a mean.
-        e_total = float(np.trace(gram)) / len(gram)
-        e_variance = variances_of_new_shapes(sample, e_total, len(gram) + 1, e_held)
+        e_variance = _of_new_people(gram / len(gram), len(gram) + 1, e_held)
         if local_identity_modes is None:
             local_identity_modes = 0 if isinstance(identity_modes, int) else _LOCAL_MODES
         L, l_variance = local_modes(identity.mean.reshape(-1, 3), A, a_variance, a_held.left_mm2, local_identity_modes)
@@ -376,6 +376,13 @@ def _modes_through_zero(
     modes = data.T @ (vectors / np.sqrt(values * len(data)))
     modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(kept)])
     return modes, values
+
+
+def _of_new_people(gram: FloatArray, n_shapes: int, held_out: HeldOut) -> FloatArray:
+    """Return variances (K,) of people who took no part in the modes, by the whole spectrum of `gram` (N, N)."""
+    spectrum = eigh(gram, eigvals_only=True)[::-1]
+    spectrum = spectrum[spectrum > _NO_VARIANCE * spectrum[0]]
+    return variances_of_new_shapes(spectrum, float(spectrum.sum()), n_shapes, held_out)
 
 
 def _as_shape_model(A: FloatArray, B: FloatArray) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:

@@ -17,7 +17,7 @@ _FIELD_SHARE = 0.999
 _MOST_PRODUCTS = 600
 _BLOCK = 250
 _RANGE_SHARE = 0.6
-_FAINT = 1e-6
+_FAINT = 1e-7
 """Of the variance of the modes; local modes with less are not worth their time."""
 _ROOM = 4
 """Local modes are at most one in so many of the coordinates, so that they cannot make everything."""

@@ -47,15 +47,17 @@ class HeldOut:
 def variances_of_new_shapes(
     sample: FloatArray, total: float, n_shapes: int, held_out: HeldOut | None = None
 ) -> FloatArray:
-    """Return the variances (K,), mm^2, that new shapes have along the modes of a sample, in falling order.
+    """Return the variances (K,), mm^2, that new shapes have along the first modes of a sample, in falling order.
 
     Args:
-        sample: (K,) variances in the sample, above 0, in falling order, divisor `n_shapes` - 1.
+        sample: variances in the sample, above 0, in falling order, divisor `n_shapes` - 1; of all modes where they are
+            known, since the rest is otherwise taken to be spread evenly.
         total: of all modes of the sample, kept or not, mm^2.
         n_shapes: number of shapes in it.
-        held_out: what shapes left out have along the same number of modes; None where only the spectrum is known.
+        held_out: what shapes left out have along K modes; None where only the spectrum is known: K is then all of it.
     """
-    variance = _shrunk(_whole_spectrum(sample, total, n_shapes), n_shapes)[: len(sample)]
+    count = len(sample) if held_out is None else len(held_out.squares)
+    variance = _shrunk(_whole_spectrum(sample, total, n_shapes), n_shapes)[:count]
     if held_out is not None:
         variance = variance * np.exp(_log_factor(variance, held_out))
     return np.asarray(isotonic_regression(variance, increasing=False).x)
