@@ -23,6 +23,8 @@ _WIDTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations tried for the constant part of the log factor; wavier parts have less."""
 _STEPS, _STILL, _LONGEST = 60, 1e-7, 1.0
 _ALL_KEPT = 1e-6
+_BOUNDS = (1e-2, 1e4)
+_FARTHEST = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,10 @@ def variances_of_new_shapes(
         held_out: what shapes left out have along K modes; None where only the spectrum is known: K is then all of it.
     """
     count = len(sample) if held_out is None else len(held_out.squares)
-    variance = _shrunk(_whole_spectrum(sample, total, n_shapes), n_shapes)[:count]
+    spectrum = _whole_spectrum(sample, total, n_shapes)
+    # Where shapes are not independent a single mode can be foretold absurdly, which its neighbours then correct.
+    bounded = np.clip(_shrunk(spectrum, n_shapes) / spectrum, *_BOUNDS) * spectrum
+    variance = np.exp(isotonic_regression(np.log(bounded[:count]), increasing=False).x)
     if held_out is not None:
         variance = variance * np.exp(_log_factor(variance, held_out))
     return np.asarray(isotonic_regression(variance, increasing=False).x)
@@ -105,14 +110,14 @@ def _at_width(waves: FloatArray, weight: FloatArray, ratio: FloatArray, width: f
     prior = np.arange(1.0, waves.shape[1] + 1.0) ** 4 / width**2
     c = np.zeros(waves.shape[1])
     for _ in range(_STEPS):
-        pull = weight * ratio * np.exp(-waves @ c)
+        pull = weight * ratio * np.exp(np.clip(-waves @ c, -_FARTHEST, _FARTHEST))
         hessian = (waves.T * pull) @ waves + np.diag(prior)
         step = np.linalg.solve(hessian, waves.T @ (pull - weight) - prior * c)
         longest = float(np.abs(step).max())
         c = c + step * min(1.0, _LONGEST / max(longest, _STILL))
         if longest < _STILL:
             break
-    pull = weight * ratio * np.exp(-waves @ c)
+    pull = weight * ratio * np.exp(np.clip(-waves @ c, -_FARTHEST, _FARTHEST))
     hessian = (waves.T * pull) @ waves + np.diag(prior)
     cost = pull.sum() + weight @ waves @ c + 0.5 * prior @ c**2
     return float(-cost + 0.5 * np.log(prior).sum() - 0.5 * np.linalg.slogdet(hessian)[1]), c
