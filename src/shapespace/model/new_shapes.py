@@ -98,7 +98,7 @@ def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
 def _log_factor(variance: FloatArray, held_out: HeldOut) -> FloatArray:
     """Return the log factor (K,) at the likeliest width: a normal prior on Legendre polynomials of the rank."""
     k = len(variance)
-    waves = legvander(np.linspace(-1.0, 1.0, k), min(_DEGREE, k - 1))
+    waves: FloatArray = np.asarray(legvander(np.linspace(-1.0, 1.0, k), min(_DEGREE, k - 1)), dtype=np.float64)
     weight = 0.5 * held_out.groups * held_out.seen
     ratio = held_out.squares / np.maximum(held_out.seen * held_out.shapes, 1.0) / variance
     found = [_at_width(waves, weight, ratio, width) for width in _WIDTHS]
