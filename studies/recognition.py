@@ -23,8 +23,8 @@ from tqdm import tqdm
 
 from shape_space_tables import shape_space_parts
 from shape_spaces import ShapeSpaces, prepare, stages
+from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.workers import cores
-from shapespace.commands import telling_of_compiling
 from shapespace.errors import ShapespaceError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.report.html import require_report_extra, write_report

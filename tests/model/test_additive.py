@@ -8,6 +8,7 @@ import pytest
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.posterior import variance_of_new_shapes
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel, still_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
@@ -238,7 +239,7 @@ def crowd(world: World) -> tuple[list[Mesh], list[str], list[bool]]:
     return meshes, subjects, neutral
 
 
-def test_of_many_people_the_file_says_that_variances_are_of_those_left_out(
+def test_the_file_says_that_variances_are_of_those_left_out(
     model: AdditiveModel, crowd: tuple[list[Mesh], list[str], list[bool]], tmp_path: Path
 ) -> None:
     many = AdditiveModel.fit(*crowd, gauge="form", identity_modes=4, expression_modes=2)
@@ -246,7 +247,33 @@ def test_of_many_people_the_file_says_that_variances_are_of_those_left_out(
     read = ShapeModel.load(tmp_path / "m.h5")
     assert read.held_out and read.content_hash == many.shape.content_hash
     assert np.array_equal(variance_of_new_shapes(read), read.stddev**2)
-    assert not model.shape.held_out and not ShapeModel.fit(training_meshes(vertices=300)).held_out
+    assert model.shape.held_out and not ShapeModel.fit(training_meshes(vertices=300)).held_out
+
+
+def test_what_identity_leaves_outside_its_modes_becomes_local_modes_of_identity(
+    crowd: tuple[list[Mesh], list[str], list[bool]], world: World
+) -> None:
+    few = 12  # meshes, of six people, whose modes leave much of the four of the world
+    part = tuple(values[:few] for values in crowd)
+    lacking, whole = (
+        AdditiveModel.fit(*part, gauge="form", identity_modes=2, expression_modes=2, local_identity_modes=most)
+        for most in (0, 40)
+    )
+    assert lacking.n_identity == 2 and 2 < whole.n_identity <= 42
+    assert lacking.n_expression == whole.n_expression == 2
+    rng = np.random.default_rng(4)
+    neutral = [world.face(a, np.zeros(EXPRESSIONS)) for a in rng.standard_normal((20, 4))]
+
+    def left_over(model: AdditiveModel) -> float:
+        found = [model.shape.reconstruct(model.shape.project(mesh)) for mesh in neutral]
+        pairs = [
+            (fit_similarity(x, mesh.vertices, with_scale=False).apply(x), mesh)
+            for x, mesh in zip(found, neutral, strict=True)
+        ]
+        return float(np.mean([((x - mesh.vertices) ** 2).mean() for x, mesh in pairs]))
+
+    assert left_over(whole) < 0.8 * left_over(lacking)
+    assert (whole.shape.stddev**2).sum() <= whole.shape.total_variance * (1 + 1e-9)
 
 
 def test_kin_are_left_out_together_when_variances_are_found(

@@ -20,7 +20,6 @@ from shapespace.errors import InputError, MeshError
 from shapespace.geometry.surface import faces_of, vertex_normals
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
 
-
 PLAIN_TRIANGLES = 20_000
 """Of a plain scan."""
 

@@ -19,10 +19,10 @@ from shapespace.fit.equations import SCALE, NormalEquations, Prior
 from shapespace.fit.matching import Weights
 from shapespace.fit.moving_model import POSE, MovingSurface, small_poses
 from shapespace.geometry.surface import rms_size
+from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
-_FEWEST_SHAPES = 10
 _ALL_KEPT = 1e-6
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
@@ -124,22 +124,10 @@ def new_shapes(model: ShapeModel) -> FloatArray:
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
 
-    Modes are chosen to fit the training shapes, so their variances there say too little of others: far too little for
-    the last of N - 1 modes of N shapes. Nonlinear shrinkage estimates it from the spectrum alone (Ledoit and Wolf,
-    Annals of Statistics 48(5), 2020, section 4.5 for more coordinates than shapes). Never below the model's own, which
-    are taken as they are where they were found on shapes left out.
+    Those of the model are taken as they are where they were found on shapes left out.
     """
-    own, n = model.stddev**2, model.n_training
-    if n < _FEWEST_SHAPES or model.held_out:
-        return own
-    spectrum, _ = _whole_spectrum(model)
-    c = len(spectrum) / (n - 1)
-    density, transform = _smoothed(spectrum, n)
-    if c < 1:
-        shrunk = spectrum / ((np.pi * c * spectrum * density) ** 2 + (1 - c - np.pi * c * spectrum * transform) ** 2)
-    else:
-        shrunk = 1.0 / (np.pi**2 * spectrum * (density**2 + transform**2))
-    return np.maximum(own, shrunk[: len(own)])
+    own = model.stddev**2
+    return own if model.held_out else variances_of_new_shapes(own, model.total_variance, model.n_training)
 
 
 def lack_of_new_shapes(model: ShapeModel) -> float:
@@ -161,19 +149,6 @@ def _whole_spectrum(model: ShapeModel) -> tuple[FloatArray, float]:
     if rest > 0 and left > _ALL_KEPT * model.total_variance:
         return np.concatenate([own, np.full(rest, left / rest)]), left
     return own, 0.0
-
-
-def _smoothed(spectrum: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return the density (D,) of the eigenvalues and its Hilbert transform (D,), by an Epanechnikov kernel."""
-    width = n ** (-1.0 / 3.0) * spectrum
-    x = (spectrum[:, None] - spectrum) / width
-    root = np.sqrt(5.0)
-    near = np.maximum(1.0 - x**2 / 5.0, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curved = np.nan_to_num((1.0 - x**2 / 5.0) * np.log(np.abs((root - x) / (root + x))))
-    density = (0.75 / root * near / width).mean(axis=1)
-    transform = ((-0.3 * x + 0.75 / root * curved) / np.pi / width).mean(axis=1)
-    return density, transform
 
 
 def _gram(surface: MovingSurface) -> FloatArray:

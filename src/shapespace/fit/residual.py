@@ -25,11 +25,10 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
 from shapespace.io.kept import keep, recall
+from shapespace.model.local_modes import smooth_fields, strongest_products
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Similarity
+from shapespace.types import FloatArray, Similarity
 
-_CENTRES = 40
-_FIELD_SHARE = 0.999
 _MOST_PRODUCTS = 600
 _BLOCK = 250
 _LEAST_VALUE = 1e-8
@@ -87,8 +86,8 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
-    fields = _smooth_fields(x, settings.range_share * rms_size(x))
-    mode, at = _strongest(model.stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS // len(sources))
+    fields = smooth_fields(x, settings.range_share * rms_size(x))
+    mode, at = strongest_products(model.stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS // len(sources))
     field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
 
@@ -119,14 +118,6 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     for P, rows in zip(own, blocks, strict=True):
         together[rows, :, modes.shape[2] :] = (products(rows) @ mix - P @ inside).reshape(-1, 3, len(stddev_mm))
     return ResidualModes(together, stddev_mm)
-
-
-def _strongest(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:
-    """Return mode and field of the `count` products with the most variance, of modes (K,) and fields (m,) of a size."""
-    strength = np.outer(stddev, size)
-    order = np.argsort(strength, axis=None)[::-1][:count]
-    mode, field = np.unravel_index(order, strength.shape)
-    return mode.astype(np.int32), field.astype(np.int32)
 
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
@@ -170,27 +161,3 @@ def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
 
 def _blocks(count: int) -> list[slice]:
     return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
-
-
-def _smooth_fields(x: FloatArray, range_mm: float) -> FloatArray:
-    """Return (V, m) fields f with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2), but for their mean.
-
-    A constant field times a mode is that mode, which the model and its mirror image have already.
-    """
-    centres = x[_spread_out(x, _CENTRES)]
-    bumps = np.exp(-((x[:, None] - centres) ** 2).sum(axis=2) / (0.5 * range_mm**2))
-    bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
-    bumps -= bumps.mean(axis=0)
-    left, value, _ = np.linalg.svd(bumps, full_matrices=False)
-    m = int(np.searchsorted(np.cumsum(value**2) / (value**2).sum(), _FIELD_SHARE)) + 1
-    return left[:, :m] * value[:m]
-
-
-def _spread_out(x: FloatArray, count: int) -> IntArray:
-    """Return indices of `count` points far from each other (farthest-point sampling)."""
-    chosen = np.zeros(min(count, len(x)), dtype=np.int32)
-    distance = np.full(len(x), np.inf)
-    for i in range(1, len(chosen)):
-        distance = np.minimum(distance, ((x - x[chosen[i - 1]]) ** 2).sum(axis=1))
-        chosen[i] = int(distance.argmax())
-    return chosen

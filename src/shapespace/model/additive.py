@@ -21,7 +21,9 @@ from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import read_hdf5
 from shapespace.model import model_file
-from shapespace.model.held_out import held_out_variances
+from shapespace.model.held_out import held_out_shapes
+from shapespace.model.local_modes import local_modes
+from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
@@ -30,6 +32,7 @@ _STILL_ROUNDS = 3
 _STILL_SHAPES = 60
 _NO_VARIANCE = 1e-10
 _NO_MOTION_MM = 1e-6
+_LOCAL_MODES = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,7 @@ class AdditiveModel:
         expression_modes: int | float | None = 0.99,
         gauge: Gauge = "shape",
         alignment_vertices: IntArray | None = None,
+        local_identity_modes: int | None = None,
         still_share: float = 0.3,
         kin: Sequence[str] | None = None,
         landmarks: Mapping[str, int] | None = None,
@@ -94,8 +98,9 @@ class AdditiveModel:
     ) -> AdditiveModel:
         """Build the model of corresponding `meshes`, in mm.
 
-        The directions of the modes are those of all meshes. From 50 people on their variances are those that people
-        have who took no part in the modes, so that a new face is not read as an expression for want of identity.
+        The directions of the modes are those of all meshes, their variances those of people who took no part in them.
+        What a new face has outside the modes of identity belongs to smooth local modes beside them, which count as
+        identity, so that it is not read as an expression.
 
         Args:
             meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
@@ -103,6 +108,9 @@ class AdditiveModel:
             neutral: (N,) whether it is the neutral face; a person's neutrals are averaged.
             identity_modes: a number; a float below 1 for a share of the variance; None for all.
             expression_modes: the same for expressions.
+            local_identity_modes: how many smooth local modes of identity there are at most beside those of the people;
+                None for 150, or for none where `identity_modes` is a number. The less is left outside the people's,
+                the fewer are kept.
             gauge: `shape` divides size out, `form` keeps it.
             alignment_vertices: that carry the alignment, such as forehead and nose; None takes those that expressions
                 move least.
@@ -152,15 +160,19 @@ class AdditiveModel:
         gram = moved @ moved.T
         B, sample = _modes_through_zero(moved, gram, expression_modes)
         whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
-        a_held = held_out_variances(centred @ centred.T, whose[0], identity.variance, centred=True)
-        e_held = held_out_variances(gram, whose[1], sample, centred=False)
-        if a_held is None or e_held is None:
-            identity_variance, expression_variance, held_out = identity.variance, sample, False
-            total = identity.total_variance + float(np.trace(gram)) / len(gram)
-        else:
-            (identity_variance, a_left), (expression_variance, e_left) = a_held, e_held
-            total, held_out = float(identity_variance.sum() + expression_variance.sum()) + a_left + e_left, True
-        shape, rotation = _as_shape_model(A * np.sqrt(identity_variance), B * np.sqrt(expression_variance))
+        a_gram = centred @ centred.T
+        a_held = held_out_shapes(a_gram, whose[0], len(identity.variance), centred=True)
+        e_held = held_out_shapes(gram, whose[1], len(sample), centred=False)
+        a_variance = _of_new_people(a_gram / (len(neutrals) - 1), len(neutrals), a_held)
+        # Modes through zero are one more than those through a mean.
+        e_variance = _of_new_people(gram / len(gram), len(gram) + 1, e_held)
+        if local_identity_modes is None:
+            local_identity_modes = 0 if isinstance(identity_modes, int) else _LOCAL_MODES
+        L, l_variance = local_modes(identity.mean.reshape(-1, 3), A, a_variance, a_held.left_mm2, local_identity_modes)
+        A, left = np.concatenate([A, L], axis=1), a_held.left_mm2 + e_held.left_mm2
+        total = float(a_variance.sum() + e_variance.sum()) + left
+        a_variance = np.concatenate([a_variance, l_variance])
+        shape, rotation = _as_shape_model(A * np.sqrt(a_variance), B * np.sqrt(e_variance))
         basis, stddev = shape
         model = ShapeModel(
             mean=identity.mean,
@@ -173,9 +185,9 @@ class AdditiveModel:
             landmarks=landmarks or {},
             provenance=provenance,
             licence=licence,
-            held_out=held_out,
+            held_out=True,
         )
-        return cls(model, rotation, len(identity_variance))
+        return cls(model, rotation, len(a_variance))
 
     @property
     def n_expression(self) -> int:
@@ -358,6 +370,13 @@ def _modes_through_zero(
     modes = data.T @ (vectors / np.sqrt(values * len(data)))
     modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(kept)])
     return modes, values
+
+
+def _of_new_people(gram: FloatArray, n_shapes: int, held_out: HeldOut) -> FloatArray:
+    """Return variances (K,) of people who took no part in the modes, by the whole spectrum of `gram` (N, N)."""
+    spectrum = eigh(gram, eigvals_only=True)[::-1]
+    spectrum = spectrum[spectrum > _NO_VARIANCE * spectrum[0]]
+    return variances_of_new_shapes(spectrum, float(spectrum.sum()), n_shapes, held_out)
 
 
 def _as_shape_model(A: FloatArray, B: FloatArray) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:

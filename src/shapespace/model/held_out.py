@@ -1,9 +1,8 @@
-"""Variances of modes as people left out have them, which the eigenvalues of a sample do not tell.
+"""What shapes have along modes that were made without them, which the eigenvalues of a sample do not tell.
 
-Of N shapes the first eigenvalues are too large and the last far too small: a direction that no training person has
-looks impossible, and what a new person has of it is then read as something else. Of few people the eigenvalues are the
-better guess all the same, since what is found on those left out is noisier still. Source: Abadir, Distaso and Zikes,
-J. Econometrics 2014, for eigenvalues from data that did not make the eigenvectors, put into falling order.
+A direction that no training person has looks impossible to a sample, and what a new person has of it is then read as
+something else. Source: Abadir, Distaso and Zikes, J. Econometrics 2014, for eigenvalues from data that did not make the
+eigenvectors.
 """
 
 from __future__ import annotations
@@ -12,36 +11,28 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.optimize import isotonic_regression
 
+from shapespace.model.new_shapes import HeldOut
 from shapespace.types import FloatArray
 
-_PARTS, _FEWEST_GROUPS = 25, 50
+_PARTS = 25
 _NO_VARIANCE = 1e-10
-_LEAST = 0.01
-"""Of the variance in the sample; a mode that those left out hardly have is still one."""
 
 
-def held_out_variances(
-    gram: FloatArray, groups: Sequence[str], sample: FloatArray, *, centred: bool
-) -> tuple[FloatArray, float] | None:
-    """Return the variances (K,) of modes, and what is left, of shapes whose group did not take part in the modes.
-
-    None where there are fewer than 50 groups, or where without a part of them there are fewer modes.
+def held_out_shapes(gram: FloatArray, groups: Sequence[str], modes: int, *, centred: bool) -> HeldOut:
+    """Return what the shapes of groups have along the first `modes` modes of all other groups.
 
     Args:
         gram: (N, N) inner products of the shapes, about any one point where `centred`, else about zero.
         groups: (N,) of each shape; those of one group are left out together, a 25th of the groups at a time.
-        sample: (K,) variances in the sample, in falling order.
+        modes: K.
         centred: whether the modes go through the mean of the shapes, and not through zero.
     """
-    if len(set(groups)) < _FEWEST_GROUPS:
-        return None
-    names = {name: number % _PARTS for number, name in enumerate(dict.fromkeys(groups))}
-    part = np.array([names[name] for name in groups])
-    wanted = len(sample)
-    squares, left = np.zeros(wanted), 0.0
-    for k in range(part.max() + 1):
+    names = list(dict.fromkeys(groups))
+    part_of = {name: number % _PARTS for number, name in enumerate(names)}
+    part = np.array([part_of[name] for name in groups])
+    squares, seen, left = np.zeros(modes), np.zeros(modes), 0.0
+    for k in range(min(_PARTS, len(names)) if len(names) > 1 else 0):
         out, own = np.flatnonzero(part == k), np.flatnonzero(part != k)
         inner, cross = gram[np.ix_(own, own)], gram[np.ix_(out, own)]
         size = gram[out, out].copy()
@@ -50,15 +41,12 @@ def held_out_variances(
             row = inner.mean(axis=0)
             cross = cross - cross.mean(axis=1, keepdims=True) - row + inner.mean()
             inner = inner - row - row[:, None] + inner.mean()
-        count = min(wanted, len(own))
+        count = min(modes, len(own))
         values, vectors = eigh(inner, subset_by_index=(len(own) - count, len(own) - 1), check_finite=False)
         values, vectors = values[::-1], vectors[:, ::-1]
         kept = int((values > _NO_VARIANCE * max(values[0], 0.0)).sum())
-        if kept < wanted:
-            return None
         along = (cross @ (vectors[:, :kept] / np.sqrt(values[:kept]))) ** 2
-        squares += along.sum(axis=0)
+        squares[:kept] += along.sum(axis=0)
+        seen[:kept] += len(out)
         left += float(np.maximum(size - along.sum(axis=1), 0.0).sum())
-    # Modes change places from part to part, so single values jump.
-    fallen = isotonic_regression(squares / len(gram), increasing=False).x
-    return np.maximum(fallen, _LEAST * sample), left / len(gram)
+    return HeldOut(squares, seen / len(gram), len(gram), len(names), left / len(gram))

@@ -1,0 +1,96 @@
+"""Smooth local versions of a model's modes: a prior for what a new shape has outside the span of a few.
+
+What modes leave varies as they do, only locally, so their covariance damped with distance foretells it (Wilms, Handels
+and Ehrhardt, Medical Image Analysis 38, 2017). How much there is of it is told by shapes left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import eigh
+
+from shapespace.geometry.surface import rms_size
+from shapespace.types import FloatArray, IntArray
+
+_CENTRES = 40
+_FIELD_SHARE = 0.999
+_MOST_PRODUCTS = 600
+_BLOCK = 250
+_RANGE_SHARE = 0.6
+_FAINT = 1e-7
+"""Of the variance of the modes; local modes with less are not worth their time."""
+_ROOM = 4
+"""Local modes are at most one in so many of the coordinates, so that they cannot make everything."""
+
+
+def local_modes(
+    mean: FloatArray, modes: FloatArray, variance: FloatArray, left_mm2: float, most: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return local modes (3V, R), orthonormal and orthogonal to `modes`, and their variances (R,), mm^2.
+
+    Args:
+        mean: (V, 3) mm.
+        modes: (3V, K), orthonormal.
+        variance: (K,) of each, mm^2.
+        left_mm2: what new shapes have outside `modes`; all local modes together have as much.
+        most: how many at most.
+    """
+    fields = smooth_fields(mean, _RANGE_SHARE * rms_size(mean))
+    stddev = np.sqrt(variance)
+    mode, at = strongest_products(stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS)
+    vertex_modes = modes.reshape(*mean.shape, -1)
+
+    def products(rows: slice) -> FloatArray:
+        field = fields[rows][:, at] * stddev[mode]
+        return (vertex_modes[rows][:, :, mode] * field[:, None]).reshape(-1, len(mode))
+
+    # All at once they are many times as large as the model; block by block they are nothing.
+    blocks = [slice(start, start + _BLOCK) for start in range(0, len(mean), _BLOCK)]
+    inside, gram = np.zeros((len(variance), len(mode))), np.zeros((len(mode), len(mode)))
+    for rows in blocks:
+        part = products(rows)
+        inside += vertex_modes[rows].reshape(len(part), -1).T @ part
+        gram += part.T @ part
+    gram -= inside.T @ inside
+    whole, count = float(np.trace(gram)), min(most, len(gram), mean.size // _ROOM)
+    if count < 1 or whole <= 0 or left_mm2 <= 0:
+        return np.zeros((mean.size, 0)), np.zeros(0)
+    value, vector = eigh(gram, subset_by_index=(len(gram) - count, len(gram) - 1))
+    value, vector = value[::-1], vector[:, ::-1]
+    kept = value * left_mm2 / whole > _FAINT * variance.sum()
+    mix = vector[:, kept] / np.sqrt(value[kept])
+    local = np.concatenate([products(rows) @ mix for rows in blocks]) - modes @ (inside @ mix)
+    # Faint ones lose digits where most of them lies inside.
+    return np.linalg.qr(local)[0], value[kept] * left_mm2 / whole
+
+
+def strongest_products(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:
+    """Return mode and field of the `count` products with the most variance, of modes (K,) and fields (m,) of a size."""
+    strength = np.outer(stddev, size)
+    order = np.argsort(strength, axis=None)[::-1][:count]
+    mode, field = np.unravel_index(order, strength.shape)
+    return mode.astype(np.int32), field.astype(np.int32)
+
+
+def smooth_fields(x: FloatArray, range_mm: float) -> FloatArray:
+    """Return (V, m) fields f with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2), but for their mean.
+
+    A constant field times a mode is that mode.
+    """
+    centres = x[_spread_out(x, _CENTRES)]
+    bumps = np.exp(-((x[:, None] - centres) ** 2).sum(axis=2) / (0.5 * range_mm**2))
+    bumps /= np.linalg.norm(bumps, axis=1, keepdims=True)
+    bumps -= bumps.mean(axis=0)
+    left, value, _ = np.linalg.svd(bumps, full_matrices=False)
+    m = int(np.searchsorted(np.cumsum(value**2) / (value**2).sum(), _FIELD_SHARE)) + 1
+    return left[:, :m] * value[:m]
+
+
+def _spread_out(x: FloatArray, count: int) -> IntArray:
+    """Return indices of `count` points far from each other (farthest-point sampling)."""
+    chosen = np.zeros(min(count, len(x)), dtype=np.int32)
+    distance = np.full(len(x), np.inf)
+    for i in range(1, len(chosen)):
+        distance = np.minimum(distance, ((x - x[chosen[i - 1]]) ** 2).sum(axis=1))
+        chosen[i] = int(distance.argmax())
+    return chosen
