@@ -25,6 +25,7 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
 from shapespace.io.kept import keep, recall
+from shapespace.model import local_modes
 from shapespace.model.local_modes import smooth_fields, strongest_products
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
@@ -69,7 +70,8 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
 
 def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     # Whatever could change the modes is in the name, and so is the recipe itself.
-    made_of = f"{model.content_hash} {settings} {__version__} ".encode() + Path(__file__).read_bytes()
+    recipe = b"".join(Path(file).read_bytes() for file in (__file__, local_modes.__file__))
+    made_of = f"{model.content_hash} {settings} {__version__} ".encode() + recipe
     name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
     arrays = recall(name)
     if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
