@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from typing import TypeAlias
 
 FAILED_SHARE = 0.0375
 """A fit has failed if its mean vertex error exceeds this share of the model's size (3 mm on a face), or if the scan
@@ -47,7 +48,10 @@ def _log(value: float, least: float = _LEAST_LENGTH) -> float:
     return math.log(max(value, least))
 
 
-INPUTS: Mapping[str, Callable[[Mapping[str, float]], float]] = {
+Input: TypeAlias = Callable[[Mapping[str, float]], float]
+"""Of the evidence."""
+
+INPUTS: Mapping[str, Input] = {
     "posterior": lambda e: _log(e["posterior_error_mm"] / e["size_mm"]),
     "spread": lambda e: _log(e["spread_mm"] / e["size_mm"]),
     "spread beside the model's": lambda e: _log(e["spread_mm"] / max(e["model_spread_mm"], 1e-9)),
