@@ -107,7 +107,7 @@ def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Loo
     axes.add_collection(LineCollection(lines, colors=colours, linewidths=1.0))
     axes.plot([], [], color=(0.05, 0.45, 0.75), lw=2, label="scan to model (eq 4), thick where it counts (eq 8)")
     axes.plot([], [], color=(0.1, 0.55, 0.25), lw=1.2, label="model to scan (eq 5)")
-    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="not allowed: it ends on the border of the scan (eq 6)")
+    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="model to scan, not allowed (border, or eq 6)")
     axes.set_aspect("equal")
     axes.set_xlim(x[near(x), 2].max() - 75.0, x[near(x), 2].max() + 12.0)
     axes.set_ylim(-80.0, 75.0)

@@ -34,7 +34,7 @@ class Estimate:
     b: FloatArray
 
     def moved_by(self, delta: FloatArray) -> Estimate:
-        """Return where `delta` (7 + k,) leads: turn, shift and scale in the model's frame, then k coefficients."""
+        """Return where `delta` (7 + k,) leads (eq 3): turn, shift, scale in the model's frame, then k coefficients."""
         b = self.b.copy()
         b[: len(delta) - POSE] += delta[POSE:]
         return Estimate(self.T_scan_model @ small_similarity(delta[:POSE]), b)
@@ -46,7 +46,7 @@ class Prior:
 
     Args:
         stddev: (K,) of each coefficient, mm.
-        weight: how many matches tell as much as one independent one.
+        weight: of the prior beside one match.
         start_scale: scale of the start,
         scale_stddev: and how far the log of the scale is from its log; zero where the scale is held.
     """

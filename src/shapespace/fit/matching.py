@@ -181,7 +181,7 @@ class Matcher:
         return ((self._points_mm - T.translation) @ T.rotation) / T.scale
 
     def match(self, surface: MovingSurface, T_scan_model: Similarity) -> Matches:
-        """Return the matches of `surface` where it is now (eqs 4 to 7)."""
+        """Return the matches of `surface` where it is now (eqs 4 to 6)."""
         q, n = self._in_model(T_scan_model), self._normals @ T_scan_model.rotation
         barycentric = surface.walk(q, self._walks, self._triangles)
         triangle = self._triangles.copy()
@@ -202,7 +202,7 @@ def match_vertices(
     target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: MovingSurface, vertex: IntArray,
     near: ClosestPoints | None, *, winding: float, normal_cosine: float,
 ) -> VertexMatches:  # fmt: skip
-    """Match some of the surface's vertices to the scan (eqs 5 to 7).
+    """Match some of the surface's vertices to the scan (eqs 5 and 6).
 
     Args:
         target: the scan.

@@ -74,7 +74,7 @@ def posterior(
     beyond_model_mm: float,
     allowed_share: float,
 ) -> Posterior:
-    """Return what is known at the end of a fit (eqs 20 to 23).
+    """Return what is known at the end of a fit (eqs 20 to 22).
 
     Args:
         model: the shape space.
@@ -110,7 +110,7 @@ def posterior(
 
     told = covariance(max(_PATCHES * allowed_share**2, _FEWEST_PATCHES))
     dark = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else told
-    off_mm2 = float((dark * _gram(surface)).sum()) / len(surface.vertices)  # eq 22
+    off_mm2 = float((dark * _gram(surface)).sum()) / len(surface.vertices)  # eq 22, first term
     return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
 
 

@@ -62,7 +62,7 @@ class RobustSettings:
         reach_mm: this, mm, count little.
         vertex_share: weight of a vertex's match beside that of a scan point's, for scans at least as fine as the
             model; less for coarser ones, whose flat triangles cut the corners.
-        prior: how many matches tell as much as one independent one,
+        prior: weight of the prior beside one match,
         beyond_prior: the same beside modes that the model lacks.
         scale_stddev: of log s about the start.
         seed: of the subsamples.
