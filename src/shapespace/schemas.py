@@ -94,7 +94,7 @@ class Distances(Struct, frozen=True, kw_only=True):
     rms: float | None = None
     p95: float | None = None
     max: float | None = None
-    count: int | None = None
+    count: float | None = None
     fraction: float | None = None
 
 

@@ -63,7 +63,7 @@ def test_a_folds_model_knows_nobody_who_is_tested_in_it(done: Path, monkeypatch:
 
 
 def test_raw_scans_are_fitted_to_a_few_millimetres_from_any_pose(done: Path) -> None:
-    fits = read_fits([person_path(done, p) for p in range(6)], 40)
+    fits = read_fits([person_path(done, p) for p in range(6)], 400)
     own = SMALL.fold_of()[fits.person]
     status = fits.status[own, np.arange(len(own))]
     assert (status != simulated.STATUSES.index("failed")).all()

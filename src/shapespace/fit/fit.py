@@ -324,7 +324,7 @@ def _dense_stage(
         partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
-        stretch=dense.stretch,
+        strain=dense.strain,
         moved_mm=float(np.sqrt(moved.mean())) / fitted.T_scan_fitted.scale if len(moved) else 0.0,
     )
 

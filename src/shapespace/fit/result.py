@@ -57,7 +57,7 @@ class Stage:
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where such a surface has only the model to go by; else None.
         moved_mm: how far such a surface was moved where it was seen (RMS), mm of the model's frame.
-        stretch: how much its edges changed by that: |log| of the ratio that 1 % exceed.
+        strain: how far its parts moved against each other by that, in standard deviations of the model.
     """
 
     T_scan_model: Similarity
@@ -66,7 +66,7 @@ class Stage:
     vertices: FloatArray | None = None
     seen: BoolArray | None = None
     moved_mm: float = 0.0
-    stretch: float = 0.0
+    strain: float = 0.0
 
     @cached_property
     def distances(self) -> SurfaceDistances:

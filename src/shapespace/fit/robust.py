@@ -6,11 +6,12 @@ One step minimises, over a small change of the pose and over the coefficients b,
 
 where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992), and `prior` is
 the weight of what is known beforehand beside that of one match. Matches go both ways: each scan point to the closest
-point of the moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals that disagree,
-or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The second term is the
-prior (Blanz et al., 2004); the third keeps a scale that the scan hardly shows. Few modes are free at first and all in
-the end; where the scan then shows a shape that the model cannot make, the modes of `residual` join in, so that what the
-model lacks does not bend what it has. docs/robust.md derives it; equation numbers are those of that page.
+point of the moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals
+that disagree, or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The
+second term is the prior (Blanz et al., 2004); the third keeps a scale that the scan hardly shows. Few modes are free
+at first and all in the end; where the scan then shows a shape that the model cannot make, the modes of `residual`
+join in, so that what the model lacks does not bend what it has. docs/robust.md derives it; equation numbers are those
+of that page.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ _LEAST_SHARE = 0.01
 _MOST_LOG_SCALE = 1.0
 _TOLD_SHARE = 0.4
 _TOLD = 3
+_ALL_OVER = 0.8
+"""A model is called too narrow only where its surface has the scan near all over."""
 _LAYERED = 0.16
 """Share of a scan over which it has two surfaces; chosen on fits of `benchmarks/reliability.py`."""
 
@@ -144,7 +146,7 @@ def doubts_of_robust(evidence: Mapping[str, float]) -> list[str]:
     if not _is_doubted(evidence):
         return []
     usual = {name: min(evidence[name], 1.0) for name in ("z2", "z2_leading")}
-    if not _is_doubted(dict(evidence) | usual):
+    if evidence["model_near_share"] > _ALL_OVER and not _is_doubted(dict(evidence) | usual):
         out = math.sqrt(max(evidence["z2"], evidence["z2_leading"]))
         return [
             f"the model is too narrow for this scan: its surface follows it, to {evidence['spread_mm']:.2f} mm where "

@@ -12,8 +12,8 @@ _FARTHEST_Z = 10.0
 _OTHER_SCALE = 0.05
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
 """The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
-_STRETCHED = 0.1
-"""Dense surfaces of faces the model is made for stretch by 5 to 6 %, of others by 11 % and more (docs/dense.md)."""
+_STRAINED = 1.0
+"""Parts of dense surfaces move against each other by half of that where the model is made for them (docs/dense.md)."""
 
 
 def verdict(method: Method, ended: Ended) -> tuple[Status, str]:
@@ -52,9 +52,9 @@ def doubts_of_returned(ended: Ended) -> list[str]:
             f"told in the model's own modes, the surface moves {away_mm:.2g} mm away from the one that was fitted"
         )
     dense = ended.stages.get("dense")
-    if dense is not None and dense.stretch > _STRETCHED:
+    if dense is not None and dense.strain > _STRAINED:
         found.append(
-            f"following the scan stretches the fitted surface by {100 * dense.stretch:.0f} % in places, so the dense "
-            "surface may lie on the scan with its vertices in other places than those that correspond"
+            f"to follow the scan, parts of the dense surface moved against each other by {dense.strain:.1f} standard "
+            "deviations of the model, so its vertices may lie in other places than those that correspond"
         )
     return found
