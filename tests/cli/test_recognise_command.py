@@ -169,7 +169,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
         assert outcome.code == 2, arguments
         assert any(part in outcome.sentence() for part in said.split("|")), outcome.err
     (train / "p0_smile.fit.json").write_text('{"format": "shapespace fit"}')
-    assert "p0_smile is damaged" in run("recognise", "train", train, *labels, *out).sentence()
+    assert "p0_smile.fit.json is damaged" in run("recognise", "train", train, *labels, *out).sentence()
 
 
 def additive_model(path: Path) -> str:

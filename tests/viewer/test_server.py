@@ -360,7 +360,10 @@ def test_the_list_of_fits_tells_what_scan_and_model_both_show(fits: Path) -> Non
     rows = {row["name"]: row for row in Shown.open(fits).fit_list()}
     for key in ("shown", "shown_scan_mm"):
         for way in ("model_to_scan", "scan_to_model"):
-            assert rows["a"][key][way] == {name: record[key][way][name] for name in ("mean", "p95")}
+            told = rows["a"][key][way]
+            assert {name: told[name] for name in ("mean", "p95")} == {
+                name: record[key][way][name] for name in ("mean", "p95")
+            }
         assert rows["a"][key]["model_seen_share"] == record["shown"]["model_seen_share"]
     assert rows["older"]["shown"] is None and rows["older"]["status"] == "converged"
     assert rows["odd"]["status"] == "unreadable" and rows["c"]["shown"] is None

@@ -124,10 +124,13 @@ def new_shapes(model: ShapeModel) -> FloatArray:
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
 
-    Those of the model are taken as they are where they were found on shapes left out.
+    Those of the model are taken as they are where they were found on shapes left out. Never below the model's own: a
+    spectrum of few modes tells no density, and what it foretells of them can be far too little.
     """
     own = model.stddev**2
-    return own if model.held_out else variances_of_new_shapes(own, model.total_variance, model.n_training)
+    if model.held_out:
+        return own
+    return np.maximum(own, variances_of_new_shapes(own, model.total_variance, model.n_training))
 
 
 def lack_of_new_shapes(model: ShapeModel) -> float:

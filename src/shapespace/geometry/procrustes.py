@@ -15,6 +15,8 @@ from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, IntArray, Similarity
 
+_TANGENT_ROUNDS, _IN_TANGENT = 20, 1e-13
+
 Gauge: TypeAlias = Literal["form", "shape"]
 """`form`: rigid alignment, size stays in the modes. `shape`: alignment with scale, size is divided out."""
 
@@ -111,3 +113,22 @@ def align_in_place(
     else:
         return Alignment(mean, max_iterations, converged=False)
     return Alignment(shapes.mean(axis=0), iteration, converged=True)
+
+
+def scale_to_tangent(shapes: FloatArray) -> float:
+    """Scale each of the aligned `shapes` (N, V, 3) in place so that none varies along the mean; return what did, mm^2.
+
+    Shapes of one size lie on a sphere, so to second order they vary along its radius, which is what a scaling does to
+    the mean. In the tangent plane at the mean they are the same shapes, and no mode can be told from the scale of a
+    pose (Dryden and Mardia, Statistical Shape Analysis, 2016, section 4.4).
+    """
+    flat = shapes.reshape(len(shapes), -1)
+    mean = flat.mean(axis=0)
+    variance_mm2 = float((flat @ mean / np.linalg.norm(mean)).var(ddof=1))
+    for _ in range(_TANGENT_ROUNDS):
+        along = flat @ mean / (mean @ mean)
+        flat /= along[:, None]
+        mean = flat.mean(axis=0)
+        if np.abs(along - 1.0).max() < _IN_TANGENT:
+            break
+    return variance_mm2

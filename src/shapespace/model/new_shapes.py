@@ -23,7 +23,7 @@ _WIDTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations tried for the constant part of the log factor; wavier parts have less."""
 _STEPS, _STILL, _LONGEST = 60, 1e-7, 1.0
 _ALL_KEPT = 1e-6
-_BOUNDS = (0.4, 1e4)
+_BOUNDS = (1e-2, 1e4)
 _FARTHEST = 30.0
 
 

@@ -1,7 +1,8 @@
 """Modes that no shape made: what the alignment left of itself, and what is finer than the meshes are written.
 
-Procrustes takes out of the shapes what a similarity does to the mean, to first order. What remains to second order
-comes out of PCA as faint modes that lie in the tangent of the similarity group at the mean: there a fit cannot tell
+Procrustes takes out of the shapes what a similarity does to the mean, to first order. What remains to second order is
+along the scale, and is scaled away before PCA (`scale_to_tangent`) where all vertices carried the alignment. What comes
+out all the same as modes in the tangent of the similarity group at the mean is left out: there a fit cannot tell
 them from its pose. Sources: Goodall, JRSS B 53(2), 1991, section 4; for the edge of a spectrum of pure noise Marchenko
 and Pastur, Math. USSR-Sbornik 1(4), 1967.
 """
