@@ -529,15 +529,15 @@
   }
 
   const mm = (value) => (Number.isFinite(value) ? `${value.toFixed(2)} mm` : "unknown");
-  const percent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : "an unknown share");
+  const sharePercent = (share) => (Number.isFinite(share) ? `${Math.round(100 * share)} %` : "an unknown share");
 
   /** Distances over what scan and model both show, in mm of the model and, where they differ, of the scan. */
   function distanceFacts(facts) {
     const { shown: told, shown_scan_mm: inScan } = facts;
     if (!told) return null;
     const rows = [
-      ["Model to scan", "model_to_scan", `the scan shows it, ${percent(told.model_seen_share)} of the model`],
-      ["Scan to model", "scan_to_model", `the model covers it, ${percent(told.scan_covered_share)} of the scan`],
+      ["Model to scan", "model_to_scan", `the scan shows it, ${sharePercent(told.model_seen_share)} of the model`],
+      ["Scan to model", "scan_to_model", `the model covers it, ${sharePercent(told.scan_covered_share)} of the scan`],
     ].map(([name, way, where]) => {
       const { mean, p95 } = told[way], own = inScan ? inScan[way].mean : mean;
       const other = Math.abs(own - mean) > OTHER_SIZE * mean ? ` (${mm(own)} of the scan)` : "";
