@@ -50,7 +50,7 @@ def test_raw_scans_become_a_training_set(run: Run, world: World, strangers: Path
         scan = build_engine(read_mesh(strangers / f"raw_{k}.ply"))
         assert scan.query(mesh.vertices).distance.mean() < 0.25
     assert np.mean(better) < np.mean(plain)
-    built = run("build", *surfaces, "-o", dense / "new.h5", "--modes", "all")
+    built = run("build", *surfaces, "-o", dense / "new.h5", "--modes", "all", "--with-doubtful")
     assert built.code == 0, built.err
     new = ShapeModel.load(dense / "new.h5")
     assert new.n_vertices == model.n_vertices and new.n_training == STRANGERS

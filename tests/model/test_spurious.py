@@ -27,10 +27,9 @@ def tangent_share(model: ShapeModel) -> FloatArray:
 
 
 @pytest.mark.parametrize("count", [20, 40])
-def test_no_mode_lies_in_the_tangent_of_the_pose_and_how_many_did_is_known(count: int) -> None:
+def test_no_mode_has_anything_of_the_tangent_of_the_pose(count: int) -> None:
     model = ShapeModel.fit(linear_shapes(count, 5))
-    assert model.left_out >= 1
-    assert tangent_share(model).max() < 0.1
+    assert tangent_share(model).max() < 1e-6
     assert (model.stddev[:5] > 10 * model.stddev[5]).all()  # those of the shapes are all there
 
 

@@ -115,8 +115,8 @@ def align_in_place(
     return Alignment(shapes.mean(axis=0), iteration, converged=True)
 
 
-def scale_to_tangent(shapes: FloatArray) -> float:
-    """Scale each of the aligned `shapes` (N, V, 3) in place so that none varies along the mean; return what did, mm^2.
+def scale_to_tangent(shapes: FloatArray) -> None:
+    """Scale each of the aligned `shapes` (N, V, 3) in place so that none varies along the mean.
 
     Shapes of one size lie on a sphere, so to second order they vary along its radius, which is what a scaling does to
     the mean. In the tangent plane at the mean they are the same shapes, and no mode can be told from the scale of a
@@ -124,11 +124,9 @@ def scale_to_tangent(shapes: FloatArray) -> float:
     """
     flat = shapes.reshape(len(shapes), -1)
     mean = flat.mean(axis=0)
-    variance_mm2 = float((flat @ mean / np.linalg.norm(mean)).var(ddof=1))
     for _ in range(_TANGENT_ROUNDS):
         along = flat @ mean / (mean @ mean)
         flat /= along[:, None]
         mean = flat.mean(axis=0)
         if np.abs(along - 1.0).max() < _IN_TANGENT:
             break
-    return variance_mm2

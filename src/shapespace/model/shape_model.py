@@ -28,7 +28,6 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
-_ROUNDING_SHARE = 1e-10
 _IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
@@ -167,8 +166,8 @@ class ShapeModel:
             _refuse_without_extent(shapes, names)
             align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
         # Where only some vertices carried the alignment, the size of the others is shape.
-        by_size = align and gauge == "shape" and alignment_vertices is None
-        along_scale_mm2 = scale_to_tangent(shapes) if by_size else 0.0
+        if align and gauge == "shape" and alignment_vertices is None:
+            scale_to_tangent(shapes)
         coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), control_points)
         if isinstance(coder, Vertices):
             pc = _components(coder.encode(shapes), modes, seed)
@@ -187,7 +186,7 @@ class ShapeModel:
             mean=pc.mean,
             basis=pc.basis[:, ~spurious],
             stddev=np.sqrt(pc.variance[~spurious]),
-            left_out=int(spurious.sum()) + (along_scale_mm2 > _ROUNDING_SHARE * pc.variance[0]),
+            left_out=int(spurious.sum()),
             total_variance=pc.total_variance,
             n_training=pc.n_samples,
             faces=faces,
