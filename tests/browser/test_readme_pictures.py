@@ -30,4 +30,6 @@ def test_every_picture_of_the_readme_is_made_by_a_test() -> None:
     tests = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
     assert shown
     assert {name for name in shown if f'same_as_kept("{name}"' not in tests} == set()
-    assert {path.name for path in IMAGES.iterdir()} == shown
+    documents = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    in_documents = {part.split(")")[0] for part in documents.split("(images/")[1:]}
+    assert {path.name for path in IMAGES.iterdir()} == shown | in_documents
