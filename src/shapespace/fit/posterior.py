@@ -19,11 +19,9 @@ from shapespace.fit.equations import SCALE, NormalEquations, Prior
 from shapespace.fit.matching import Weights
 from shapespace.fit.moving_model import POSE, MovingSurface, small_poses
 from shapespace.geometry.surface import rms_size
-from shapespace.model.new_shapes import variances_of_new_shapes
+from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
-
-_ALL_KEPT = 1e-6
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 _NOISE_TEMPERATURE = 1.7
@@ -140,18 +138,10 @@ def lack_of_new_shapes(model: ShapeModel) -> float:
     harmonic mean of the variances. What modes that were cut off held comes on top. Where variances were found on shapes
     left out, what they leave is what new shapes leave.
     """
-    spectrum, left = _whole_spectrum(model)
+    spectrum = whole_spectrum(model.stddev**2, model.total_variance, model.n_training)
+    left = float(spectrum[model.n_modes :].sum())
     outside = 0.0 if model.held_out else model.n_training / float((1.0 / spectrum).mean())
     return float(np.sqrt((left + outside) / model.n_vertices))
-
-
-def _whole_spectrum(model: ShapeModel) -> tuple[FloatArray, float]:
-    """Return the variances of all N - 1 modes, those not kept sharing alike what is left, and what is left."""
-    own = model.stddev**2
-    left, rest = model.total_variance - float(own.sum()), model.n_training - 1 - model.n_modes
-    if rest > 0 and left > _ALL_KEPT * model.total_variance:
-        return np.concatenate([own, np.full(rest, left / rest)]), left
-    return own, 0.0
 
 
 def _gram(surface: MovingSurface) -> FloatArray:

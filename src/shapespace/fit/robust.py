@@ -184,7 +184,7 @@ class Problem:
         Raises:
             FitError: hardly anything matches, or the fit diverged.
         """
-        modes = len(at.b) if level.modes is None else min(level.modes, len(at.b))
+        modes = level.free(len(at.b))
         for _ in range(level.iterations):
             step = self.step(matcher, at, modes)
             at = step.at
@@ -216,8 +216,7 @@ class Problem:
     def preferred(self, at: Estimate, matcher: Matcher, start: Start, level: Level, tree: KdTree) -> Estimate:
         """Return where `level` leads from `start` and its coefficients if that matches clearly better, else `at`."""
         limit_mm = _CLEARLY_BETTER * self.mismatch_mm(matcher, at)
-        free = len(at.b) if level.modes is None else min(level.modes, len(at.b))
-        b = np.zeros(len(at.b))
+        free, b = level.free(len(at.b)), np.zeros(len(at.b))
         b[: min(len(start.b), free)] = start.b[:free]
         other = Estimate(start.T_scan_model, b)
         self.surface.deform(b)

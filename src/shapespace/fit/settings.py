@@ -42,6 +42,10 @@ class Level:
     iterations: int
     stop_motion_mm: float
 
+    def free(self, modes: int) -> int:
+        """Return how many of `modes` are free."""
+        return modes if self.modes is None else min(self.modes, modes)
+
 
 @dataclass(frozen=True)
 class RobustSettings:

@@ -59,7 +59,7 @@ def variances_of_new_shapes(
         held_out: what shapes left out have along K modes; None where only the spectrum is known: K is then all of it.
     """
     count = len(sample) if held_out is None else len(held_out.squares)
-    spectrum = _whole_spectrum(sample, total, n_shapes)
+    spectrum = whole_spectrum(sample, total, n_shapes)
     # Where shapes are not independent a single mode can be foretold absurdly, which its neighbours then correct.
     bounded = np.clip(_shrunk(spectrum, n_shapes) / spectrum, *_BOUNDS) * spectrum
     variance = np.exp(isotonic_regression(np.log(bounded[:count]), increasing=False).x)
@@ -68,8 +68,8 @@ def variances_of_new_shapes(
     return np.asarray(isotonic_regression(variance, increasing=False).x)
 
 
-def _whole_spectrum(sample: FloatArray, total: float, n: int) -> FloatArray:
-    """Return the spectrum with the modes that were not kept, each with an equal part of what they hold."""
+def whole_spectrum(sample: FloatArray, total: float, n: int) -> FloatArray:
+    """Return the variances of all n - 1 modes, mm^2: those of the first, `sample` (K,), and equal parts of the rest."""
     rest, left = n - 1 - len(sample), total - float(sample.sum())
     return np.concatenate([sample, np.full(rest, left / rest)]) if rest > 0 and left > _ALL_KEPT * total else sample
 
