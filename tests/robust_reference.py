@@ -8,8 +8,8 @@ normal n, by a small rotation, translation and log scale of the model and by the
 import numpy as np
 
 from shapespace.fit.equations import Estimate
-from shapespace.fit.moving_model import POSE
 from shapespace.fit.robust import Look, Problem
+from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray
 
 

@@ -12,13 +12,14 @@ from shapespace.fit.equations import Estimate
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.matching import Matcher
 from shapespace.fit.methods import method_named
-from shapespace.fit.moving_model import POSE, MovingSurface, prepare
+from shapespace.fit.moving_model import MovingSurface, prepare
 from shapespace.fit.robust import Problem
 from shapespace.fit.robust_method import Robust
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.span import in_span
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.similarity import POSE
 from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity

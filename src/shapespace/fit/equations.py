@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.fit.kernels import rows_into
 from shapespace.fit.matching import Gathered
-from shapespace.fit.moving_model import POSE, MovingSurface
+from shapespace.fit.moving_model import MovingSurface
+from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray, Similarity
 
 _DAMPING = 1e-7

@@ -317,7 +317,6 @@ def _dense_stage(
 
     T = fitted.T_scan_model
     dense = dense_surface(model, target, fitted.vertices_scan_mm, fitted.T_scan_fitted, config.dense_settings)
-    moved = ((dense.vertices_scan_mm - fitted.vertices_scan_mm)[dense.seen] ** 2).sum(axis=1)
     return Stage(
         T_scan_mm @ T,
         fitted.b,
@@ -325,7 +324,6 @@ def _dense_stage(
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
         strain=dense.strain,
-        moved_mm=float(np.sqrt(moved.mean())) / fitted.T_scan_fitted.scale if len(moved) else 0.0,
     )
 
 

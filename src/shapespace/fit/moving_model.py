@@ -10,12 +10,10 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.fit.kernels import Float32Array, less_sag, meet_into, normals_into, walk_into
 from shapespace.geometry.kdtree import KdTree
+from shapespace.geometry.similarity import small_poses
 from shapespace.geometry.surface import boundary_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
-
-POSE = 7
-"""Pose parameters come before the coefficients: rotation, translation, scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,16 +99,6 @@ def prepare(model: ShapeModel) -> PreparedModel:
         pose = small_poses(model.mean_vertices)
         _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.vertex_basis.T @ pose)
     return _PREPARED[model]
-
-
-def small_poses(x: FloatArray) -> FloatArray:
-    """Return (3V, 7): how x (V, 3) moves by a rotation about each axis, a translation along each, and a scaling."""
-    pose = np.zeros((len(x), 3, POSE))
-    pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
-    pose[:, :, :3] -= pose[:, :, :3].transpose(0, 2, 1)
-    pose[:, :, 3:6] = np.eye(3)
-    pose[:, :, 6] = x
-    return pose.reshape(-1, POSE)
 
 
 class MovingSurface:

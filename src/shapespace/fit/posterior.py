@@ -17,7 +17,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from shapespace.fit.equations import SCALE, NormalEquations, Prior
 from shapespace.fit.matching import Weights
-from shapespace.fit.moving_model import POSE, MovingSurface, small_poses
+from shapespace.fit.moving_model import MovingSurface
+from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel

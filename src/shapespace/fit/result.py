@@ -56,8 +56,7 @@ class Stage:
         measure: measures the distances; it holds the scan.
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where such a surface has only the model to go by; else None.
-        moved_mm: how far such a surface was moved where it was seen (RMS), mm of the model's frame.
-        strain: how far its parts moved against each other by that, in standard deviations of the model.
+        strain: how far parts of such a surface moved against each other, in standard deviations of the model.
     """
 
     T_scan_model: Similarity
@@ -65,7 +64,6 @@ class Stage:
     measure: Callable[[], SurfaceDistances] = field(repr=False)
     vertices: FloatArray | None = None
     seen: BoolArray | None = None
-    moved_mm: float = 0.0
     strain: float = 0.0
 
     @cached_property

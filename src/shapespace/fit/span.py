@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.fit.equations import Estimate, small_similarity
-from shapespace.fit.moving_model import POSE, PreparedModel
+from shapespace.fit.moving_model import PreparedModel
+from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray
 
 

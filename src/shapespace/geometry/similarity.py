@@ -13,6 +13,9 @@ from shapespace.types import FloatArray, Similarity
 
 _RANK_TOLERANCE = 1e-9
 
+POSE = 7
+"""Pose parameters come before the coefficients: rotation, translation, scale."""
+
 
 def fit_similarity(
     source: FloatArray, target: FloatArray, weights: FloatArray | None = None, *, with_scale: bool = True
@@ -64,3 +67,13 @@ def fit_similarity(
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
     T = mean_target - s * R @ mean_source  # eq 17, as corrected
     return Similarity(s, R, T)
+
+
+def small_poses(x: FloatArray) -> FloatArray:
+    """Return (3V, 7): how x (V, 3) moves by a rotation about each axis, a translation along each, and a scaling."""
+    pose = np.zeros((len(x), 3, POSE))
+    pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
+    pose[:, :, :3] -= pose[:, :, :3].transpose(0, 2, 1)
+    pose[:, :, 3:6] = np.eye(3)
+    pose[:, :, 6] = x
+    return pose.reshape(-1, POSE)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.similarity import small_poses
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray
 
 _TANGENT_SHARE = 0.1
@@ -34,11 +35,8 @@ def made_by_alignment(
         alignment_vertices: indices of those that carried the alignment; None for all.
     """
     used = np.arange(len(mean_vertices)) if alignment_vertices is None else np.unique(alignment_vertices)
-    x = mean_vertices[used]
-    moves = [np.cross(axis, x) for axis in np.eye(3)] + [np.broadcast_to(axis, x.shape) for axis in np.eye(3)]
-    if gauge == "shape":
-        moves.append(x - x.mean(axis=0))
-    tangent = np.linalg.qr(np.stack([move.ravel() for move in moves], axis=1))[0]
+    moves = small_poses(mean_vertices[used])  # rotations, translations, and the scale last
+    tangent = np.linalg.qr(moves if gauge == "shape" else moves[:, :-1])[0]
     rows = (3 * used[:, None] + np.arange(3)).ravel()
     return ((tangent.T @ vertex_basis[rows]) ** 2).sum(axis=0) > _TANGENT_SHARE
 
