@@ -20,7 +20,7 @@ from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.trust import score
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import rms_size, vertex_normals
+from shapespace.geometry.surface import rms_size, vertex_normals, without_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
@@ -136,8 +136,8 @@ def _part(mesh: Mesh, kept: BoolArray) -> Mesh:
     """Return the vertices `kept` (S,) with the triangles that have no other."""
     if mesh.faces is None:
         return Mesh(mesh.vertices[kept], name=mesh.name)
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    return Mesh(mesh.vertices[kept], number[mesh.faces[kept[mesh.faces].all(axis=1)]], name=mesh.name)
+    vertices, faces = without_vertices(mesh.vertices, mesh.faces, kept)
+    return Mesh(vertices, faces, name=mesh.name)
 
 
 def _end(states: Generator[IcpState, None, Fitted]) -> Fitted:

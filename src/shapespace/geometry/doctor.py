@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import MeshError
+from shapespace.geometry.surface import without_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 # Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
@@ -185,9 +186,10 @@ class _Doctor:
         return True
 
     def _keep_vertices(self, keep: BoolArray) -> None:
-        if self.faces is not None:
-            self.faces = (np.cumsum(keep, dtype=np.int32) - 1)[self.faces]
-        self.vertices = self.vertices[keep]
+        if self.faces is None:
+            self.vertices = self.vertices[keep]
+        else:
+            self.vertices, self.faces = without_vertices(self.vertices, self.faces, keep)
 
     def _keep_triangles(self, keep: BoolArray | IntArray) -> None:
         assert self.faces is not None and self.in_file is not None

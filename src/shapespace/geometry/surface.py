@@ -19,6 +19,12 @@ def faces_of(mesh: Mesh) -> IntArray:
     return mesh.faces
 
 
+def without_vertices(vertices: FloatArray, faces: IntArray, kept: BoolArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices `kept` (V,) of (V, 3) and, told in their numbers, the triangles (F, 3) that have no other."""
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    return vertices[kept], number[faces[kept[faces].all(axis=1)]]
+
+
 def rms_size(points: FloatArray) -> float:
     """Return the RMS distance of `points` (N, 3) from their mean."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
