@@ -180,6 +180,18 @@ def test_a_point_cloud_will_do() -> None:
     assert error_mm(surface.vertices_scan_mm) < 0.6 * error_mm(fitted())
 
 
+@pytest.mark.parametrize(("height_mm", "doubted"), [(0.2, False), (3.0, True)])
+def test_a_surface_that_moved_further_than_a_model_should_lack_is_doubted(height_mm: float, doubted: bool) -> None:
+    d, faces = sphere(6000, turn=0.7)
+    result = fit_scan(model(), Mesh(bumpy(d, height_mm), faces), FitConfig(dense=True, unit="mm"))
+    assert ("the dense surface moved" in result.reason) is doubted
+    surface = dense(Mesh(bumpy(d, height_mm), faces))
+    mesh = Mesh(fitted(), model().faces)
+    off_mm = bumpy(sphere(model().n_vertices)[0], height_mm) - mesh.vertices
+    along_mm = np.einsum("vd,vd->v", vertex_normals(mesh), off_mm)
+    assert surface.moved_mm == pytest.approx(np.sqrt((along_mm**2).mean()), rel=0.2)
+
+
 def test_a_reversed_scan_gives_the_same_surface() -> None:
     scan = scanned()
     assert scan.faces is not None

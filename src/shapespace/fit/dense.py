@@ -27,7 +27,6 @@ from shapespace.fit.moving_model import MovingSurface, Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.weights import spread
-from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import face_vectors, rms_size, vertex_areas
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
@@ -37,7 +36,6 @@ _FEWEST_PAIRS = 100
 _WELL_SHAPED = 0.05
 """Vertices own at least this share of the median area: slivers would be infinitely stiff."""
 _HALVINGS = 8
-_PART, _PAIRS = 0.12, 3_000
 _SEEN = 0.1
 """Matches that together weigh as much show a vertex; a good one weighs 1."""
 
@@ -52,8 +50,7 @@ class DenseSurface:
         noise_mm: of the scan as found, mm of the model's frame.
         unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
         damped: how many vertices were held back so that no triangle folds.
-        strain: how far neighbouring parts that are seen moved against each other, in standard deviations of the model;
-            1 % moved further.
+        moved_mm: RMS of how far what is seen moved along the normals, mm of the model's frame.
     """
 
     vertices_scan_mm: FloatArray
@@ -61,7 +58,7 @@ class DenseSurface:
     noise_mm: float
     unexplained_mm: float
     damped: int
-    strain: float
+    moved_mm: float
 
 
 def dense_surface(
@@ -89,6 +86,7 @@ def dense_surface(
     topology, T = prepare(model).topology, T_scan_model
     start = T.inverse().apply(vertices_scan_mm)
     surface = MovingSurface(topology, start)
+    up = surface.normals.copy()
     matcher = _matcher(target, surface, T, settings)
     size_mm = rms_size(model.mean_vertices)
 
@@ -121,31 +119,9 @@ def dense_surface(
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
     seen, damped = seen_at * noise_mm**2 > _SEEN, int((held | held_back).sum())
-    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, _strain(model, start, kept, seen))
-
-
-def _strain(model: ShapeModel, before: FloatArray, after: FloatArray, seen: BoolArray) -> float:
-    """Return how far neighbouring parts that are seen moved against each other, in standard deviations of the model.
-
-    Pairs of vertices lie about `_PART` of the size apart; 1 % of them moved further than what is returned.
-    """
-    index, rng, apart_mm = np.flatnonzero(seen), np.random.default_rng(0), _PART * rms_size(model.mean_vertices)
-    if len(index) == 0:
-        return 0.0
-    one = rng.choice(index, min(_PAIRS, len(index)), replace=False)
-    towards = rng.standard_normal((len(one), 3))
-    towards *= apart_mm / np.linalg.norm(towards, axis=1, keepdims=True)
-    other = index[KdTree(before[index]).nearest(before[one] + towards)[0]]
-    length = np.linalg.norm(before[one] - before[other], axis=1)
-    apart = (length > 0.5 * apart_mm) & (length < 1.5 * apart_mm)
-    one, other = one[apart], other[apart]
-    if len(one) == 0:
-        return 0.0
-    modes = model.vertex_basis.reshape(model.n_vertices, 3, -1)
-    known_mm = np.sqrt((((modes[one] - modes[other]) * model.stddev) ** 2).sum(axis=(1, 2)))
-    moved = after - before
-    moved_mm = np.linalg.norm(moved[one] - moved[other], axis=1)
-    return float(np.quantile(moved_mm / np.maximum(known_mm, 1e-9), 0.99))
+    along_mm = np.einsum("vd,vd->v", up[seen], (kept - start)[seen])
+    moved_mm = float(np.sqrt((along_mm**2).sum() / max(len(along_mm), 1)))
+    return DenseSurface(T.apply(kept), seen, noise_mm, left_mm, damped, moved_mm)
 
 
 @dataclass(frozen=True, eq=False)

@@ -323,7 +323,7 @@ def _dense_stage(
         partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
-        strain=dense.strain,
+        moved_mm=dense.moved_mm,
     )
 
 

@@ -56,7 +56,7 @@ class Stage:
         measure: measures the distances; it holds the scan.
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
         seen: (V,) False where such a surface has only the model to go by; else None.
-        strain: how far parts of such a surface moved against each other, in standard deviations of the model.
+        moved_mm: how far such a surface moved along its normals (RMS over what is seen), mm of the model's frame.
     """
 
     T_scan_model: Similarity
@@ -64,7 +64,7 @@ class Stage:
     measure: Callable[[], SurfaceDistances] = field(repr=False)
     vertices: FloatArray | None = None
     seen: BoolArray | None = None
-    strain: float = 0.0
+    moved_mm: float = 0.0
 
     @cached_property
     def distances(self) -> SurfaceDistances:

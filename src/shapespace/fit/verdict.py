@@ -12,8 +12,9 @@ _FARTHEST_Z = 10.0
 _OTHER_SCALE = 0.05
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
 """The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
-_STRAINED = 1.0
-"""Parts of dense surfaces move against each other by half of that where the model is made for them (docs/dense.md)."""
+_DENSE_MOVED_SHARE = 0.009
+"""Dense surfaces move along their normals by a quarter of that share of the size where the model is made for them; of
+those that move further, most lie elsewhere than they belong (docs/dense.md)."""
 
 
 def verdict(method: Method, ended: Ended) -> tuple[Status, str]:
@@ -52,9 +53,9 @@ def doubts_of_returned(ended: Ended) -> list[str]:
             f"told in the model's own modes, the surface moves {away_mm:.2g} mm away from the one that was fitted"
         )
     dense = ended.stages.get("dense")
-    if dense is not None and dense.strain > _STRAINED:
+    if dense is not None and dense.moved_mm > _DENSE_MOVED_SHARE * ended.size_mm:
         found.append(
-            f"to follow the scan, parts of the dense surface moved against each other by {dense.strain:.1f} standard "
-            "deviations of the model, so its vertices may lie in other places than those that correspond"
+            f"to follow the scan, the dense surface moved by {dense.moved_mm:.2g} mm along its normals, more than the "
+            "model should lack, so its vertices may lie in other places than those that correspond"
         )
     return found
