@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import shapespace.datasets.faces as module
-from shapespace.datasets.faces import EXPRESSIONS, Expression, Person, load_faces, write_faces
+from shapespace.datasets.face_files import write_faces
+from shapespace.datasets.faces import EXPRESSIONS, Expression, Person, load_faces
+from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
 from shapespace.io.meshes import read_mesh
 
@@ -176,6 +178,44 @@ def test_no_face_turns_inside_out_or_grows_shards(faces, people):
             assert (lengths(V) / np.maximum(lengths(neutral), 1.0))[skin].max() < 8, name
 
 
+def test_wide_people_are_the_same_people_with_smooth_changes_that_fold_nothing(faces, people):
+    triangles, distances = faces.template.faces, []
+    for k, plain in enumerate(people[:10]):
+        person = faces.draw_person(np.random.default_rng([0, k]), wide=True)
+        assert np.array_equal(person.weights, plain.weights)
+        before, after = (faces.face(p).vertices for p in (plain, person))
+        distances.append(np.linalg.norm(after - before, axis=1).mean())
+        assert np.linalg.norm(after[faces.mirror] * [-1, 1, 1] - after, axis=1).mean() < 4.0
+        a, b = (np.cross(V[triangles[:, 1]] - V[triangles[:, 0]], V[triangles[:, 2]] - V[triangles[:, 0]])
+                for V in (before, after))  # fmt: skip
+        assert ((a * b).sum(axis=1) < 0).mean() < 0.003
+    assert 2.0 < np.mean(distances) < 8.0
+    again = faces.draw_person(np.random.default_rng([0, 9]), wide=True)
+    assert np.array_equal(again.warp_mm, person.warp_mm)
+    assert people[0].warp_mm is None
+
+
+def test_the_face_alone_is_a_sheet_with_the_landmarks_of_the_face(faces, people):
+    whole = faces.face(people[0])
+    face = faces.cut_to_face(whole)
+    assert 0.5 < len(face.vertices) / len(whole.vertices) < 0.8
+    assert {"pronasale", "menton", "left_pupil"} <= set(face.landmarks) == set(faces.face_landmarks)
+    for name, vertex in faces.face_landmarks.items():
+        assert np.array_equal(face.vertices[vertex], whole.landmarks[name])
+    assert np.array_equal(np.unique(face.faces), np.arange(len(face.vertices)))
+    edges, count = np.unique(np.sort(directed_edges(face.faces), axis=1), axis=0, return_counts=True)
+    assert len(face.vertices) - len(edges) + len(face.faces) == 1  # a disc
+    assert count.max() == 2
+
+
+def test_a_warp_varies_as_much_as_it_says(faces):
+    x, mirror = faces.template.vertices, faces.mirror
+    off = np.abs(x[:, 0]) > 60  # in the middle the two sides are one
+    warp = Warp(stretch=0.0, fields=((15.0, 2.0),), lopsided=0.0)
+    drawn = np.stack([warp.draw(x, mirror, np.random.default_rng(k))[off] for k in range(30)])
+    assert drawn.std() == pytest.approx(2.0, rel=0.1)
+
+
 @pytest.mark.parametrize("name", [n for n in EXPRESSIONS if n != "neutral"])
 def test_an_expression_grows_with_its_intensity_from_nothing(faces, name):
     size = [
@@ -242,6 +282,16 @@ def test_written_faces_read_back_and_do_not_depend_on_how_many_are_asked_for(tmp
         assert {r["name"]: int(r["vertex"]) for r in csv.DictReader(stream)} == dict(faces.landmarks)
 
 
+def test_wide_people_and_faces_alone_are_written_beside_their_landmarks(tmp_path, faces):
+    write_faces(tmp_path, subjects=1, seed=3, wide=True, face_only=True)
+    person = faces.draw_person(np.random.default_rng([3, 0]), wide=True)
+    written = read_mesh(tmp_path / "subject_000_neutral.ply")
+    assert np.abs(written.vertices - faces.cut_to_face(faces.face(person)).vertices).max() < 1e-3
+    with (tmp_path / "landmarks.csv").open(encoding="utf-8") as file:
+        rows = {row["name"]: int(row["vertex"]) for row in csv.DictReader(file)}
+    assert rows == dict(faces.face_landmarks)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"subjects": 0}, {"subjects": 10**9}, {"seed": -1}, {"expressions": ["grin"]}, {"expressions": []},
@@ -258,6 +308,8 @@ def test_impossible_weights_are_refused(faces):
         Person(np.array([1.5]))
     with pytest.raises(InputError, match="weights"):
         faces.face(Person(np.array([0.5])))
+    with pytest.raises(InputError, match="another number of vertices"):
+        faces.face(Person(faces._generic, warp_mm=np.zeros((3, 3))))
     with pytest.raises(InputError, match="intensity"):
         faces.draw_expression("smile", 1.5, np.random.default_rng(0))
     with pytest.raises(InputError, match="grin"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import landmark_vertices, load_ict
 from shapespace.datasets.james import load_james
 from shapespace.fit.fit import FitConfig, fit_scan
@@ -29,3 +30,16 @@ def test_james_is_fitted_within_millimetres(shared_data, seed, method, mean_mm, 
     marked = np.stack([james.landmarks[name] for name in named])
     assert np.linalg.norm(fitted - marked, axis=1).mean() < 6.0
     assert np.linalg.norm(fit_similarity(fitted, marked).apply(fitted) - marked, axis=1).mean() < 5.0
+
+
+def test_james_is_no_stranger_to_bundled_people_who_vary_widely(shared_data):
+    faces = load_faces()
+    people = [faces.draw_person(np.random.default_rng([0, k]), wide=True) for k in range(100)]
+    model = ShapeModel.fit([faces.cut_to_face(faces.face(p)) for p in people], landmarks=faces.face_landmarks)
+    james = load_james(shared_data / "james")
+    result = fit_scan(model, james)
+    assert result.status == "converged", result.reason
+    at, marked = result.surface().landmarks, james.landmarks
+    pairs = {"pronasale": "nose_3", "subnasale": "nose_6", "left_cheilion": "mouth_6", "right_cheilion": "mouth_0",
+             "left_exocanthion": "reye_3", "right_exocanthion": "leye_0", "menton": "chin_8"}  # fmt: skip
+    assert np.mean([np.linalg.norm(at[here] - marked[there]) for here, there in pairs.items()]) < 5.0

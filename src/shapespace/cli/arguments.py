@@ -79,9 +79,12 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--expressions", default="neutral", metavar="LIST", help="names with commas between them")
     faces.add_argument("--seed", type=_natural, default=0, metavar="S")
     faces.add_argument("--source", choices=("bundled", "ict-facekit"), default="bundled")
-    faces.add_argument("--area", choices=("face", "face_and_head"), default="face", help="of ict-facekit")
+    faces.add_argument("--area", choices=("face", "face_and_head"),
+                       help="what to write (default: face of ict-facekit, face_and_head of bundled)")  # fmt: skip
     faces.add_argument("--raw", action="store_true",
                        help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
+    faces.add_argument("--wide", action="store_true",
+                       help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
 
 

@@ -91,6 +91,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         area=arguments.area,
         quiet=arguments.quiet,
         raw=arguments.raw,
+        wide=arguments.wide,
     )
     if arguments.json:
         show_json({"folder": str(arguments.output), "faces": count})

@@ -36,20 +36,25 @@ def write_simulated_faces(
     subjects: int,
     expressions: Sequence[str],
     seed: int,
-    area: str,
+    area: str | None,
     quiet: bool,
     raw: bool = False,
+    wide: bool = False,
 ) -> int:
     """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
 
     Raises:
-        InputError: an unknown expression or area.
+        InputError: an unknown expression or area, or wide people of ICT-FaceKit.
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
     """
-    from shapespace.datasets import faces as bundled
-    from shapespace.datasets import ict
+    from shapespace.datasets import face_files, ict
+    from shapespace.datasets.faces import LICENSE
 
+    if area not in (None, "face", "face_and_head"):
+        raise InputError(f"The area must be face or face_and_head, not {area!r}.")
+    if wide and source == "ict-facekit":
+        raise InputError("People of ICT-FaceKit vary as widely as real ones already; leave --wide out.")
     make_folder(folder)
     total = subjects * len(expressions)
     with progress(total, "writing", "face", quiet=quiet) as bar:
@@ -59,14 +64,17 @@ def write_simulated_faces(
             bar.update(done - bar.n)
 
         if source == "ict-facekit":
-            if area not in ("face", "face_and_head"):
-                raise InputError(f"The area must be face or face_and_head, not {area!r}.")
             ict.write_people(
-                folder, subjects=subjects, seed=seed, area=area, expressions=expressions, raw=raw, progress=step
-            )
+                folder, subjects=subjects, seed=seed, area=area or "face", expressions=expressions, raw=raw,
+                progress=step,
+            )  # fmt: skip
         else:
-            bundled.write_faces(folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, progress=step)
-    licence, of = ("MIT", f"ICT-FaceKit, area {area}") if source == "ict-facekit" else (bundled.LICENSE, "shapespace")
-    said = f"{subjects} simulated people of {of}, seed {seed}, expressions: {', '.join(expressions)}"
+            face_files.write_faces(
+                folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
+                face_only=area == "face", progress=step,
+            )  # fmt: skip
+    licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
+    who = "people who vary widely" if wide else "people"
+    said = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
     write_about(folder, said, licence)
     return total

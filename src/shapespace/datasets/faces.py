@@ -11,9 +11,9 @@ import importlib.resources
 import io
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -21,12 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.datasets.loop import loop_operator
-from shapespace.datasets.simulated_scan import plain_scan
+from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
-from shapespace.io.files import make_folder
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.geometry.surface import faces_of
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 LICENSE = "CC0-1.0"
@@ -68,6 +65,8 @@ _SPREAD = {
     "head": 0.10, "mouth": 0.20, "neck": 0.08, "nose": 0.19,
 }  # fmt: skip
 _SIDE_SPREAD = 0.03
+_FACE_MM = 110.0
+"""A face alone reaches as far from the tip of the nose."""
 _OPPOSITES = {
     "decr": "incr", "down": "up", "in": "out", "backward": "forward", "concave": "convex", "compress": "uncompress",
 }  # fmt: skip
@@ -81,13 +80,17 @@ class Person:
     Args:
         weights: (I,) float64 in [0, 1], one for each of the generator's `identity_names`.
         name: used in the names of meshes.
+        warp_mm: (C, 3) what none of those shapes makes, on the generator's vertices before subdivision; None for none.
     """
 
     weights: FloatArray
     name: str = "person"
+    warp_mm: FloatArray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", _checked_weights(self.weights, "person"))
+        if self.warp_mm is not None:
+            object.__setattr__(self, "warp_mm", read_only(self.warp_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +144,14 @@ class FaceGenerator:
     _generic: FloatArray = field(repr=False)
     _loop: Any = field(repr=False)
 
-    def draw_person(self, rng: np.random.Generator, name: str = "person") -> Person:
+    def draw_person(self, rng: np.random.Generator, name: str = "person", *, wide: bool = False) -> Person:
         """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.
 
         Args:
             rng: the only source of chance.
             name: used in the names of the person's meshes.
+            wide: whether the same person also differs by smooth changes at every scale (`Warp`), as real people do:
+                a model of such people follows real faces where one of the others is too narrow.
         """
         weights = dict.fromkeys(self.identity_names, 0.0)
         ethnicity = rng.dirichlet([0.6] * len(_ETHNICITIES))
@@ -176,7 +181,11 @@ class FaceGenerator:
                     weights[down] = -x
                 elif x > 0:
                     weights[up] = x
-        return Person(np.array([weights[n] for n in self.identity_names]), name)
+        drawn = np.array([weights[n] for n in self.identity_names])
+        if not wide:
+            return Person(drawn, name)
+        mirror = self.mirror[: len(self._coarse)]  # subdivision keeps these vertices first
+        return Person(drawn, name, Warp().draw(self._coarse + self._identity_change(drawn), mirror, rng))
 
     def _pairs(self) -> list[tuple[str, str]]:
         """Return (towards less, towards more) for each detail on the left or in the middle; (x, x) without a pair."""
@@ -246,8 +255,10 @@ class FaceGenerator:
             name: of the mesh; made from the two when left out.
 
         Raises:
-            InputError: weights of the wrong number.
+            InputError: weights, or a warp, of the wrong number.
         """
+        if person.warp_mm is not None and person.warp_mm.shape != self._coarse.shape:
+            raise InputError("The warp of this person has another number of vertices than the generator.")
         for weights, shapes, what in (
             (person.weights, self._identity, "person"),
             (expression.weights if expression else np.zeros(len(self._units)), self._units, "expression"),
@@ -257,13 +268,41 @@ class FaceGenerator:
                     f"This {what} has {len(weights)} weights, but the generator has {len(shapes)} shapes; draw it from "
                     "the same generator."
                 )
-        change = _combine(person.weights - self._generic, self._identity)
+        change = self._identity_change(person.weights)
+        if person.warp_mm is not None:
+            change = change + person.warp_mm
         if expression is not None:
             change = change + _combine(expression.weights, self._units)
         vertices = np.asarray(self._loop @ (self._coarse + change), dtype=np.float64)
         title = name or (person.name if expression is None else f"{person.name} {expression.name}")
         points = {k: vertices[v] for k, v in self.landmarks.items()}
         return Mesh(vertices, self.template.faces, points, title)
+
+    def cut_to_face(self, mesh: Mesh) -> Mesh:
+        """Return the face alone of a surface of this generator, always the same part: no ears, crown, nape and neck.
+
+        Models of it follow scans that show hair, a collar or no more than the face.
+        """
+        used, triangles = self._face_part
+        points = {k: mesh.vertices[v] for k, v in self.face_landmarks.items()}
+        return Mesh(mesh.vertices[used], triangles, points, mesh.name)
+
+    @cached_property
+    def face_landmarks(self) -> Mapping[str, int]:
+        """Name -> vertex of the landmarks that lie in what `cut_to_face` leaves, in its numbers."""
+        number = {int(v): k for k, v in enumerate(self._face_part[0])}
+        return MappingProxyType({name: number[v] for name, v in self.landmarks.items() if v in number})
+
+    @cached_property
+    def _face_part(self) -> tuple[IntArray, IntArray]:
+        x = self.template.vertices
+        near = np.linalg.norm(x - x[self.landmarks["pronasale"]], axis=1) < _FACE_MM
+        triangles = faces_of(self.template)
+        used, inside = np.unique(triangles[near[triangles].all(axis=1)], return_inverse=True)
+        return used.astype(np.int32), inside.reshape(-1, 3).astype(np.int32)
+
+    def _identity_change(self, weights: FloatArray) -> FloatArray:
+        return _combine(weights - self._generic, self._identity)
 
 
 def _combine(weights: FloatArray, shapes: npt.NDArray[np.float32]) -> FloatArray:
@@ -345,61 +384,3 @@ def _generator(data: Mapping[str, npt.NDArray[Any]]) -> FaceGenerator:
         _generic=read_only(generic),
         _loop=operator,
     )
-
-
-def write_faces(
-    folder: Path,
-    *,
-    subjects: int,
-    expressions: Sequence[str] = ("neutral",),
-    seed: int = 0,
-    raw: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Path:
-    """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
-
-    Subject k is the same person whatever the number of subjects, and looks the same whatever the other expressions.
-
-    Args:
-        folder: created when missing.
-        subjects: how many people, 1 to 100,000.
-        expressions: names out of `EXPRESSIONS`, each drawn once per person at full intensity.
-        seed: a number of 0 or more.
-        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
-        progress: called with (files written, files in all).
-
-    Returns:
-        The folder.
-
-    Raises:
-        InputError: no subjects, too many, a negative seed, or an unknown or repeated expression.
-        FileError: the folder cannot be written.
-    """
-    known = list(EXPRESSIONS)
-    if not 1 <= subjects <= 100_000:
-        raise InputError(f"The number of subjects must lie between 1 and 100000, not at {subjects}.")
-    if seed < 0:
-        raise InputError(f"The seed must be 0 or more, not {seed}.")
-    if not expressions or len(set(expressions)) != len(expressions):
-        raise InputError("Give at least one expression, and each one once.")
-    for name in expressions:
-        if name not in known:
-            raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
-    folder = make_folder(Path(folder))
-    faces = load_faces()
-    labels: list[tuple[str, str, str, str]] = []
-    for k in range(subjects):
-        person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}")
-        for name in expressions:
-            expression = faces.draw_expression(name, 1.0, np.random.default_rng([seed, k, 1 + known.index(name)]))
-            file = f"{person.name}_{name}.ply"
-            face = faces.face(person, expression)
-            rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
-            write_mesh(folder / file, plain_scan(face, rng) if raw else face)
-            labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
-            if progress is not None:
-                progress(len(labels), subjects * len(expressions))
-    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
-    if not raw:
-        write_landmark_indices(folder / "landmarks.csv", faces.landmarks)
-    return folder

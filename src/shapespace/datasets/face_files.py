@@ -1,0 +1,79 @@
+"""Files of simulated faces in correspondence, or of raw scans of them, with their labels and landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.datasets.faces import EXPRESSIONS, load_faces
+from shapespace.datasets.simulated_scan import plain_scan
+from shapespace.errors import InputError
+from shapespace.io.files import make_folder
+from shapespace.io.landmarks import write_landmark_indices
+from shapespace.io.meshes import write_mesh
+from shapespace.io.tables import write_rows
+
+
+def write_faces(
+    folder: Path,
+    *,
+    subjects: int,
+    expressions: Sequence[str] = ("neutral",),
+    seed: int = 0,
+    raw: bool = False,
+    wide: bool = False,
+    face_only: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
+
+    Subject k is the same person whatever the number of subjects, and looks the same whatever the other expressions.
+
+    Args:
+        folder: created when missing.
+        subjects: how many people, 1 to 100,000.
+        expressions: names out of `EXPRESSIONS`, each drawn once per person at full intensity.
+        seed: a number of 0 or more.
+        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
+        wide: whether people vary as widely as real ones; see `FaceGenerator.draw_person`.
+        face_only: whether to leave out ears, crown, nape and neck; see `FaceGenerator.cut_to_face`.
+        progress: called with (files written, files in all).
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: no subjects, too many, a negative seed, or an unknown or repeated expression.
+        FileError: the folder cannot be written.
+    """
+    known = list(EXPRESSIONS)
+    if not 1 <= subjects <= 100_000:
+        raise InputError(f"The number of subjects must lie between 1 and 100000, not at {subjects}.")
+    if seed < 0:
+        raise InputError(f"The seed must be 0 or more, not {seed}.")
+    if not expressions or len(set(expressions)) != len(expressions):
+        raise InputError("Give at least one expression, and each one once.")
+    for name in expressions:
+        if name not in known:
+            raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
+    folder = make_folder(Path(folder))
+    faces = load_faces()
+    labels: list[tuple[str, str, str, str]] = []
+    for k in range(subjects):
+        person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}", wide=wide)
+        for name in expressions:
+            expression = faces.draw_expression(name, 1.0, np.random.default_rng([seed, k, 1 + known.index(name)]))
+            file = f"{person.name}_{name}.ply"
+            face = faces.face(person, expression)
+            face = faces.cut_to_face(face) if face_only else face
+            rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
+            write_mesh(folder / file, plain_scan(face, rng) if raw else face)
+            labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
+            if progress is not None:
+                progress(len(labels), subjects * len(expressions))
+    write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)
+    if not raw:
+        write_landmark_indices(folder / "landmarks.csv", faces.face_landmarks if face_only else faces.landmarks)
+    return folder
