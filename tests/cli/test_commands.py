@@ -121,6 +121,17 @@ def test_data_faces_writes_corresponding_faces_with_labels(run: Run, tmp_path: P
     assert again.read_bytes() == (folder / labels[0]["file"]).read_bytes()
 
 
+def test_data_faces_writes_wide_people_and_faces_alone_and_says_so(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "wide"
+    assert run("data", "faces", "-o", folder, "--subjects", 1, "--wide", "--area", "face").code == 0
+    assert "vary widely" in (folder / "about.json").read_text(encoding="utf-8")
+    assert len(read_mesh(folder / "subject_000_neutral.ply").vertices) < 10_000
+    refused = run("data", "faces", "-o", tmp_path / "ict", "--source", "ict-facekit", "--wide")
+    assert refused.code == 2
+    assert "leave --wide out" in refused.err
+    assert not (tmp_path / "ict").exists()
+
+
 @pytest.mark.parametrize("names", ["", "neutral,neutral", "schadenfreude"])
 def test_data_faces_refuses_odd_lists_of_expressions(names: str, run: Run, tmp_path: Path) -> None:
     outcome = run("data", "faces", "-o", tmp_path / "faces", "--expressions", names)
