@@ -108,7 +108,7 @@ def test_labels_that_are_long_or_hold_what_cannot_be_printed_stay_within_the_fig
     def blank(count: int, size: tuple[int, int]) -> list[np.ndarray]:
         return [np.full((size[1], size[0], 3), 255, dtype=np.uint8)] * count
 
-    monkeypatch.setattr(figures.fit, "render_maps", lambda *_, size, **__: blank(5, size))
+    monkeypatch.setattr(figures.fit, "render", lambda *_, size, **__: blank(1, size)[0])
     monkeypatch.setattr(figures.fit, "render_series", lambda pictures, size, **_: blank(len(pictures), size))
     picture = decoded(draw_it(make_fit(head(6), label=NASTY)))
     assert (picture[:, -2:] == 255).all() and (picture[:, :2] == 255).all() and (picture < 128).any()
@@ -304,36 +304,6 @@ def test_the_quality_of_a_model_shows_what_is_there_and_refuses_what_is_none() -
             figures.quality_figure(wrong)
 
 
-def test_failed_and_doubtful_fits_stand_first_with_their_reasons(head: MakeHead) -> None:
-    mesh = head(8)
-    near, far = make_fit(mesh, label="near"), make_fit(mesh, label="far")
-    distances = {stage: 3 * values for stage, values in far.model_to_scan_mm.items()}
-    far = replace(far, model_to_scan_mm=distances)
-    doubtful = make_fit(mesh, label="doubtful", status="doubtful", reason="It covers little.")
-    failed = figures.Entry("failed", "failed", "The file is cut short.")
-    unfitted = figures.Entry("unfitted", "failed", "No start was found.", scan=mesh)
-    order = [near, doubtful, far, failed, unfitted]
-    figure = figures.gallery(order)
-    told = words(figure).split("\n")
-    names = [line for line in told if line in ("near", "far", "doubtful", "failed", "unfitted")]
-    assert names == ["failed", "unfitted", "doubtful", "far", "near"]
-    flat = " ".join(told)
-    for reason in ("The file is cut short.", "No start was found.", "It covers little."):
-        assert reason in flat
-    assert "2 failed, 1 doubtful" in flat
-    assert len(pictures(figure)) == 5
-    decoded(figure)
-
-
-def test_a_gallery_of_hundreds_shows_the_worst_and_counts_the_rest() -> None:
-    entries = [figures.Entry(f"fit {k}", "converged", mean_mm=float(k)) for k in range(400)]
-    figure = figures.gallery(entries, most=6)
-    told = words(figure)
-    assert len(pictures(figure)) == 6 and "fit 399" in told and "394 more fits" in told
-    with pytest.raises(InputError, match="without fits"):
-        figures.gallery([])
-
-
 @pytest.mark.parametrize("count", [1, 400])
 def test_error_curves_reach_their_quantiles(head: MakeHead, count: int) -> None:
     fit = make_fit(head(6))
@@ -348,7 +318,6 @@ def test_error_curves_reach_their_quantiles(head: MakeHead, count: int) -> None:
         figures.error_curves([])
     with pytest.raises(InputError, match="'dense'"):
         figures.error_curves([fit], stage="dense")
-    decoded(figures.error_curves({"a $b": far, "none": np.array([np.nan])}))
 
 
 def nothing_seen(fit: StagedFit) -> StagedFit:
@@ -362,7 +331,6 @@ OF_MANY_FITS = [
     figures.portrait_figure,
     figures.distance_maps,
     figures.aligned_grid,
-    figures.gallery,
     figures.error_curves,
     figures.threshold_figure,
 ]

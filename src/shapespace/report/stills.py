@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image as PillowImage
 
-from shapespace.report.colours import CLAY, DIVERGING, MODEL_COLOUR, SCAN_COLOUR
-from shapespace.report.render import Camera, Image, Layer, distance_layer, render_series
+from shapespace.report.colours import DIVERGING, MODEL_COLOUR, SCAN_COLOUR
+from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
     plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
     distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
-    (seen,) = render_series([[distances]], camera=camera, size=panel)
+    seen = render(distances, camera=camera, size=panel)
     return encoded(np.concatenate([plain, both, seen], axis=1))
 
 
@@ -59,8 +59,7 @@ def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
     camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
     # Points are drawn as balls, of a size that joins them whatever the unit of the file.
     radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    (image,) = render_series([[Layer(mesh, CLAY, point_radius_mm=max(radius, 1e-9))]], camera=camera, size=panel)
-    return encoded(image)
+    return encoded(render(Layer(mesh, point_radius_mm=max(radius, 1e-9)), camera=camera, size=panel))
 
 
 def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:

@@ -25,14 +25,11 @@ from shapespace.report.figures.fit import (
     threshold_figure,
 )
 from shapespace.report.figures.many import (
-    Entry,
     aligned_grid,
     distance_maps,
     error_curves,
     faces_grid,
-    gallery,
     portrait_figure,
-    worst_first,
 )
 from shapespace.report.figures.model import mean_figure, mode_animation, modes_figure, quality_figure, spectrum_figure
 from shapespace.report.figures.recognition import (
@@ -50,7 +47,6 @@ __all__ = [
     "STAGE_WORDS",
     "THRESHOLDS_MM",
     "Coefficients",
-    "Entry",
     "StagedFit",
     "aligned_grid",
     "b_plane",
@@ -65,7 +61,6 @@ __all__ = [
     "error_curves",
     "face_map_figure",
     "faces_grid",
-    "gallery",
     "history_figure",
     "importance_figure",
     "learning_curve_figure",
@@ -83,5 +78,4 @@ __all__ = [
     "spectrum_figure",
     "stages_figure",
     "threshold_figure",
-    "worst_first",
 ]

@@ -75,15 +75,11 @@ class Row:
         panels: (H, W, 3) pictures.
         captions: one above each panel; empty for none.
         heading: above the row.
-        notes: one below each panel; empty for none.
-        frames: colour of the line around each panel, None for no line; empty for none at all.
     """
 
     panels: Sequence[Image]
     captions: Sequence[str] = ()
     heading: str = ""
-    notes: Sequence[str] = ()
-    frames: Sequence[Colour | None] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +145,7 @@ def grid(
     widest = max(row.panels[0].shape[1] for row in rows)
     total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
     texts: list[tuple[float, float, str, dict[str, Any]]] = []
-    pictures: list[tuple[int, float, Image, Colour | None]] = []
+    pictures: list[tuple[int, float, Image]] = []
     y = 6.0
 
     def write(x: float, text: str, width: float, size: float, **style: Any) -> float:
@@ -162,7 +158,7 @@ def grid(
     y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
     for r, row in enumerate(rows):
         y += 10 if r and any(row.captions) and not row.heading else 0
-        panels = row.panels if any(row.frames) else without_empty_rows(row.panels)
+        panels = without_empty_rows(row.panels)
         high, wide = panels[0].shape[:2]
         left = (total_w - len(row.panels) * wide - (len(row.panels) - 1) * _GAP) // 2 if len(rows) == 1 else 0
         if row.heading:
@@ -173,15 +169,8 @@ def grid(
                 write(x, text, wide, TEXT, ha="center", color=INK)
                 for x, text in zip(centres, row.captions, strict=True)
             )
-        frames = row.frames or [None] * len(row.panels)
-        for k, (panel, frame) in enumerate(zip(panels, frames, strict=True)):
-            pictures.append((left + k * (wide + _GAP), y, panel, frame))
+        pictures += [(left + k * (wide + _GAP), y, panel) for k, panel in enumerate(panels)]
         y += high + _GAP
-        if any(row.notes):
-            y += 4 + max(
-                write(x, text, wide - 6, SMALL, ha="center", color=GREY)
-                for x, text in zip(centres, row.notes, strict=True)
-            )
     if keys:
         y += 4
         y += _place_keys(texts, keys, y, total_w)
@@ -198,24 +187,18 @@ def grid(
 
 
 def _drawn(
-    pictures: Sequence[tuple[int, float, Image, Colour | None]],
+    pictures: Sequence[tuple[int, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
     total_w: int,
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
     figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
-    for x, top, image, frame in pictures:
+    for x, top, image in pictures:
         high, wide = image.shape[:2]
-        axes = figure.add_axes(
-            (x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h), frameon=frame is not None
-        )
+        axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
         axes.imshow(image, interpolation="nearest", aspect="auto")
-        axes.set_xticks([])
-        axes.set_yticks([])
-        if frame is not None:
-            for spine in axes.spines.values():
-                spine.set(color=frame, linewidth=2.2)
+        axes.set_axis_off()
     for x, top, text, style in texts:
         figure.text(x / total_w, 1 - top / total_h, escaped(text), **style)
     return figure

@@ -48,7 +48,7 @@ from shapespace.report.figures.draw import (
     unknown,
     view,
 )
-from shapespace.report.render import Image, Layer, distance_layer, render_maps, render_series
+from shapespace.report.render import Image, Layer, distance_layer, render, render_series
 from shapespace.report.staged import StagedFit, scale_end
 from shapespace.types import FloatArray, Mesh
 
@@ -140,7 +140,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         seen = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
         first = view(surroundings(fit), len(_SIDES))
         for row, layer in zip(panels, (on_model, on_scan), strict=True):
-            row += render_series([[layer]], camera=seen.camera, size=first.size)
+            row.append(render(layer, camera=seen.camera, size=first.size))
     unseen, beyond = unknown(forward), unknown(backward)
     keys: list[tuple[str, Colour]] = []
     if unseen:
@@ -171,12 +171,15 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
     """
     several = [fits] if isinstance(fits, StagedFit) else list(fits)
     table = np.array([WITHIN_COLOUR, BEYOND_COLOUR])
-    ranges = [(limit - 1e-3, limit + 1e-3) for limit in THRESHOLDS_MM]
     rows: list[Row] = []
     for fit in several:
         far = np.abs(fit.model_to_scan_mm["final"])
         seen = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
-        panels = render_maps(fit.surfaces["final"], far, ranges, colormap=table, camera=seen.camera, size=seen.size)
+        maps = [
+            [Layer(fit.surfaces["final"], scalars=far, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+            for limit in THRESHOLDS_MM
+        ]
+        panels = render_series(maps, camera=seen.camera, size=seen.size)
         known = absolute(far)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
         captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]

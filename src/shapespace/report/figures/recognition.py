@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from shapespace.errors import InputError
-from shapespace.report.colours import CATEGORIES, CLAY, SEQUENTIAL, oklab
+from shapespace.report.colours import CATEGORIES, SEQUENTIAL, oklab
 from shapespace.report.figures.draw import (
     DPI,
     FORWARD,
@@ -38,7 +38,7 @@ from shapespace.report.figures.draw import (
     view,
     wrap,
 )
-from shapespace.report.render import Image, Layer, render, render_layers
+from shapespace.report.render import Image, Layer, render
 from shapespace.report.staged import nice_ceiling
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -353,7 +353,7 @@ def face_map_figure(
     size = view(mesh.vertices, columns).size
     for yaw in _SIDES:
         camera = view(mesh.vertices, columns, yaw_deg=yaw).camera
-        panels.append(render_layers([layer], camera=camera, size=size))
+        panels.append(render(layer, camera=camera, size=size))
     captions = ["front", "three-quarter"]
     if ranked:
         panels.append(np.full_like(panels[0], 255))
@@ -448,7 +448,7 @@ def mesh_rows_figure(
     drawn = [
         Row(
             [
-                render(mesh, camera=seen.camera, size=seen.size, colour=CLAY)
+                render(Layer(mesh), camera=seen.camera, size=seen.size)
                 if mesh is not None
                 else np.full((seen.size[1], seen.size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
                 for _, mesh in pictures
