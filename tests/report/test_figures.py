@@ -495,13 +495,14 @@ def test_lines_of_the_b_plot_pass_through_neutral_along_the_expressions() -> Non
     stddev, neutral_z = np.array([30.0, 8.0, 2.0]), np.array([0.5, -1.0, 0.2])
     direction = np.array([1.0, -2.0, 0.5])
     points = neutral_z + np.arange(1, 5)[:, None] * direction
-    figure = figures.b_plane(scans(points, "fear", stddev), neutral_b=neutral_z * stddev, neutral_z=neutral_z)
+    neutral = figures.Coefficients("neutral", "", 0, neutral_z * stddev, neutral_z)
+    figure = figures.b_plane(scans(points, "fear", stddev), neutral=neutral)
     line = next(line for line in figure.axes[0].lines if len(line.get_xdata()) == 2)
     ends = np.stack([line.get_xdata(), line.get_ydata()], axis=1).astype(float)
     np.testing.assert_allclose(ends[0], (neutral_z * stddev)[:2], atol=1e-9)
     step = ends[1] - ends[0]
     np.testing.assert_allclose(step / step[0], (direction * stddev)[:2] / (direction * stddev)[0])
-    decoded(figures.b_space(scans(points, "fear", stddev), neutral_b=neutral_z * stddev, neutral_z=neutral_z))
+    decoded(figures.b_space(scans(points, "fear", stddev), neutral=neutral))
 
 
 def test_without_a_neutral_face_no_lines_are_drawn() -> None:
@@ -521,10 +522,10 @@ def test_coefficients_are_scattered_for_any_number_of_labels_and_modes(labels: l
     told = words(figure) + "".join(text.get_text() for legend in figure.legends for text in legend.get_texts())
     assert ("and 4 more" in told) == (len(labels) == 20)
     if modes >= 3:
-        decoded(figures.scatter_3d(every))
+        decoded(figures.b_space(every))
     else:
         with pytest.raises(InputError, match="three coefficients"):
-            figures.scatter_3d(every)
+            figures.b_space(every)
 
 
 @pytest.mark.parametrize("size_mm", [3.0, 300.0, 20000.0])
@@ -533,7 +534,7 @@ def test_nothing_is_cut_or_covered_in_space(labels: int, size_mm: float) -> None
     rng = np.random.default_rng(1)
     names = [f"surprise_mouth_open_{k}" for k in range(labels)]
     points = [point for name in names for point in scans(rng.normal(size=(2, 3)), name, np.full(3, size_mm))]
-    figure = figures.b_space(points, neutral_b=np.zeros(3), neutral_z=np.zeros(3))
+    figure = figures.b_space(points, neutral=figures.Coefficients("", "", 0, np.zeros(3), np.zeros(3)))
     picture = decoded(figure)
     (legend,) = figure.legends
     boxes = [legend.get_window_extent()]
@@ -557,7 +558,7 @@ def test_coefficients_that_do_not_go_together_are_refused() -> None:
     with pytest.raises(InputError, match="different models"):
         figures.scatter_matrix([one, other])
     with pytest.raises(InputError, match="without scans"):
-        figures.scatter_3d([])
+        figures.b_space([])
     with pytest.raises(InputError, match="two coefficients"):
         figures.b_plane(scans(np.ones((3, 1)), "a", np.ones(1)))
 

@@ -300,8 +300,7 @@ class FolderPage:
             more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
             out.append(Text(more))
         if sample:
-            bar = stills.colour_bar()
-            out.append(ScaleKey(limit, self.page.image(bar.data, bar.size, "from blue over pale to red")))
+            out.append(ScaleKey(limit, self.page.image(stills.colour_bar(), "from blue over pale to red")))
         return [*out, Gallery([self.card(fit, limit) for fit in self.carded])]
 
     def card(self, fit: SavedFit, limit_mm: float) -> Card:
@@ -336,7 +335,7 @@ class FolderPage:
             still, alt = stills.mesh_still(self.posed(fit)), f"The fitted surface of {fit.name}"
         else:
             still, alt = stills.mesh_still(self.raw_scan(fit)), f"The raw scan {fit.name}, as its axes stand"
-        return self.page.image(still.data, still.size, alt)
+        return self.page.image(still, alt)
 
     def posed(self, fit: SavedFit) -> Mesh:
         """Return NAME.fitted.ply in the model's frame, so that it looks at the camera."""

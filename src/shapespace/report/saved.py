@@ -22,6 +22,7 @@ from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
+from shapespace.report.wording import printable
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.types import FloatArray, Mesh
 
@@ -200,8 +201,8 @@ class SavedFit:
         """Return the fit with more known beside its record, by the names of `FitEntry`."""
         return SavedFit(structs.replace(self.entry, **known), self.record)
 
-    def numbers(self, key: Literal["b", "z", "b_stddev", "shrinkage"]) -> FloatArray:
-        """Return coefficients of the record, or what belongs to them, (K,).
+    def numbers(self, key: Literal["b", "z"]) -> FloatArray:
+        """Return coefficients of the record, (K,).
 
         Raises:
             FileFormatError: there are none, or not as many as coefficients.
@@ -264,7 +265,7 @@ def _found(folder: Folder, file: str) -> SavedFit:
         return f"{name}.{ending}" if (folder.root / f"{name}.{ending}").is_file() else None
 
     entry = FitEntry(
-        name=str(_printable(name)),
+        name=printable(name),
         json=file,
         stages=beside("stages.npz"),
         fitted=beside("fitted.ply"),
@@ -285,17 +286,7 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
     """
     if not fit.entry.stages:
         raise FileFormatError(f"{fit.name}: its stages were not saved; fit the scan again with --stages.")
-    return StagedFit.from_arrays(
-        folder.arrays(fit.entry.stages),
-        name=fit.name,
-        label=fit.label,
-        status=fit.status,
-        reason=fit.reason,
-        b=fit.numbers("b"),
-        z=fit.numbers("z"),
-        b_stddev=fit.numbers("b_stddev"),
-        shrinkage=fit.numbers("shrinkage"),
-    )
+    return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
 
 
 def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None) -> ShapeModel:
@@ -352,11 +343,9 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo,
 def _printable(value: object) -> object:
     """Return JSON content whose strings have control characters and lone surrogates replaced."""
     if isinstance(value, str):
-        return "".join(
-            c if c in "\n\t" or (c.isprintable() or c.isspace()) else "\N{REPLACEMENT CHARACTER}" for c in value
-        )
+        return printable(value)
     if isinstance(value, list):
         return [_printable(item) for item in cast(list[object], value)]
     if isinstance(value, dict):
-        return {str(_printable(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
+        return {printable(str(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
     return value

@@ -21,11 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.report.staged import StagedFit, measured_mm
+from shapespace.schemas import to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.staged import StagedFit
 
 SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 """The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
@@ -106,8 +107,8 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
     try:
-        header = json.dumps({"facts": _plain(facts), "arrays": specs}, allow_nan=False).encode("ascii")
-    except (TypeError, ValueError) as error:
+        header = json.dumps({"facts": to_json(facts), "arrays": specs}, allow_nan=False).encode("ascii")
+    except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The facts of a scene must be plain values that JSON can hold ({error}).") from error
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
@@ -423,17 +424,6 @@ def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
-def _plain(value: Any) -> Any:
-    """Return `value` with numbers that are not finite as None, which JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in cast(list[Any], value)]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any] | Steps:
     if vertices > 1 << 16:
         return faces.astype(np.uint32)
@@ -482,12 +472,12 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
 
 
 def _mean(signed_mm: FloatArray) -> float:
-    known = np.abs(signed_mm[np.isfinite(signed_mm)])
+    known = measured_mm(signed_mm)
     return float(known.mean()) if len(known) else math.nan
 
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
-    known = np.sort(np.abs(signed_mm[np.isfinite(signed_mm)]))
+    known = np.sort(measured_mm(signed_mm))
     within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
     return (1.0 - within / max(len(known), 1)).astype(np.float32)
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from PIL import Image as PillowImage
@@ -21,17 +20,8 @@ PANEL = (176, 232)
 """Width and height of a panel in pixels."""
 
 
-@dataclass(frozen=True)
-class Still:
-    """A picture ready to embed.
-
-    Args:
-        data: WebP.
-        size: width and height in pixels.
-    """
-
-    data: bytes
-    size: tuple[int, int]
+Still: TypeAlias = tuple[bytes, tuple[int, int]]
+"""WebP, and its width and height in pixels."""
 
 
 def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
@@ -68,10 +58,10 @@ def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> S
     return encoded(np.repeat(row[None], 10, axis=0), lossless=True)
 
 
-def encoded(image: Image, *, lossless: bool = False) -> Still:
+def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
     """Return pixels (H, W, 3) uint8 as WebP."""
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(image)).save(
-        stream, format="WEBP", lossless=lossless, quality=84, method=3
+        stream, format="WEBP", lossless=lossless, quality=quality, method=effort
     )
-    return Still(stream.getvalue(), (image.shape[1], image.shape[0]))
+    return stream.getvalue(), (image.shape[1], image.shape[0])

@@ -11,7 +11,7 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
-from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_3d, scatter_matrix
+from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_matrix
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit import (
     THRESHOLDS_MM,
@@ -72,7 +72,6 @@ __all__ = [
     "portrait_figure",
     "quality_figure",
     "regions_figure",
-    "scatter_3d",
     "scatter_matrix",
     "signed_maps",
     "spectrum_figure",

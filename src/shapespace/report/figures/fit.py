@@ -30,7 +30,6 @@ from shapespace.report.figures.draw import (
     STAGE_WORDS,
     TEXT,
     Row,
-    absolute,
     chart,
     charts,
     distance_scale,
@@ -49,7 +48,7 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.render import Image, Layer, distance_layer, render, render_series
-from shapespace.report.staged import StagedFit, scale_end
+from shapespace.report.staged import StagedFit, measured_mm, scale_end
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -180,7 +179,7 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
             for limit in THRESHOLDS_MM
         ]
         panels = render_series(maps, camera=seen.camera, size=seen.size)
-        known = absolute(far)
+        known = measured_mm(far)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
         captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
         rows.append(Row(panels, captions, short(fit.label, 60) if len(several) > 1 else ""))
@@ -201,7 +200,8 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
     vertices that the scan shows count, and scan points within the model's rim.
     """
     both = {
-        stage: (absolute(fit.model_to_scan_mm[stage]), absolute(fit.scan_to_model_mm[stage])) for stage in fit.surfaces
+        stage: (measured_mm(fit.model_to_scan_mm[stage]), measured_mm(fit.scan_to_model_mm[stage]))
+        for stage in fit.surfaces
     }
     every = np.concatenate([values for pair in both.values() for values in pair])
     low, high = _decades(every)
@@ -392,7 +392,7 @@ def _surface(fit: StagedFit, stage: str) -> Mesh:
 
 
 def _summary(values: FloatArray) -> str:
-    far = absolute(values)
+    far = measured_mm(values)
     if not len(far):
         return "no point counted"
     return f"mean {mm(float(far.mean()))}, 95 % within {mm(float(np.percentile(far, 95)))}"

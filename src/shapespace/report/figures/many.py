@@ -26,7 +26,6 @@ from shapespace.report.figures.draw import (
     TEXT,
     Row,
     Scale,
-    absolute,
     chart,
     counted,
     distance_scale,
@@ -45,7 +44,7 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
-from shapespace.report.staged import StagedFit, nice_ceiling, scale_end
+from shapespace.report.staged import StagedFit, measured_mm, nice_ceiling, scale_end
 from shapespace.types import FloatArray, Mesh
 
 _DOUBTFUL = as_hex((0.90, 0.55, 0.05))
@@ -66,7 +65,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(absolute(fit.model_to_scan_mm[stage])) for fit in fits]
+    far = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
     fits = [fit for fit, values in zip(fits, far, strict=True) if len(values)]
     far = [values for values in far if len(values)]
     if not far:
@@ -190,7 +189,7 @@ def distance_maps(
     """Draw the distance from each fitted model to its scan, on one scale up to the 99th percentile of all."""
     if not fits:
         raise InputError(f"{plain(title)}: there is no fit to draw.")
-    known = np.concatenate([absolute(f.model_to_scan_mm["final"]) for f in fits])
+    known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
     top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
     images = _equal_views(
         fits,
