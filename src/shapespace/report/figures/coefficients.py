@@ -205,12 +205,7 @@ def b_space(
                     axes.plot([point[0]] * 2, [point[1]] * 2, [low[2] - room[2], point[2]], color="#cfd1d5", lw=0.6)
         if neutral is not None:
             axes.plot(*neutral.b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
-        _style_space(axes, low - room, high + room)
-        # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
-        wider = _wider_than_three(axes.zaxis)
-        axes.tick_params(axis="z", pad=wider / 2 - 1)
-        axes.zaxis.labelpad = 2 + 0.6 * wider
-        aside = wider / 72 * DPI / WIDTH
+        aside = _style_space(axes, low - room, high + room) / 72 * DPI / WIDTH
         axes.set_position((place[0] + k * aside, place[1], place[2] - aside, place[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
@@ -222,8 +217,8 @@ def b_space(
     return figure
 
 
-def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> None:
-    """Give a plot in space its names, its ends (3,), and quiet panes."""
+def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
+    """Give a plot in space its names, its ends (3,), and quiet panes; return the points by which it is wider."""
     for axis, at in zip("xyz", range(3), strict=True):
         getattr(axes, f"set_{axis}label")(f"b{at + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
         getattr(axes, f"set_{axis}lim")(low[at], high[at])
@@ -232,6 +227,11 @@ def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> None:
     axes.zaxis.set_rotate_label(False)
     axes.zaxis.label.set_rotation(90)
     axes.tick_params(labelsize=SMALL - 2, colors=GREY, pad=-1)
+    # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
+    wider = _wider_than_three(axes.zaxis)
+    axes.tick_params(axis="z", pad=wider / 2 - 1)
+    axes.zaxis.labelpad = 2 + 0.6 * wider
+    return wider
 
 
 def _wider_than_three(axis: Any) -> float:
