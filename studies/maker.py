@@ -18,7 +18,8 @@ from shapespace.recognise import evaluate
 from shapespace.schemas import Part, Target
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray, IntArray
-from simulated import Fits, StudyConfig, model_path, person_path, read_fits
+from simulated import StudyConfig
+from study_fits import Fits, model_path, person_path, read_fits
 
 Told = Callable[[str], None]
 TextArray = npt.NDArray[np.str_]

@@ -17,13 +17,8 @@ from shapespace.schemas import MeshesPart, Part, RowOfMeshes, Still
 from shapespace.study import parts
 from shapespace.study.parts import target, words
 from shapespace.types import FloatArray
-from simulated import (
-    PAPER_EXPRESSIONS,
-    STATUSES,
-    read_fits,
-    stranger_path,
-    stranger_shown,
-)
+from simulated import PAPER_EXPRESSIONS, stranger_shown
+from study_fits import STATUSES, read_fits, stranger_path
 
 _STRANGERS_LEAST = 0.85
 _RANK_1_LEAST = 0.95

@@ -28,14 +28,8 @@ from shapespace.schemas import LinesPart, Part, Point, TextPart
 from shapespace.study import parts
 from shapespace.study.parts import target, words
 from shapespace.types import IntArray
-from simulated import (
-    PAPER_EXPRESSIONS,
-    STATUSES,
-    StudyConfig,
-    paper_path,
-    paper_shown,
-    read_paper,
-)
+from simulated import PAPER_EXPRESSIONS, StudyConfig, paper_shown
+from study_fits import STATUSES, paper_path, read_paper
 
 _CEILING_MOST = 0.97
 _LINE_R2_LEAST = 0.98
