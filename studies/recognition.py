@@ -28,7 +28,7 @@ from shapespace.batch.workers import cores
 from shapespace.errors import ShapespaceError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.report.html import require_report_extra, write_report
-from shapespace.study.parts import Part
+from shapespace.schemas import Part
 from simulated import StudyConfig, prepare_folder, run_fits, run_jobs
 from study_people import StudyPeople
 from tables import SHAPE_SPACES, make_tables, seconds_of_study

@@ -19,8 +19,8 @@ from shape_spaces import (
 )
 from shapespace.errors import FileFormatError
 from shapespace.recognise import evaluate
+from shapespace.schemas import Part
 from shapespace.study import parts
-from shapespace.study.parts import Part
 from shapespace.types import FloatArray
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
@@ -33,12 +32,11 @@ from shapespace.io.files import make_folder, read_bytes, write_bytes, write_text
 from shapespace.model.additive import AdditiveModel, Told
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from study_fits import STATUSES, model_path, paper_path, person_path, stranger_path
 from study_people import StudyPeople
 
 MIRRORED = ", mirrored"
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
-_SAVED = ("z", "z_stddev", "status", "error_mm", "seconds", "e_beside", "e_together", "a_together")
-STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
 Job: TypeAlias = tuple[Callable[..., None], tuple[Any, ...]]
@@ -115,37 +113,6 @@ class StudyConfig:
         fold = np.empty(len(order), dtype=np.int32)
         fold[order] = np.arange(len(order)) % self.folds
         return fold
-
-
-@dataclass(frozen=True, eq=False)
-class Fits:
-    """Every scan of a study fitted with the models of all folds.
-
-    Args:
-        z: (F, N, K) coefficients in standard deviations; K is that of the largest model and the rest is 0; NaN where a
-            fit failed, or was not needed.
-        z_stddev: (F, N, K) theirs.
-        status: (F, N) index of `STATUSES`; -1 where none was needed.
-        error_mm: (N,) mean distance of the vertices to the true ones, in the fold where the scan is tested.
-        seconds: (N,) of that fit.
-        e_beside: (F, N, Ke) expressions by tying each scan with the person's neutral scan, less that scan's; NaN where
-            there is none. Ke is that of the largest model and the rest is 0.
-        e_together: (F, N, Ke) by tying all expressive scans of the person, none of them known as anything.
-        a_together: (F, P, Ka) the identity of those.
-        person: (N,) who is scanned.
-        shown: (N,) index of `StudyPeople.shown`.
-    """
-
-    z: FloatArray
-    z_stddev: FloatArray
-    status: IntArray
-    error_mm: FloatArray
-    seconds: FloatArray
-    e_beside: FloatArray
-    e_together: FloatArray
-    a_together: FloatArray
-    person: IntArray
-    shown: IntArray
 
 
 def prepare_folder(folder: Path, config: StudyConfig) -> None:
@@ -259,26 +226,6 @@ def _run(pool: Executor | None, jobs: Sequence[Job]) -> Iterator[None]:
                     "A worker was stopped from outside, most likely for lack of memory; run again with fewer --jobs."
                 ) from error
             yield
-
-
-def model_path(folder: Path, fold: int) -> Path:
-    """Return the file of the model made without the subjects of `fold`."""
-    return folder / f"fold_{fold}.h5"
-
-
-def person_path(folder: Path, person: int) -> Path:
-    """Return the file of a person's fits."""
-    return folder / "fits" / f"person_{person:03d}.npz"
-
-
-def paper_path(folder: Path) -> Path:
-    """Return the file of the fits of the paper's experiment 1."""
-    return folder / "fits" / "experiment_1.npz"
-
-
-def stranger_path(folder: Path, person: int) -> Path:
-    """Return the file of a stranger's fits."""
-    return folder / "fits" / f"stranger_{person:03d}.npz"
 
 
 _ict_folder: Path | None = None
@@ -493,60 +440,3 @@ def _tied(
                 _, e = model.tie([known[0], known[row]])
                 beside[fold, row, : model.n_expression] = e[1] - e[0]
     return {"e_beside": beside, "e_together": together, "a_together": identity}
-
-
-def read_fits(paths: Sequence[Path], n_modes: int) -> Fits:
-    """Return the fits in `paths`, one file a person, with `n_modes` coefficients.
-
-    Raises:
-        FileError: a file cannot be read.
-        FileFormatError: a file is damaged.
-    """
-    parts: list[dict[str, npt.NDArray[Any]]] = []
-    for path in paths:
-        part = _read_arrays(path, _SAVED)
-        for key, rest in (("z", 0.0), ("z_stddev", 1.0)):
-            whole = np.full((*part[key].shape[:2], n_modes), rest)
-            whole[..., : part[key].shape[2]] = part[key]
-            part[key] = whole
-        parts.append(part)
-    for key in ("e_beside", "e_together", "a_together"):
-        most = max(part[key].shape[2] for part in parts)
-        for part in parts:
-            part[key] = np.pad(part[key], ((0, 0), (0, 0), (0, most - part[key].shape[2])))
-    counts = [parts[0]["z"].shape[1]] * len(parts)
-    return Fits(
-        z=_joined(parts, "z", 1),
-        z_stddev=_joined(parts, "z_stddev", 1),
-        status=np.concatenate([part["status"] for part in parts], axis=1).astype(np.int32),
-        error_mm=_joined(parts, "error_mm", 0),
-        seconds=_joined(parts, "seconds", 0),
-        e_beside=_joined(parts, "e_beside", 1),
-        e_together=_joined(parts, "e_together", 1),
-        a_together=_joined(parts, "a_together", 1),
-        person=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
-        shown=np.tile(np.arange(counts[0], dtype=np.int32), len(parts)),
-    )
-
-
-def read_paper(path: Path) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return b (17, K) mm of experiment 1, neutral first, the model's stddev (K,), and the status of each fit.
-
-    Raises:
-        FileError: the file cannot be read.
-        FileFormatError: it is damaged.
-    """
-    found = _read_arrays(path, ("b", "stddev", "status"))
-    return found["b"].astype(np.float64), found["stddev"].astype(np.float64), found["status"].astype(np.int32)
-
-
-def _read_arrays(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as loaded:
-            return {name: np.asarray(loaded[name]) for name in names}
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path} is damaged; delete it and run the study again.") from error
-
-
-def _joined(parts: Sequence[dict[str, npt.NDArray[Any]]], key: str, axis: int) -> FloatArray:
-    return np.concatenate([part[key] for part in parts], axis=axis).astype(np.float64)

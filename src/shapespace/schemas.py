@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, TypeVar, cast
+from typing import Any, ClassVar, Literal, TypeVar, cast, get_args
 
 import msgspec
 from msgspec import Struct
@@ -348,16 +348,15 @@ class Target(Struct, frozen=True, kw_only=True):
     note: str | None = ""
 
 
-class Part(Struct, frozen=True, kw_only=True):
-    """What each part of a study has; one of `level` 2 begins a chapter."""
+class Part(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="kind"):
+    """What each part of a study has; its class is its `kind` in JSON. One of `level` 2 begins a chapter."""
 
-    kind: str
     title: str | None = ""
     note: str | None = ""
     level: int | None = None
 
 
-class TextPart(Part, frozen=True, kw_only=True):
+class TextPart(Part, frozen=True, kw_only=True, tag="text"):
     """Paragraphs."""
 
     text: str | tuple[str, ...]
@@ -370,14 +369,14 @@ class TableColumn(Struct, frozen=True, kw_only=True):
     kind: Literal["text", "percent", "interval", "number", "mm", "p", "count"] = "text"
 
 
-class TablePart(Part, frozen=True, kw_only=True):
+class TablePart(Part, frozen=True, kw_only=True, tag="table"):
     """A table, its cells by the kinds of their columns; null where nothing is known."""
 
     columns: tuple[TableColumn, ...]
     rows: tuple[tuple[Any, ...], ...]
 
 
-class ConfusionPart(Part, frozen=True, kw_only=True):
+class ConfusionPart(Part, frozen=True, kw_only=True, tag="confusion"):
     """How many scans of each true class (rows) were taken for each class (columns)."""
 
     classes: tuple[str, ...]
@@ -394,7 +393,7 @@ class Bin(Struct, frozen=True, kw_only=True):
     count: float = 0
 
 
-class CalibrationPart(Part, frozen=True, kw_only=True):
+class CalibrationPart(Part, frozen=True, kw_only=True, tag="calibration"):
     """How often answers are right against the probability stated."""
 
     bins: tuple[Bin, ...]
@@ -402,7 +401,7 @@ class CalibrationPart(Part, frozen=True, kw_only=True):
     brier: float | None = None
 
 
-class LearningCurvePart(Part, frozen=True, kw_only=True):
+class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
     """Accuracy against the number of people learned from; `band` says what `low` and `high` are."""
 
     subjects: tuple[float, ...]
@@ -413,7 +412,7 @@ class LearningCurvePart(Part, frozen=True, kw_only=True):
     ceiling: float | None = None
 
 
-class ModesPart(Part, frozen=True, kw_only=True):
+class ModesPart(Part, frozen=True, kw_only=True, tag="modes"):
     """How much each mode carries of the decision, in `unit`."""
 
     importance: tuple[float, ...]
@@ -421,7 +420,7 @@ class ModesPart(Part, frozen=True, kw_only=True):
     unit: str = "importance"
 
 
-class FaceMapPart(Part, frozen=True, kw_only=True):
+class FaceMapPart(Part, frozen=True, kw_only=True, tag="face_map"):
     """A surface in an .npz file with a value a vertex, and the share of each region."""
 
     arrays: str
@@ -442,7 +441,7 @@ class Point(Struct, frozen=True, kw_only=True):
     intensity: float | None = None
 
 
-class LinesPart(Part, frozen=True, kw_only=True):
+class LinesPart(Part, frozen=True, kw_only=True, tag="lines"):
     """Expressions as lines through the neutral face."""
 
     points: tuple[Point, ...]
@@ -463,7 +462,7 @@ class RowOfMeshes(Struct, frozen=True, kw_only=True):
     label: str = ""
 
 
-class MeshesPart(Part, frozen=True, kw_only=True):
+class MeshesPart(Part, frozen=True, kw_only=True, tag="meshes"):
     """Stills of meshes in rows."""
 
     rows: tuple[RowOfMeshes, ...]
@@ -477,7 +476,7 @@ class Series(Struct, frozen=True, kw_only=True):
     label: str = ""
 
 
-class CurvePart(Part, frozen=True, kw_only=True):
+class CurvePart(Part, frozen=True, kw_only=True, tag="curve"):
     """One measure against another; `x` and `y` say what they are."""
 
     series: tuple[Series, ...]
@@ -485,18 +484,11 @@ class CurvePart(Part, frozen=True, kw_only=True):
     y: str = "y"
 
 
-PARTS: Mapping[str, type[Part]] = {
-    "text": TextPart,
-    "table": TablePart,
-    "confusion": ConfusionPart,
-    "calibration": CalibrationPart,
-    "learning_curve": LearningCurvePart,
-    "modes": ModesPart,
-    "face_map": FaceMapPart,
-    "lines": LinesPart,
-    "meshes": MeshesPart,
-    "curve": CurvePart,
-}
+_PARTS = (
+    TextPart | TablePart | ConfusionPart | CalibrationPart | LearningCurvePart | ModesPart | FaceMapPart | LinesPart
+    | MeshesPart | CurvePart
+)  # fmt: skip
+PARTS: Mapping[str, type[Part]] = {str(kind.__struct_config__.tag): kind for kind in get_args(_PARTS)}
 """What a part is, by its kind."""
 
 
@@ -506,12 +498,7 @@ def read_part(content: object, where: str, again: str = STUDY_AGAIN) -> Part:
     Raises:
         FileFormatError: it is damaged, or of a kind that this version does not know.
     """
-    kind = read(Part, content, where, again).kind
-    if kind not in PARTS:
-        raise FileFormatError(
-            f"{where} is damaged: it has a part of the kind {kind[:80]!r}, which this version does not know; {again}."
-        )
-    return read(PARTS[kind], content, where, again)
+    return read(cast(type[Part], _PARTS), content, where, again)
 
 
 class Recognition(Struct, frozen=True, kw_only=True):

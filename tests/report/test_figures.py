@@ -108,7 +108,7 @@ def test_labels_that_are_long_or_hold_what_cannot_be_printed_stay_within_the_fig
     def blank(count: int, size: tuple[int, int]) -> list[np.ndarray]:
         return [np.full((size[1], size[0], 3), 255, dtype=np.uint8)] * count
 
-    monkeypatch.setattr(figures.fit, "render_maps", lambda *_, size, **__: blank(5, size))
+    monkeypatch.setattr(figures.fit, "render", lambda *_, size, **__: blank(1, size)[0])
     monkeypatch.setattr(figures.fit, "render_series", lambda pictures, size, **_: blank(len(pictures), size))
     picture = decoded(draw_it(make_fit(head(6), label=NASTY)))
     assert (picture[:, -2:] == 255).all() and (picture[:, :2] == 255).all() and (picture < 128).any()
@@ -304,36 +304,6 @@ def test_the_quality_of_a_model_shows_what_is_there_and_refuses_what_is_none() -
             figures.quality_figure(wrong)
 
 
-def test_failed_and_doubtful_fits_stand_first_with_their_reasons(head: MakeHead) -> None:
-    mesh = head(8)
-    near, far = make_fit(mesh, label="near"), make_fit(mesh, label="far")
-    distances = {stage: 3 * values for stage, values in far.model_to_scan_mm.items()}
-    far = replace(far, model_to_scan_mm=distances)
-    doubtful = make_fit(mesh, label="doubtful", status="doubtful", reason="It covers little.")
-    failed = figures.Entry("failed", "failed", "The file is cut short.")
-    unfitted = figures.Entry("unfitted", "failed", "No start was found.", scan=mesh)
-    order = [near, doubtful, far, failed, unfitted]
-    figure = figures.gallery(order)
-    told = words(figure).split("\n")
-    names = [line for line in told if line in ("near", "far", "doubtful", "failed", "unfitted")]
-    assert names == ["failed", "unfitted", "doubtful", "far", "near"]
-    flat = " ".join(told)
-    for reason in ("The file is cut short.", "No start was found.", "It covers little."):
-        assert reason in flat
-    assert "2 failed, 1 doubtful" in flat
-    assert len(pictures(figure)) == 5
-    decoded(figure)
-
-
-def test_a_gallery_of_hundreds_shows_the_worst_and_counts_the_rest() -> None:
-    entries = [figures.Entry(f"fit {k}", "converged", mean_mm=float(k)) for k in range(400)]
-    figure = figures.gallery(entries, most=6)
-    told = words(figure)
-    assert len(pictures(figure)) == 6 and "fit 399" in told and "394 more fits" in told
-    with pytest.raises(InputError, match="without fits"):
-        figures.gallery([])
-
-
 @pytest.mark.parametrize("count", [1, 400])
 def test_error_curves_reach_their_quantiles(head: MakeHead, count: int) -> None:
     fit = make_fit(head(6))
@@ -348,7 +318,6 @@ def test_error_curves_reach_their_quantiles(head: MakeHead, count: int) -> None:
         figures.error_curves([])
     with pytest.raises(InputError, match="'dense'"):
         figures.error_curves([fit], stage="dense")
-    decoded(figures.error_curves({"a $b": far, "none": np.array([np.nan])}))
 
 
 def nothing_seen(fit: StagedFit) -> StagedFit:
@@ -362,7 +331,6 @@ OF_MANY_FITS = [
     figures.portrait_figure,
     figures.distance_maps,
     figures.aligned_grid,
-    figures.gallery,
     figures.error_curves,
     figures.threshold_figure,
 ]
@@ -527,13 +495,14 @@ def test_lines_of_the_b_plot_pass_through_neutral_along_the_expressions() -> Non
     stddev, neutral_z = np.array([30.0, 8.0, 2.0]), np.array([0.5, -1.0, 0.2])
     direction = np.array([1.0, -2.0, 0.5])
     points = neutral_z + np.arange(1, 5)[:, None] * direction
-    figure = figures.b_plane(scans(points, "fear", stddev), neutral_b=neutral_z * stddev, neutral_z=neutral_z)
+    neutral = figures.Coefficients("neutral", "", 0, neutral_z * stddev, neutral_z)
+    figure = figures.b_plane(scans(points, "fear", stddev), neutral=neutral)
     line = next(line for line in figure.axes[0].lines if len(line.get_xdata()) == 2)
     ends = np.stack([line.get_xdata(), line.get_ydata()], axis=1).astype(float)
     np.testing.assert_allclose(ends[0], (neutral_z * stddev)[:2], atol=1e-9)
     step = ends[1] - ends[0]
     np.testing.assert_allclose(step / step[0], (direction * stddev)[:2] / (direction * stddev)[0])
-    decoded(figures.b_space(scans(points, "fear", stddev), neutral_b=neutral_z * stddev, neutral_z=neutral_z))
+    decoded(figures.b_space(scans(points, "fear", stddev), neutral=neutral))
 
 
 def test_without_a_neutral_face_no_lines_are_drawn() -> None:
@@ -553,10 +522,10 @@ def test_coefficients_are_scattered_for_any_number_of_labels_and_modes(labels: l
     told = words(figure) + "".join(text.get_text() for legend in figure.legends for text in legend.get_texts())
     assert ("and 4 more" in told) == (len(labels) == 20)
     if modes >= 3:
-        decoded(figures.scatter_3d(every))
+        decoded(figures.b_space(every))
     else:
         with pytest.raises(InputError, match="three coefficients"):
-            figures.scatter_3d(every)
+            figures.b_space(every)
 
 
 @pytest.mark.parametrize("size_mm", [3.0, 300.0, 20000.0])
@@ -565,7 +534,7 @@ def test_nothing_is_cut_or_covered_in_space(labels: int, size_mm: float) -> None
     rng = np.random.default_rng(1)
     names = [f"surprise_mouth_open_{k}" for k in range(labels)]
     points = [point for name in names for point in scans(rng.normal(size=(2, 3)), name, np.full(3, size_mm))]
-    figure = figures.b_space(points, neutral_b=np.zeros(3), neutral_z=np.zeros(3))
+    figure = figures.b_space(points, neutral=figures.Coefficients("", "", 0, np.zeros(3), np.zeros(3)))
     picture = decoded(figure)
     (legend,) = figure.legends
     boxes = [legend.get_window_extent()]
@@ -589,7 +558,7 @@ def test_coefficients_that_do_not_go_together_are_refused() -> None:
     with pytest.raises(InputError, match="different models"):
         figures.scatter_matrix([one, other])
     with pytest.raises(InputError, match="without scans"):
-        figures.scatter_3d([])
+        figures.b_space([])
     with pytest.raises(InputError, match="two coefficients"):
         figures.b_plane(scans(np.ones((3, 1)), "a", np.ones(1)))
 

@@ -330,7 +330,7 @@ HALF = np.full((7, 7), 1.0) + np.diag(np.full(7, 20.0))
         lambda: figures.confusion_figure(HALF, [f"a rather long name {k}" for k in range(7)]),
         lambda: figures.confusion_figure([[3]], ["only $x$"]),
         lambda: figures.confusion_figure(np.eye(40), [str(k) for k in range(40)]),
-        lambda: figures.calibration_figure([0], [1], [0.5], [0.5], [1]),
+        lambda: figures.calibration_figure([[0, 1, 0.5, 0.5, 1]]),
         lambda: figures.learning_curve_figure([5], [0.5]),
         lambda: figures.importance_figure(np.arange(60) - 3.0, unit="a unit of many words that must be wrapped"),
         lambda: figures.importance_figure([0.0]),

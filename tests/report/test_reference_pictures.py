@@ -40,7 +40,6 @@ def still_life() -> dict[str, np.ndarray]:
         "sequential": [Layer(surface, scalars=np.abs(height), colormap=SEQUENTIAL, vmax=12)],
         "regions": [Layer(surface, scalars=codes, colormap=table, vmin=-0.5, vmax=3.5, categories=True)],
         "overlay": [Layer(surface, SCAN_COLOUR), Layer(mean, MODEL_COLOUR)],
-        "glass": [Layer(surface, SCAN_COLOUR, opacity=0.5), Layer(mean, MODEL_COLOUR)],
     }
     made = dict(zip(layers, render_series(list(layers.values()), camera=camera, size=SIZE), strict=True))
     panels = [np.asarray(a.images[0].get_array()) for a in figures.modes_figure(model, 2).axes if a.images]

@@ -24,10 +24,10 @@ def fit() -> StagedFit:
 def map_of(fit: StagedFit, distance_mm: float) -> np.ndarray:
     """Return the panel of the distances, where all of them are the same."""
     far = {stage: np.full(len(fit.regions), distance_mm) for stage in fit.surfaces}
-    still = stills.fit_strip(replace(fit, model_to_scan_mm=far), 2.5)
-    picture = np.asarray(Image.open(io.BytesIO(still.data)).convert("RGB")).astype(int)
-    assert picture.shape == (still.size[1], still.size[0], 3)
-    return picture[:, 2 * still.size[0] // 3 :]
+    data, size = stills.fit_strip(replace(fit, model_to_scan_mm=far), 2.5)
+    picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+    assert picture.shape == (size[1], size[0], 3)
+    return picture[:, 2 * size[0] // 3 :]
 
 
 def cloud(fit: StagedFit) -> StagedFit:

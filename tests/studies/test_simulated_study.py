@@ -18,7 +18,8 @@ import recognition
 import simulated
 import tables
 from shape_spaces import ShapeSpaces
-from simulated import StudyConfig, model_path, person_path, prepare_folder, read_fits, run_fits
+from simulated import StudyConfig, prepare_folder, run_fits
+from study_fits import model_path, person_path, read_fits
 from study_people import StudyPeople
 
 pytestmark = pytest.mark.xdist_group("study")

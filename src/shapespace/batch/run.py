@@ -155,22 +155,7 @@ def fit_files(
         FileError: the results cannot be written.
     """
     make_folder(folder)
-    records: dict[str, dict[str, Any]] = {}
-    table = CoefficientTable(folder, [job.name for job in jobs], model.n_modes)
-    next_save = time.monotonic() + _SAVE_EVERY_S
-
-    def done(job: Job, record: dict[str, Any]) -> None:
-        nonlocal next_save
-        # In this order, so that what an interruption keeps out of the table is caught up with.
-        table.add(job.name, record)
-        records[job.name] = record
-        if on_done is not None:
-            on_done(job, record)
-        if (now := time.monotonic()) > next_save:
-            table.save()
-            # A table of very many rows takes a while itself.
-            next_save = time.monotonic() + max(_SAVE_EVERY_S, _SAVES_APART * (time.monotonic() - now))
-
+    kept = _Kept(CoefficientTable(folder, [job.name for job in jobs], model.n_modes), on_done)
     tasks: list[_Task] = []
     for job in {job.name: job for job in jobs}.values():
         task, earlier = _Task(job, config, stages), None
@@ -179,7 +164,7 @@ def fit_files(
         if earlier is None:
             tasks.append(task)
         else:
-            done(job, earlier)
+            kept.add(job, earlier)
     if executor is None:
         running = _run_here(tasks, model, model_file, folder, on_state)
     else:
@@ -187,11 +172,32 @@ def fit_files(
     try:
         with closing(running) as ended:
             for job, record in ended:
-                done(job, record)
+                kept.add(job, record)
     finally:
-        table.catch_up([task.job.name for task in tasks if task.job.name not in records])
-        table.save()
-    return [records[job.name] for job in jobs]
+        kept.table.catch_up([task.job.name for task in tasks if task.job.name not in kept.records])
+        kept.table.save()
+    return [kept.records[job.name] for job in jobs]
+
+
+class _Kept:
+    """The records of jobs that ended, and the table of them, which is saved now and then."""
+
+    def __init__(self, table: CoefficientTable, on_done: Callable[[Job, Mapping[str, Any]], None] | None) -> None:
+        self.table = table
+        self.records: dict[str, dict[str, Any]] = {}
+        self._on_done = on_done
+        self._next_save = time.monotonic() + _SAVE_EVERY_S
+
+    def add(self, job: Job, record: dict[str, Any]) -> None:
+        # In this order, so that what an interruption keeps out of the table is caught up with.
+        self.table.add(job.name, record)
+        self.records[job.name] = record
+        if self._on_done is not None:
+            self._on_done(job, record)
+        if (now := time.monotonic()) > self._next_save:
+            self.table.save()
+            # A table of very many rows takes a while itself.
+            self._next_save = time.monotonic() + max(_SAVE_EVERY_S, _SAVES_APART * (time.monotonic() - now))
 
 
 @dataclass(frozen=True)

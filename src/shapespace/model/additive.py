@@ -126,59 +126,25 @@ class AdditiveModel:
             InputError: too few of them, or an expression without its person's neutral.
         """
         faces = common_faces(meshes)
-        if not len(meshes) == len(subjects) == len(neutral) == len(kin or subjects):
-            raise InputError("Give one subject and one word on neutral for each mesh, and kin for each or none.")
-        people = list(dict.fromkeys(s for s, plain in zip(subjects, neutral, strict=True) if plain))
-        expressive = [i for i, plain in enumerate(neutral) if not plain]
-        if len(people) < 2 or not expressive:
-            raise InputError(
-                f"An additive model needs the neutral faces of at least two people and some expressions, not "
-                f"{len(people)} and {len(expressive)}."
-            )
-        missing = sorted({subjects[i] for i in expressive} - set(people))
-        if missing:
-            raise InputError(f"There is no neutral face of {', '.join(missing[:5])}; add it, or leave them out.")
-        own = {name: row for row, name in enumerate(people)}
-        own_neutrals = {
-            name: [m.vertices for m, who, plain in zip(meshes, subjects, neutral, strict=True) if plain and who == name]
-            for name in people
-        }
-        neutrals = np.stack([np.asarray(np.mean(own_neutrals[name], axis=0)) for name in people])
-        shapes = np.stack([meshes[i].vertices for i in expressive])
-        if not (np.isfinite(neutrals).all() and np.isfinite(shapes).all()):
-            raise InputError("The training meshes hold vertices that are not finite; repair them or leave them out.")
-        row = np.array([own[subjects[i]] for i in expressive])
+        neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
+        row = np.array([people.index(subjects[i]) for i in expressive])
         still = still_vertices(neutrals[row], shapes, still_share) if alignment_vertices is None else alignment_vertices
         align_in_place(neutrals, gauge, alignment_vertices=still)
         for k, r in enumerate(row):
             T = fit_similarity(shapes[k][still], neutrals[r][still], with_scale=gauge == "shape")
             shapes[k] = T.apply(shapes[k]) - neutrals[r]
         kin_of = dict(zip(subjects, kin or subjects, strict=True))
-        identity = principal_components(neutrals.reshape(len(neutrals), -1), identity_modes)
-        A, centred = identity.basis, (neutrals - neutrals.mean(axis=0)).reshape(len(neutrals), -1)
-        moved = shapes.reshape(len(shapes), -1)
-        gram = moved @ moved.T
-        B, sample = _modes_through_zero(moved, gram, expression_modes)
-        whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
-        a_gram = centred @ centred.T
-        a_held = held_out_shapes(a_gram, whose[0], len(identity.variance), centred=True)
-        e_held = held_out_shapes(gram, whose[1], len(sample), centred=False)
-        a_variance = _of_new_people(a_gram / (len(neutrals) - 1), len(neutrals), a_held)
-        # Modes through zero are one more than those through a mean.
-        e_variance = _of_new_people(gram / len(gram), len(gram) + 1, e_held)
         if local_identity_modes is None:
             local_identity_modes = 0 if isinstance(identity_modes, int) else _LOCAL_MODES
-        L, l_variance = local_modes(identity.mean.reshape(-1, 3), A, a_variance, a_held.left_mm2, local_identity_modes)
-        A, left = np.concatenate([A, L], axis=1), a_held.left_mm2 + e_held.left_mm2
-        total = float(a_variance.sum() + e_variance.sum()) + left
-        a_variance = np.concatenate([a_variance, l_variance])
-        shape, rotation = _as_shape_model(A * np.sqrt(a_variance), B * np.sqrt(e_variance))
-        basis, stddev = shape
+        whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
+        mean, A, of_identity = _identity(neutrals, whose[0], identity_modes, local_identity_modes)
+        B, of_expression = _expression(shapes.reshape(len(shapes), -1), whose[1], expression_modes)
+        (basis, stddev), rotation = _as_shape_model(A, B)
         model = ShapeModel(
-            mean=identity.mean,
+            mean=mean,
             basis=basis,
             stddev=stddev,
-            total_variance=total,
+            total_variance=float((of_identity + of_expression).sum()),
             n_training=len(meshes),
             faces=faces,
             gauge=gauge,
@@ -187,7 +153,7 @@ class AdditiveModel:
             licence=licence,
             held_out=True,
         )
-        return cls(model, rotation, len(a_variance))
+        return cls(model, rotation, A.shape[1])
 
     @property
     def n_expression(self) -> int:
@@ -324,6 +290,32 @@ class AdditiveModel:
         return array
 
 
+def _neutrals_and_expressions(
+    meshes: Sequence[Mesh], subjects: Sequence[str], neutral: Sequence[bool], kin: Sequence[str] | None
+) -> tuple[FloatArray, FloatArray, list[str], list[int]]:
+    """Return each person's mean neutral (P, V, 3), the expressions (E, V, 3), the P people, and E indices of meshes."""
+    if not len(meshes) == len(subjects) == len(neutral) == len(kin or subjects):
+        raise InputError("Give one subject and one word on neutral for each mesh, and kin for each or none.")
+    own_neutrals: dict[str, list[FloatArray]] = {}
+    for mesh, who, plain in zip(meshes, subjects, neutral, strict=True):
+        if plain:
+            own_neutrals.setdefault(who, []).append(mesh.vertices)
+    expressive = [i for i, plain in enumerate(neutral) if not plain]
+    if len(own_neutrals) < 2 or not expressive:
+        raise InputError(
+            f"An additive model needs the neutral faces of at least two people and some expressions, not "
+            f"{len(own_neutrals)} and {len(expressive)}."
+        )
+    missing = sorted({subjects[i] for i in expressive} - set(own_neutrals))
+    if missing:
+        raise InputError(f"There is no neutral face of {', '.join(missing[:5])}; add it, or leave them out.")
+    neutrals = np.stack([np.asarray(np.mean(shapes, axis=0)) for shapes in own_neutrals.values()])
+    expressions = np.stack([meshes[i].vertices for i in expressive])
+    if not (np.isfinite(neutrals).all() and np.isfinite(expressions).all()):
+        raise InputError("The training meshes hold vertices that are not finite; repair them or leave them out.")
+    return neutrals, expressions, list(own_neutrals), expressive
+
+
 def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3) -> IntArray:
     """Return the vertices that move least from `neutrals` to `shapes`, both (N, V, 3): `share` of all.
 
@@ -345,6 +337,30 @@ def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3)
             moved += ((T.apply(shape) - neutral) ** 2).sum(axis=1)
         still = np.sort(np.argpartition(moved, count - 1)[:count]).astype(np.int32)
     return still
+
+
+def _identity(
+    neutrals: FloatArray, kin: Sequence[str], modes: int | float | None, most_local: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean (3V,), what one standard deviation of each mode does (3V, Ka), variance kept and left, mm^2."""
+    flat = neutrals.reshape(len(neutrals), -1)
+    found, centred = principal_components(flat, modes), flat - flat.mean(axis=0)
+    gram = centred @ centred.T
+    held = held_out_shapes(gram, kin, len(found.variance), centred=True)
+    variance = _of_new_people(gram / (len(flat) - 1), len(flat), held)
+    L, of_local = local_modes(found.mean.reshape(-1, 3), found.basis, variance, held.left_mm2, most_local)
+    directions = np.concatenate([found.basis, L], axis=1) * np.sqrt(np.concatenate([variance, of_local]))
+    return found.mean, directions, np.array([variance.sum(), held.left_mm2])
+
+
+def _expression(moved: FloatArray, kin: Sequence[str], modes: int | float | None) -> tuple[FloatArray, FloatArray]:
+    """Return what one standard deviation of each mode does (3V, Ke), variance kept and left, mm^2."""
+    gram = moved @ moved.T
+    B, sample = _modes_through_zero(moved, gram, modes)
+    held = held_out_shapes(gram, kin, len(sample), centred=False)
+    # Modes through zero are one more than those through a mean.
+    variance = _of_new_people(gram / len(gram), len(gram) + 1, held)
+    return B * np.sqrt(variance), np.array([variance.sum(), held.left_mm2])
 
 
 def _modes_through_zero(

@@ -150,20 +150,10 @@ class ShapeModel:
         """
         kind = representation_named(representation, control_points)
         faces = common_faces(meshes)
-        if len(meshes) < 2:
-            raise InputError(
-                f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
-            )
-        shapes = np.stack([mesh.vertices for mesh in meshes])
-        names = [mesh.name for mesh in meshes]
-        rounding = rounding_mm(np.nan_to_num(shapes[0], posinf=0.0, neginf=0.0))
-        if kind.takes_holes and np.isnan(shapes).any():
-            _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
-            fill_holes(shapes, faces, names)
-        _refuse_not_finite(shapes, names)
-        _refuse_equal(shapes)
+        shapes = _training_shapes(meshes, faces, fill=kind.takes_holes)
+        rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
         if align:
-            _refuse_without_extent(shapes, names)
+            _refuse_without_extent(shapes, [mesh.name for mesh in meshes])
             align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
         # Where only some vertices carried the alignment, the size of the others is shape.
         if align and gauge == "shape" and alignment_vertices is None:
@@ -428,6 +418,22 @@ def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:
                 f"Mode {mode + 1} of the model has a standard deviation of {value:.1e} mm, which no shape of its size "
                 "can have; check its unit."
             )
+
+
+def _training_shapes(meshes: Sequence[Mesh], faces: IntArray | None, *, fill: bool) -> FloatArray:
+    """Return the vertices of training meshes, (N, V, 3), checked; `fill` says whether what is missing is filled."""
+    if len(meshes) < 2:
+        raise InputError(
+            f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
+        )
+    shapes = np.stack([mesh.vertices for mesh in meshes])
+    names = [mesh.name for mesh in meshes]
+    if fill and np.isnan(shapes).any():
+        _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
+        fill_holes(shapes, faces, names)
+    _refuse_not_finite(shapes, names)
+    _refuse_equal(shapes)
+    return shapes
 
 
 def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:

@@ -20,7 +20,6 @@ from shapespace.types import FloatArray
 Colour: TypeAlias = tuple[float, float, float]
 """Red, green, blue in [0, 1], sRGB."""
 
-WHITE: Colour = (1.0, 1.0, 1.0)
 CLAY: Colour = (0.80, 0.755, 0.715)
 """A surface of which only the form is to be seen."""
 SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from shapespace import __version__
-from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.files import sha256_of_file
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.labels import Label
-from shapespace.io.meshes import read_mesh
 from shapespace.report import recognition, sections, tables
 from shapespace.report.blocks import (
     Block,
@@ -36,10 +34,9 @@ from shapespace.report.blocks import (
 )
 from shapespace.report.labels import find_labels, labelled
 from shapespace.report.page import Chapter, Page, Step
-from shapespace.report.saved import Folder, SavedFit, model_of, staged_fit
+from shapespace.report.saved import Folder, SavedFit, model_of, posed, raw_scan, staged_fit
 from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, setting, words
 from shapespace.schemas import Quality, read
-from shapespace.types import Mesh
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
@@ -51,9 +48,7 @@ MOST_DETAILS = 3
 MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
-_FEWEST_POINTS = 20
 _FEWEST_LEVELS = 2
-_ADVICE = "fit the scans again"
 _RESERVE_BYTES = 400_000
 
 
@@ -300,8 +295,7 @@ class FolderPage:
             more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
             out.append(Text(more))
         if sample:
-            bar = stills.colour_bar()
-            out.append(ScaleKey(limit, self.page.image(bar.data, bar.size, "from blue over pale to red")))
+            out.append(ScaleKey(limit, self.page.image(stills.colour_bar(), "from blue over pale to red")))
         return [*out, Gallery([self.card(fit, limit) for fit in self.carded])]
 
     def card(self, fit: SavedFit, limit_mm: float) -> Card:
@@ -333,34 +327,10 @@ class FolderPage:
             staged = self.staged(fit)
             still, alt = stills.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
         elif fit.entry.fitted and fit.fitted:
-            still, alt = stills.mesh_still(self.posed(fit)), f"The fitted surface of {fit.name}"
+            still, alt = stills.mesh_still(posed(self.folder, fit)), f"The fitted surface of {fit.name}"
         else:
-            still, alt = stills.mesh_still(self.raw_scan(fit)), f"The raw scan {fit.name}, as its axes stand"
-        return self.page.image(still.data, still.size, alt)
-
-    def posed(self, fit: SavedFit) -> Mesh:
-        """Return NAME.fitted.ply in the model's frame, so that it looks at the camera."""
-        T = fit.record.T_scan_model
-        if T is None or not T.scale > 0:
-            raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_ADVICE}.")
-        mesh = self.folder.mesh(fit.entry.fitted)
-        return mesh.with_vertices((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale)
-
-    def raw_scan(self, fit: SavedFit) -> Mesh:
-        """Return the scan that could not be fitted, if it is still where it was, with the content it had."""
-        source = fit.record.scan
-        if not source.path or "\0" in source.path:
-            raise FileFormatError("the record does not say where the scan is.")
-        file = self.folder.root / source.path
-        if not file.is_file() or sha256_of_file(file) != source.hash:
-            raise FileFormatError("the scan is no longer where it was, or has changed.")
-        try:
-            mesh = read_mesh(file)
-        except ShapespaceError as error:
-            raise FileFormatError("the scan cannot be read.") from error
-        if len(mesh.vertices) < _FEWEST_POINTS:
-            raise FileFormatError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
-        return mesh
+            still, alt = stills.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
+        return self.page.image(still, alt)
 
     def numbers(self) -> list[Block]:
         """Return the table of all fits."""

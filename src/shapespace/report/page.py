@@ -17,6 +17,8 @@ from shapespace.report.wording import anchor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
+    from shapespace.report.stills import Still
+
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""
 
@@ -95,14 +97,14 @@ class Page:
         """Return a drawing with its caption; `alt` says what is seen in it."""
         from shapespace.report.figures import encode_webp
 
-        data, size = encode_webp(figure, lossless=chart)
+        still = encode_webp(figure, lossless=chart)
         self.step(caption)
-        return Figure(self.image(data, size, alt), caption, "chart" if chart else "drawing")
+        return Figure(self.image(still, alt), caption, "chart" if chart else "drawing")
 
-    def image(self, data: bytes, size: tuple[int, int], alt: str) -> Image:
-        """Return WebP `data` of `size` pixels as an image of this page."""
-        self._spent += 4 * -(-len(data) // 3)
-        return Image(data, size, alt)
+    def image(self, still: Still, alt: str) -> Image:
+        """Return a picture as an image of this page."""
+        self._spent += 4 * -(-len(still[0]) // 3)
+        return Image(*still, alt)
 
     def turning(
         self,

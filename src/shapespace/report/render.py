@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
-from shapespace.report.colours import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, WHITE, Colour
+from shapespace.report.colours import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, Colour
 from shapespace.report.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
@@ -26,6 +26,7 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 _Single: TypeAlias = npt.NDArray[np.float32]
 
 _LARGEST_SIDE = 8192
+_SUPERSAMPLE = 2
 _GAMMA = 2.2
 # Powers of every pixel would take as long as finding what it shows.
 _SRGB = np.round(255.0 * ((np.arange(65536) + 0.5) / 65536) ** (1 / _GAMMA)).astype(np.uint8)
@@ -108,7 +109,6 @@ class Layer:
         colormap: (N, 3) colours from `vmin` to `vmax`; few colours give bands with sharp edges.
         vmin: scalar of the first colour.
         vmax: scalar of the last colour.
-        opacity: 1 hides what is behind; less blends.
         point_radius_mm: radius of the balls of a point cloud; None takes one by their spacing, and shades them as the
             surface that they lie on.
         categories: the scalars are codes: a pixel takes that of most of its triangle, and nothing between two of them.
@@ -123,7 +123,6 @@ class Layer:
     colormap: FloatArray | None = None
     vmin: float = 0.0
     vmax: float = 1.0
-    opacity: float = 1.0
     point_radius_mm: float | None = None
     categories: bool = False
 
@@ -164,44 +163,20 @@ class _Surfels:
     pixel: npt.NDArray[np.int64]
     depth_mm: _Single
     normal: _Single  # (3, n), as seen from the eye
-    scalar: _Single | None
+    scalar: _Single  # (n,), or (0,) where the layer has none
     back: npt.NDArray[np.bool_]
     occlusion: _Single
 
 
 def render(
-    mesh: Mesh,
-    *,
-    camera: Camera,
-    size: tuple[int, int] = (480, 560),
-    colour: Colour = CLAY,
-    scalars: FloatArray | None = None,
-    colormap: FloatArray | None = None,
-    vmin: float = 0.0,
-    vmax: float = 1.0,
-    background: Colour = WHITE,
-    supersample: int = 2,
+    *layers: Layer, camera: Camera, size: tuple[int, int] = (480, 560), supersample: int = _SUPERSAMPLE
 ) -> Image:
-    """Return a picture of one mesh; arguments as in `Layer` and `render_layers`."""
-    layer = Layer(mesh, colour, scalars, colormap, vmin, vmax)
-    return render_layers([layer], camera=camera, size=size, background=background, supersample=supersample)
-
-
-def render_layers(
-    layers: Sequence[Layer],
-    *,
-    camera: Camera,
-    size: tuple[int, int] = (480, 560),
-    background: Colour = WHITE,
-    supersample: int = 2,
-) -> Image:
-    """Return a picture of several layers, the nearest surface of each blended in the order of depth.
+    """Return a picture of layers on white, the nearest one in each pixel.
 
     Args:
-        layers: what to draw; with full opacity the nearer one wins each pixel.
+        layers: what to draw.
         camera: where from.
         size: (width, height) in pixels.
-        background: colour where nothing is.
         supersample: samples per pixel and axis.
 
     Returns:
@@ -210,7 +185,7 @@ def render_layers(
     Raises:
         InputError: a size or supersample that is not a small positive whole number.
     """
-    return render_series([layers], camera=camera, size=size, background=background, supersample=supersample)[0]
+    return render_series([layers], camera=camera, size=size, supersample=supersample)[0]
 
 
 def render_series(
@@ -218,77 +193,37 @@ def render_series(
     *,
     camera: Camera,
     size: tuple[int, int] = (480, 560),
-    background: Colour = WHITE,
-    supersample: int = 2,
+    supersample: int = _SUPERSAMPLE,
 ) -> list[Image]:
-    """Return several pictures from one camera; a `Layer` that takes part in several is rasterised once.
+    """Return several pictures from one camera; what takes part in several is rasterised once, whatever its colours.
 
-    Arguments and errors as in `render_layers`.
+    Arguments and errors as in `render`.
     """
-    _check_size(size, supersample)
-    fine = (size[0] * supersample, size[1] * supersample)
-    pieces: dict[int, tuple[_Single, _Surfels, float]] = {}
-    for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
-        surfels = _surfels(layer, camera, fine, supersample)
-        pieces[id(layer)] = (_shaded(layer, surfels), surfels, layer.opacity)
-    return [_composed([pieces[id(layer)] for layer in layers], size, supersample, background) for layers in pictures]
-
-
-def render_maps(
-    mesh: Mesh,
-    scalars: FloatArray,
-    ranges: Sequence[tuple[float, float]],
-    *,
-    colormap: FloatArray,
-    camera: Camera,
-    size: tuple[int, int] = (480, 560),
-    background: Colour = WHITE,
-    supersample: int = 2,
-) -> list[Image]:
-    """Return the same view of `mesh` coloured by `scalars` (V,), once for each (vmin, vmax) of `ranges`.
-
-    The surface is found once, so several maps cost little more than one. Other arguments as in `render_layers`.
-    """
-    _check_size(size, supersample)
-    layers = [Layer(mesh, scalars=scalars, colormap=colormap, vmin=low, vmax=high) for low, high in ranges]
-    if not layers:
-        return []
-    surfels = _surfels(layers[0], camera, (size[0] * supersample, size[1] * supersample), supersample)
-    return [_composed([(_shaded(layer, surfels), surfels, 1.0)], size, supersample, background) for layer in layers]
-
-
-def _check_size(size: tuple[int, int], supersample: int) -> None:
     if supersample < 1 or min(size) < 1 or max(size) * supersample > _LARGEST_SIDE:
         raise InputError(
             f"A picture of {size[0]} x {size[1]} pixels with {supersample} samples each way cannot be drawn; "
             f"each side times the samples must be 1 to {_LARGEST_SIDE}."
         )
+    fine = (size[0] * supersample, size[1] * supersample)
+    found: dict[tuple[object, ...], _Surfels] = {}
+    pieces: dict[int, tuple[_Single, _Surfels]] = {}
+    for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
+        # Layers hold views of their scalars: those of one array begin at one place.
+        scalars = None if layer.scalars is None else layer.scalars.ctypes.data
+        seen = (id(layer.mesh), scalars, layer.point_radius_mm, layer.categories)
+        if seen not in found:
+            found[seen] = _surfels(layer, camera, fine, supersample)
+        pieces[id(layer)] = (_shaded(layer, found[seen]), found[seen])
+    return [_composed([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
 
 
-def _composed(
-    pieces: Sequence[tuple[_Single, _Surfels, float]], size: tuple[int, int], supersample: int, background: Colour
-) -> Image:
-    """Blend shaded layers by depth, average the samples of each pixel, and return sRGB."""
+def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int], supersample: int) -> Image:
+    """Return the nearest of shaded layers in each sample, averaged over those of each pixel, as sRGB."""
     width, height = size
     count = width * height * supersample**2
-    out = np.empty((count, 3), dtype=np.float32)
-    out[:] = np.asarray(background) ** _GAMMA
-    if all(opacity == 1 for *_, opacity in pieces):
-        nearest = np.full(count, np.inf, dtype=np.float32)
-        for colours, surfels, _ in pieces:
-            put_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
-    else:
-        depths = np.full((len(pieces), count), np.inf, dtype=np.float32)
-        paint = np.zeros((len(pieces), count, 3), dtype=np.float32)
-        for k, (colours, surfels, _) in enumerate(pieces):
-            depths[k, surfels.pixel] = surfels.depth_mm
-            paint[k, surfels.pixel] = colours
-        alpha = np.array([opacity for *_, opacity in pieces], dtype=np.float32)
-        order = np.argsort(-depths, axis=0, kind="stable")
-        at = np.arange(count)
-        for which in order:
-            share = np.where(np.isfinite(depths[which, at]), alpha[which], 0)[:, None]
-            out += share * (paint[which, at] - out)
+    out, nearest = np.ones((count, 3), dtype=np.float32), np.full(count, np.inf, dtype=np.float32)
+    for colours, surfels in pieces:
+        put_nearer(surfels.pixel, colours, surfels.depth_mm, out, nearest)
     image = np.empty((height, width, 3), dtype=np.uint8)
     averaged(out.reshape(height * supersample, width * supersample, 3), supersample, _SRGB, image)
     return image
@@ -372,7 +307,7 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     )  # fmt: skip
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
     occlusion = _occlusion(pixel, depth_mm, size, supersample, camera)
-    return _Surfels(pixel, depth_mm, normal, scalar if len(scalars) else None, back, occlusion)
+    return _Surfels(pixel, depth_mm, normal, scalar, back, occlusion)
 
 
 def _unit(vectors: _Single) -> _Single:
@@ -405,7 +340,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
         seen *= np.where(seen[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, by which a cloud is told from a closed surface.
         normal = np.ascontiguousarray(_unit((seen[owner].T + 0.35 * normal).astype(np.float32)))
-    scalar = None if layer.scalars is None else layer.scalars[owner].astype(np.float32)
+    scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
     back = np.zeros(len(pixel), dtype=np.bool_)
     return _Surfels(pixel, depth_mm, normal, scalar, back, _occlusion(pixel, depth_mm, size, supersample, camera))
@@ -457,12 +392,10 @@ def _linear(colours: npt.ArrayLike) -> _Single:
 def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
-    mapped = surfels.scalar is not None and layer.colormap is not None
-    table = _linear(layer.colormap if mapped and layer.colormap is not None else layer.colour)
-    scalar = surfels.scalar if mapped and surfels.scalar is not None else np.zeros(0, dtype=np.float32)
+    table = _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap)
     lit(
-        surfels.normal, scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax), _LIGHTS,
-        surfels.occlusion, surfels.back, out,
+        surfels.normal, surfels.scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax),
+        _LIGHTS, surfels.occlusion, surfels.back, out,
     )  # fmt: skip
     return out
 

@@ -18,10 +18,11 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.files import read_bytes, read_error
+from shapespace.io.files import read_bytes, read_error, sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
+from shapespace.report.wording import counted, printable
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.types import FloatArray, Mesh
 
@@ -29,6 +30,7 @@ _LARGEST_JSON = 64 * 2**20
 _LARGEST_ARRAY = 2**30
 _AGAIN = "make it again with shapespace fit --stages"
 _RECORD = ".fit.json"
+_FEWEST_POINTS = 20
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
 Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]
@@ -200,8 +202,8 @@ class SavedFit:
         """Return the fit with more known beside its record, by the names of `FitEntry`."""
         return SavedFit(structs.replace(self.entry, **known), self.record)
 
-    def numbers(self, key: Literal["b", "z", "b_stddev", "shrinkage"]) -> FloatArray:
-        """Return coefficients of the record, or what belongs to them, (K,).
+    def numbers(self, key: Literal["b", "z"]) -> FloatArray:
+        """Return coefficients of the record, (K,).
 
         Raises:
             FileFormatError: there are none, or not as many as coefficients.
@@ -264,7 +266,7 @@ def _found(folder: Folder, file: str) -> SavedFit:
         return f"{name}.{ending}" if (folder.root / f"{name}.{ending}").is_file() else None
 
     entry = FitEntry(
-        name=str(_printable(name)),
+        name=printable(name),
         json=file,
         stages=beside("stages.npz"),
         fitted=beside("fitted.ply"),
@@ -285,17 +287,42 @@ def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
     """
     if not fit.entry.stages:
         raise FileFormatError(f"{fit.name}: its stages were not saved; fit the scan again with --stages.")
-    return StagedFit.from_arrays(
-        folder.arrays(fit.entry.stages),
-        name=fit.name,
-        label=fit.label,
-        status=fit.status,
-        reason=fit.reason,
-        b=fit.numbers("b"),
-        z=fit.numbers("z"),
-        b_stddev=fit.numbers("b_stddev"),
-        shrinkage=fit.numbers("shrinkage"),
-    )
+    return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
+
+
+def posed(folder: Folder, fit: SavedFit) -> Mesh:
+    """Return NAME.fitted.ply in the model's frame, so that it looks at the camera.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is damaged, or the record holds no pose.
+    """
+    T = fit.record.T_scan_model
+    if T is None or not T.scale > 0:
+        raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_AGAIN}.")
+    mesh = folder.mesh(fit.entry.fitted)
+    return mesh.with_vertices((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale)
+
+
+def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
+    """Return the scan that could not be fitted, if it is still where it was, with the content it had.
+
+    Raises:
+        FileFormatError: it is not, or cannot be read.
+    """
+    source = fit.record.scan
+    if not source.path or "\0" in source.path:
+        raise FileFormatError("the record does not say where the scan is.")
+    file = folder.root / source.path
+    if not file.is_file() or sha256_of_file(file) != source.hash:
+        raise FileFormatError("the scan is no longer where it was, or has changed.")
+    try:
+        mesh = read_mesh(file)
+    except ShapespaceError as error:
+        raise FileFormatError("the scan cannot be read.") from error
+    if len(mesh.vertices) < _FEWEST_POINTS:
+        raise FileFormatError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
+    return mesh
 
 
 def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None) -> ShapeModel:
@@ -352,11 +379,9 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo,
 def _printable(value: object) -> object:
     """Return JSON content whose strings have control characters and lone surrogates replaced."""
     if isinstance(value, str):
-        return "".join(
-            c if c in "\n\t" or (c.isprintable() or c.isspace()) else "\N{REPLACEMENT CHARACTER}" for c in value
-        )
+        return printable(value)
     if isinstance(value, list):
         return [_printable(item) for item in cast(list[object], value)]
     if isinstance(value, dict):
-        return {str(_printable(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
+        return {printable(str(key)): _printable(item) for key, item in cast(dict[object, object], value).items()}
     return value

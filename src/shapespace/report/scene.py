@@ -15,17 +15,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.report.staged import StagedFit, measured_mm
+from shapespace.report.thin import thinned
+from shapespace.schemas import to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.staged import StagedFit
 
 SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 """The scripts of `assets` that a page with scenes needs, in this order; the colours come before the last."""
@@ -33,7 +35,6 @@ SCRIPTS = ("vendor/three.min.js", "scene.js", "widgets.js")
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
 _UNKNOWN = -32768
 _MOST_STEPS = 32767
-_MOST_COLLAPSED = 150_000
 # What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
 _PLACE_STEP_MM = 0.04
 _DISTANCE_STEP_MM = 0.05
@@ -106,8 +107,8 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
     try:
-        header = json.dumps({"facts": _plain(facts), "arrays": specs}, allow_nan=False).encode("ascii")
-    except (TypeError, ValueError) as error:
+        header = json.dumps({"facts": to_json(facts), "arrays": specs}, allow_nan=False).encode("ascii")
+    except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"The facts of a scene must be plain values that JSON can hold ({error}).") from error
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
@@ -209,19 +210,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         arrays["scan_faces"] = _indices(scan.faces, len(scan.vertices), coded=small)
     if model.faces is not None:
         arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
-    surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
-    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
-    step = _DISTANCE_STEP_MM if small else 0.0
-    # Points have no inside.
-    signed = staged.scan.faces is not None
-    for stage in staged.surfaces:
-        forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
-        if not signed:
-            forward, backward = np.abs(forward), np.abs(backward)
-        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
-        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
-        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
-        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
+    arrays |= _stage_arrays(staged, of_model, of_scan, small=small)
     arrays |= {
         "regions": staged.regions[of_model].astype(np.uint8),
         "b": staged.b,
@@ -238,7 +227,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         "reason": staged.reason,
         "stages": list(staged.surfaces),
         "scale_mm": staged.scale_mm,
-        "signed": signed,
+        # Points have no inside.
+        "signed": staged.scan.faces is not None,
         "mean_mm": {
             stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
             for stage in staged.surfaces
@@ -249,6 +239,26 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
+
+
+def _stage_arrays(
+    staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp], *, small: bool
+) -> dict[str, npt.NDArray[Any] | Steps]:
+    """Return surface and distances at each stage, of these vertices and scan points; shares are of all of them."""
+    surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    arrays |= _alike(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
+    step = _DISTANCE_STEP_MM if small else 0.0
+    signed = staged.scan.faces is not None
+    for stage in staged.surfaces:
+        forward, backward = staged.model_to_scan_mm[stage][of_model], staged.scan_to_model_mm[stage][of_scan]
+        if not signed:
+            forward, backward = np.abs(forward), np.abs(backward)
+        arrays[f"model_to_scan_{stage}"] = quantised(forward, step=step, coded=small)
+        arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
+        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
+        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
+    return arrays
 
 
 def _history(staged: StagedFit) -> dict[str, npt.NDArray[Any]]:
@@ -295,82 +305,6 @@ def pack_scatter(
     codes = np.array([kinds.index(label) for label in labels], dtype=np.int32)
     facts = {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit}
     return pack({"points": points, "labels": codes}, facts)
-
-
-def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
-
-    No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
-    collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
-    instead (Rossignac and Borrel 1993): of each cell the vertex nearest to the mean stays.
-
-    Args:
-        scan: any surface or points.
-        largest: at least 1.
-
-    Returns:
-        The mesh, and (S',) indices into the vertices of `scan`.
-    """
-    if _count(scan) <= largest:
-        return scan, np.arange(len(scan.vertices))
-    if scan.faces is not None and len(scan.faces) <= _MOST_COLLAPSED:
-        collapsed = _collapsed(scan, scan.faces, largest)
-        if collapsed is not None:
-            return collapsed
-    cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
-    best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
-    # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
-    for _ in range(8):
-        trial = _clustered(scan, cell)
-        left = _count(trial[0])
-        if left <= largest and (best is None or left > _count(best[0])):
-            best = trial
-            if left >= 0.9 * largest:
-                break
-        cell *= math.sqrt(max(left, 1) / (0.95 * largest))
-    while best is None:
-        cell *= 2.0
-        trial = _clustered(scan, cell)
-        best = trial if _count(trial[0]) <= largest else None
-    return best
-
-
-def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
-    """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
-    import igl as untyped  # pyright: ignore[reportMissingTypeStubs]
-
-    igl = cast(Any, untyped)
-    if not igl.is_edge_manifold(faces.astype(np.int64)):
-        return None
-    _, triangles, _, kept = igl.decimate(scan.vertices, faces.astype(np.int64), largest)
-    if not 0 < len(triangles) <= largest:
-        return None
-    kept = np.asarray(kept, dtype=np.intp)
-    return Mesh(scan.vertices[kept], np.asarray(triangles), name=scan.name), kept
-
-
-def _count(mesh: Mesh) -> int:
-    return len(mesh.vertices) if mesh.faces is None else len(mesh.faces)
-
-
-def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
-    points = scan.vertices
-    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    side = at.max(axis=0) + 1
-    _, group = np.unique((at[:, 0] * side[1] + at[:, 1]) * side[2] + at[:, 2], return_inverse=True)
-    size = np.bincount(group)
-    middle = np.stack([np.bincount(group, points[:, k]) / size for k in range(3)], axis=1)
-    far = ((points - middle[group]) ** 2).sum(axis=1)
-    order = np.lexsort((far, group))
-    first = np.r_[0, np.cumsum(size)[:-1]]
-    kept = order[first]
-    if scan.faces is None:
-        return Mesh(points[kept], None, name=scan.name), kept
-    faces = group[scan.faces].astype(np.int32)
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    faces = faces[whole]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return Mesh(points[kept], faces[np.sort(once)], name=scan.name), kept
 
 
 def scripts() -> str:
@@ -423,17 +357,6 @@ def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
-def _plain(value: Any) -> Any:
-    """Return `value` with numbers that are not finite as None, which JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in cast(Mapping[Any, Any], value).items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in cast(list[Any], value)]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _indices(faces: IntArray, vertices: int, *, coded: bool) -> npt.NDArray[Any] | Steps:
     if vertices > 1 << 16:
         return faces.astype(np.uint32)
@@ -482,12 +405,12 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
 
 
 def _mean(signed_mm: FloatArray) -> float:
-    known = np.abs(signed_mm[np.isfinite(signed_mm)])
+    known = measured_mm(signed_mm)
     return float(known.mean()) if len(known) else math.nan
 
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
-    known = np.sort(np.abs(signed_mm[np.isfinite(signed_mm)]))
+    known = np.sort(measured_mm(signed_mm))
     within = np.searchsorted(known, np.arange(101) / 10.0 + 1e-9, side="right")
     return (1.0 - within / max(len(known), 1)).astype(np.float32)
 

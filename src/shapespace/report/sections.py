@@ -23,13 +23,13 @@ from shapespace.report.blocks import (
 )
 from shapespace.report.page import Page
 from shapespace.report.saved import SavedFit
+from shapespace.report.staged import REGIONS, StagedFit, measured_mm, nice_ceiling
 from shapespace.report.wording import counted, isfinite, listed, mm, percent
 from shapespace.types import FloatArray
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
     from shapespace.report.figures import Coefficients
-    from shapespace.report.staged import StagedFit
     from shapespace.schemas import Quality
 
 ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
@@ -142,7 +142,7 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
     return page.turning(
         "modes",
         pack_model(model, count, small=True),
-        page.image(still.data, still.size, "The mean shape"),
+        page.image(still, "The mean shape"),
         f"{which}, to be moved by hand.",
         label="Modes of the model, one slider each",
         still="The still shows the mean.",
@@ -185,7 +185,7 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     return page.turning(
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
-        page.image(still.data, still.size, strip_alt(fit, limit_mm)),
+        page.image(still, strip_alt(fit, limit_mm)),
         f"{fit.label}: the scan, and the model at each stage.",
         label=f"Scan and model of {fit.label}, to be turned",
         still=f"The still shows the scan, both over each other, and {scale}",
@@ -202,13 +202,8 @@ def strip_alt(fit: StagedFit, limit_mm: float) -> str:
 
 def share_within(fit: StagedFit, limit_mm: float) -> str:
     """Return the share of the vertices that the scan shows which lie within `limit_mm` of it."""
-    known = _known(fit, "final")
+    known = measured_mm(fit.model_to_scan_mm["final"])
     return percent(float((known <= limit_mm).mean())) if len(known) else "none"
-
-
-def _known(fit: StagedFit, stage: str) -> FloatArray:
-    distances = np.abs(fit.model_to_scan_mm[stage])
-    return distances[np.isfinite(distances)]
 
 
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Group:
@@ -217,7 +212,10 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
 
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
     largest = "largest distance from model to scan " + listed(
-        [f"{mm(float(_known(fit, stage).max(initial=0.0)))} {stages[stage]}" for stage in fit.surfaces]
+        [
+            f"{mm(float(measured_mm(far).max(initial=0.0)))} {stages[stage]}"
+            for stage, far in fit.model_to_scan_mm.items()
+        ]
     )
     within = listed([f"{share_within(fit, limit)} within {limit} mm" for limit in (2, 4, 6, 8, 10)])
     rms = [moment.rms_mm for moment in fit.history]
@@ -268,8 +266,6 @@ _OF_PAPER = {
 
 def region_shares(fit: StagedFit) -> str:
     """Return the share of each region in words."""
-    from shapespace.report.staged import REGIONS
-
     counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
     return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
 
@@ -306,8 +302,6 @@ def _over(share: float | None, of: str) -> str:
 
 def common_limit_mm(fits: Sequence[StagedFit]) -> float:
     """Return the end of the scale that strips of these fits share: that of the usual fit."""
-    from shapespace.report.staged import nice_ceiling
-
     return nice_ceiling(float(np.median([fit.scale_mm for fit in fits]))) if fits else 1.0
 
 
@@ -369,11 +363,10 @@ def lines_through_neutral(
         if neutral
         else "Larger marks are stronger expressions. No neutral face was fitted, so no lines are drawn."
     )
-    through = {"neutral_b": neutral.b if neutral else None, "neutral_z": neutral.z if neutral else None}
     faces = counted(len(points), "face")
     pictures: list[Block] = [
         page.figure(
-            figures.b_plane(points, title="Expressions in the first two coefficients", **through),
+            figures.b_plane(points, title="Expressions in the first two coefficients", neutral=neutral),
             f"{figures_of[0]}{about}",
             alt=f"Scatter plot of b1 and b2 for {faces}: each expression runs along its own line",
             chart=True,
@@ -382,7 +375,7 @@ def lines_through_neutral(
     if all(len(point.b) >= 3 for point in points):
         pictures.append(
             page.figure(
-                figures.b_space(points, title="The first three coefficients, from two sides", **through),
+                figures.b_space(points, title="The first three coefficients, from two sides", neutral=neutral),
                 f"{figures_of[1]}Grey lines drop to the floor of the box.",
                 alt=f"Two views of b1, b2 and b3 for {faces} with a line for each expression",
             )
@@ -395,7 +388,7 @@ def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Fig
     from shapespace.report import figures
     from shapespace.report.scene import pack_scatter
 
-    data, size = figures.encode_webp(figures.scatter_3d(points), lossless=True)
+    still = figures.encode_webp(figures.b_space(points), lossless=True)
     first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
     return page.turning(
         "scatter",
@@ -405,7 +398,7 @@ def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Fig
             [point.name for point in points],
             axes=[f"b{k + 1}" for k in range(first.shape[1])],
         ),
-        page.image(data, size, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
+        page.image(still, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
         "Coefficients of all fits in space, in mm.",
         label="Scatter of three coefficients, to be turned",
         still="The still shows the first three from two sides.",

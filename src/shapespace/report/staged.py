@@ -15,6 +15,7 @@ from shapespace.fit.regions import REGIONS, UNSEEN
 from shapespace.fit.result import STAGES, FitResult
 from shapespace.fit.stages import STAGES_VERSION, stage_arrays
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 
@@ -86,37 +87,28 @@ class StagedFit:
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
         """Return what pictures need of `result`, which was fitted by `model`."""
-        return StagedFit.from_arrays(
-            stage_arrays(result, model),
-            name=result.scan_name,
-            label=label or result.scan_name,
-            status=result.status,
-            reason=result.reason,
-            b=result.b,
-            z=result.z,
-            b_stddev=result.b_stddev,
-            shrinkage=result.shrinkage,
-        )
+        arrays = stage_arrays(result, model)
+        return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
 
     @staticmethod
     def from_arrays(
-        arrays: Mapping[str, npt.NDArray[Any]],
-        *,
-        name: str,
-        label: str,
-        status: str,
-        reason: str,
-        b: FloatArray,
-        z: FloatArray,
-        b_stddev: FloatArray,
-        shrinkage: FloatArray,
+        arrays: Mapping[str, npt.NDArray[Any]], told: FitResult | FitRecord, *, name: str, label: str
     ) -> StagedFit:
-        """Return a fit from the arrays of NAME.stages.npz and the numbers of its record.
+        """Return a fit from the arrays of NAME.stages.npz.
+
+        Args:
+            arrays: of the file.
+            told: its result, or its record: status, reason and numbers.
+            name: of the fit.
+            label: what pictures call it.
 
         Raises:
             FileFormatError: arrays are absent, of an earlier version, or do not fit together.
         """
         again = "fit the scan again with --stages"
+        b, z, b_stddev, shrinkage = (
+            np.array(values, dtype=np.float64) for values in (told.b, told.z, told.b_stddev, told.shrinkage)
+        )
         if int(arrays.get("format_version", np.array(0))) != STAGES_VERSION:
             raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
         try:
@@ -144,14 +136,21 @@ class StagedFit:
         whole &= all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values())
         whole &= all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values())
         whole &= regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS)
+        whole &= all(values.shape == b.shape for values in (z, b_stddev, shrinkage))
         whole &= all(moment.b.shape == b.shape and np.isfinite(moment.b).all() for moment in history)
         if not whole:
             raise FileFormatError(f"{name}: its saved stages do not fit together; {again}.")
         unseen = regions == UNSEEN
         shown = {stage: np.where(unseen, np.nan, d) for stage, d in forward.items()}
         return StagedFit(
-            name, label, status, reason, scan, surfaces, shown, backward, regions, b, z, b_stddev, shrinkage, history
-        )
+            name, label, told.status, told.reason, scan, surfaces, shown, backward, regions, b, z, b_stddev, shrinkage,
+            history,
+        )  # fmt: skip
+
+
+def measured_mm(distances_mm: FloatArray) -> FloatArray:
+    """Return the lengths of signed distances, those that were measured, (n,)."""
+    return np.abs(distances_mm[np.isfinite(distances_mm)])
 
 
 _MEDIANS = 5.0
@@ -160,7 +159,7 @@ _MEDIANS = 5.0
 
 def scale_end(distances_mm: FloatArray) -> float:
     """Return where a scale of signed distances (N,), mm, ends, whatever hair or one bad fit among them does."""
-    known = np.abs(distances_mm[np.isfinite(distances_mm)])
+    known = measured_mm(distances_mm)
     if not len(known):
         return 1.0
     return nice_ceiling(min(float(np.percentile(known, 97)), _MEDIANS * float(np.median(known))))

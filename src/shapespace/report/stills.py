@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from PIL import Image as PillowImage
 
-from shapespace.report.colours import CLAY, DIVERGING, MODEL_COLOUR, SCAN_COLOUR
-from shapespace.report.render import Camera, Image, Layer, distance_layer, render_series
+from shapespace.report.colours import DIVERGING, MODEL_COLOUR, SCAN_COLOUR
+from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
@@ -21,17 +20,8 @@ PANEL = (176, 232)
 """Width and height of a panel in pixels."""
 
 
-@dataclass(frozen=True)
-class Still:
-    """A picture ready to embed.
-
-    Args:
-        data: WebP.
-        size: width and height in pixels.
-    """
-
-    data: bytes
-    size: tuple[int, int]
+Still: TypeAlias = tuple[bytes, tuple[int, int]]
+"""WebP, and its width and height in pixels."""
 
 
 def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -> Still:
@@ -50,7 +40,7 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     scan, model = Layer(fit.scan, SCAN_COLOUR), Layer(surface, MODEL_COLOUR)
     plain, both = render_series([[scan], [scan, model]], camera=camera, size=panel)
     distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
-    (seen,) = render_series([[distances]], camera=camera, size=panel)
+    seen = render(distances, camera=camera, size=panel)
     return encoded(np.concatenate([plain, both, seen], axis=1))
 
 
@@ -59,8 +49,7 @@ def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
     camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
     # Points are drawn as balls, of a size that joins them whatever the unit of the file.
     radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    (image,) = render_series([[Layer(mesh, CLAY, point_radius_mm=max(radius, 1e-9))]], camera=camera, size=panel)
-    return encoded(image)
+    return encoded(render(Layer(mesh, point_radius_mm=max(radius, 1e-9)), camera=camera, size=panel))
 
 
 def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:
@@ -69,10 +58,10 @@ def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> S
     return encoded(np.repeat(row[None], 10, axis=0), lossless=True)
 
 
-def encoded(image: Image, *, lossless: bool = False) -> Still:
+def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
     """Return pixels (H, W, 3) uint8 as WebP."""
     stream = io.BytesIO()
     PillowImage.fromarray(np.ascontiguousarray(image)).save(
-        stream, format="WEBP", lossless=lossless, quality=84, method=3
+        stream, format="WEBP", lossless=lossless, quality=quality, method=effort
     )
-    return Still(stream.getvalue(), (image.shape[1], image.shape[0]))
+    return stream.getvalue(), (image.shape[1], image.shape[0])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.report import sections
@@ -139,19 +140,9 @@ class StudyParts:
         """Return how well stated probabilities hold."""
         from shapespace.report import figures
 
-        low, high, confidence, accuracy, count = (
-            np.array(
-                [(one.low, one.high, one.confidence, one.accuracy, one.count) for one in part.bins], dtype=np.float64
-            )
-            .reshape(-1, 5)
-            .T
-        )
-        figure = figures.calibration_figure(low, high, confidence, accuracy, count, ece=part.ece, brier=part.brier)
-        told = [
-            f"stated {percent(c)}, right {percent(a)}"
-            for c, a, n in zip(confidence, accuracy, count, strict=True)
-            if n > 0
-        ]
+        bins = np.array([structs.astuple(one) for one in part.bins], dtype=np.float64).reshape(-1, 5)
+        figure = figures.calibration_figure(bins, ece=part.ece, brier=part.brier)
+        told = [f"stated {percent(said)}, right {percent(right)}" for _, _, said, right, count in bins if count > 0]
         said = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
         about = (
             "How often answers are right, against the probability stated for them: under the dashed line they are "

@@ -20,6 +20,11 @@ STATUS_WORDS: Mapping[str, str] = {
 DASH = "–"
 
 
+def printable(text: str) -> str:
+    """Return `text` with control characters and lone surrogates replaced; white space stays."""
+    return "".join(c if c.isprintable() or c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def anchor(text: str) -> str:
     """Return `text` as the name of a place in the page: letters, digits and hyphens only."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "part"

@@ -25,6 +25,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.report.html import require_report_extra, write_report
+from shapespace.schemas import Part, TextPart
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
@@ -203,14 +204,14 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
     accuracy, interval = fits.accuracy_of(found.predicted)
     labels, classes = fits.labels.tolist(), found.classes
     doubtful, failed = fits.status.count("doubtful"), fits.status.count("failed")
-    made: list[parts.Part] = [
-        {"kind": "text", "title": "What was tested", "text": [
+    made: list[Part] = [
+        TextPart(title="What was tested", text=(
             *holds.splitlines(),
             f"{doubtful} of {len(fits.status)} fits are doubtful and {failed} failed. Doubtful fits are classified "
             "and counted; a failed one counts as wrong.",
             "The shape model was given and stays the same in all folds; scaling and classifiers are made anew "
             "without the people tested. Where it was made of the same people, these figures flatter.",
-        ]},
+        )),
         parts.table(
             "Classifiers on unseen people",
             [("Features", "text"), ("Neutral face", "text"), ("Classifier", "text"), ("Macro accuracy", "percent"),
@@ -265,7 +266,7 @@ def _compared(
     return rows, *last
 
 
-def _by_intensity(fits: OwnFits, found: evaluate.Predictions) -> list[parts.Part]:
+def _by_intensity(fits: OwnFits, found: evaluate.Predictions) -> list[Part]:
     level = fits.level[fits.tested]
     levels = sorted(set(level.tolist()))
     if len(levels) < 2:

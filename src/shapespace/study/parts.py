@@ -13,96 +13,76 @@ import numpy.typing as npt
 from shapespace import __version__
 from shapespace.errors import InputError
 from shapespace.recognise import evaluate
-from shapespace.schemas import Recognition
+from shapespace.schemas import (
+    Bin,
+    CalibrationPart,
+    ConfusionPart,
+    LearningCurvePart,
+    Part,
+    Recognition,
+    TableColumn,
+    TablePart,
+    Target,
+    to_json,
+)
 from shapespace.types import FloatArray
 
-Part = dict[str, Any]
 BoolRow = npt.NDArray[np.bool_]
 TextArray = npt.NDArray[np.str_]
 
 
-def table(title: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[object]], note: str = "") -> Part:
+def table(
+    title: str, columns: Sequence[tuple[str, str]], rows: Sequence[Sequence[object]], note: str = ""
+) -> TablePart:
     """Return a table; `columns` are (name, kind)."""
-    return {
-        "kind": "table",
-        "title": title,
-        "note": note,
-        "columns": [{"name": name, "kind": kind} for name, kind in columns],
-        "rows": [[plain(cell) for cell in row] for row in rows],
-    }
-
-
-def plain(value: object) -> object:
-    """Return a value as JSON has it: numbers that are not finite become null."""
-    if isinstance(value, tuple):
-        return [plain(item) for item in cast(tuple[object, ...], value)]
-    bare: object = cast(Any, value).item() if isinstance(value, np.generic) else value
-    return None if isinstance(bare, float) and not np.isfinite(bare) else bare
+    heads = tuple(TableColumn(name=name, kind=cast(Any, kind)) for name, kind in columns)
+    return TablePart(title=title, note=note, columns=heads, rows=tuple(map(tuple, rows)))
 
 
 def confusion(
     title: str, labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str], note: str = ""
-) -> Part:
+) -> ConfusionPart:
     """Return a confusion matrix."""
     counts = evaluate.confusion(labels, predicted, classes)
     unanswered = int(counts[:, len(classes) :].sum())
-    counts = counts[:, : len(classes)]
     if unanswered:
         note = f"{note} {unanswered} without an answer are not shown.".strip()
-    return {"kind": "confusion", "title": title, "classes": list(classes), "counts": counts.tolist(), "note": note}
+    return ConfusionPart(title=title, note=note, classes=tuple(classes), counts=counts[:, : len(classes)].tolist())
 
 
-def per_class(title: str, labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> Part:
+def per_class(title: str, labels: Sequence[str], predicted: Sequence[str], classes: Sequence[str]) -> TablePart:
     """Return precision, recall and F1 of each class."""
     scores = evaluate.per_class(labels, predicted, classes)
     return table(
         title,
-        [
-            ("Expression", "text"),
-            ("Precision", "percent"),
-            ("Recall", "percent"),
-            ("F1", "percent"),
-            ("Scans", "count"),
-        ],
+        [("Expression", "text"), *((head, "percent") for head in ("Precision", "Recall", "F1")), ("Scans", "count")],
         [(name, one.precision, one.recall, one.f1, one.count) for name, one in scores.items()],
     )
 
 
-def calibration(title: str, labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> Part:
+def calibration(
+    title: str, labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]
+) -> CalibrationPart:
     """Return how often probabilities come true."""
     found = evaluate.calibration(labels, probabilities, classes)
-    bins = [
-        {"confidence": float(said), "accuracy": float(true), "count": int(count)}
-        for said, true, count in zip(found.confidence, found.accuracy, found.count, strict=True)
-    ]
-    for one in bins:
-        one["low"] = min(float(np.floor(10 * one["confidence"])) / 10, 0.9)
-        one["high"] = one["low"] + 0.1
-    return {
-        "kind": "calibration",
-        "title": title,
-        "bins": bins,
-        "ece": float(found.expected_calibration_error),
-        "brier": float(found.brier),
-    }
+    low = np.minimum(np.floor(10 * np.asarray(found.confidence)) / 10, 0.9)
+    bins = tuple(
+        Bin(low=begins, high=begins + 0.1, confidence=said, accuracy=true, count=count)
+        for begins, said, true, count in zip(low, found.confidence, found.accuracy, found.count, strict=True)
+    )
+    return CalibrationPart(title=title, bins=bins, ece=found.expected_calibration_error, brier=found.brier)
 
 
 def learning_curve(
     title: str, folds: Sequence[evaluate.Fold], counts: Sequence[int], *, ceiling: float | None, repeats: int = 5
-) -> Part:
+) -> LearningCurvePart:
     """Return macro accuracy against the number of training people."""
     curve = evaluate.learning_curve(folds, "lda", counts, repeats=repeats)
-    low, high = np.quantile(curve.macro_accuracy, [0.0, 1.0], axis=1)
-    return {
-        "kind": "learning_curve",
-        "title": title,
-        "subjects": curve.subjects.tolist(),
-        "mean": curve.mean.tolist(),
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "band": f"lowest and highest of {repeats} draws",
-        "ceiling": ceiling,
-    }
+    low, high = np.quantile(curve.macro_accuracy, [0.0, 1.0], axis=1).tolist()
+    return LearningCurvePart(
+        title=title, subjects=curve.subjects.tolist(), mean=curve.mean.tolist(), low=low, high=high,
+        band=f"lowest and highest of {repeats} draws", ceiling=ceiling,
+    )  # fmt: skip
 
 
 def accuracy_of(
@@ -136,33 +116,32 @@ def words(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def target(what: str, wanted: str, reached: str, *, met: bool, note: str = "") -> dict[str, Any]:
+def target(what: str, wanted: str, reached: str, *, met: bool, note: str = "") -> Target:
     """Return one line of the table of targets."""
-    return {"what": what, "target": wanted, "reached": reached, "met": bool(met), "note": note}
+    return Target(what=what, target=wanted, reached=reached, met=bool(met), note=note)
 
 
 def document(
     title: str,
     summary: Sequence[str],
-    targets: Sequence[Mapping[str, Any]],
+    targets: Sequence[Target],
     parts: Sequence[Part],
     *,
     settings: Mapping[str, Any],
     model_hashes: Sequence[str],
 ) -> dict[str, Any]:
     """Return the whole of recognition.json, checked as the report will."""
-    whole = {
-        "format": Recognition.FORMAT,
-        "format_version": Recognition.VERSION,
-        "version": __version__,
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "title": title,
-        "summary": list(summary),
-        "targets": list(targets),
-        "parts": list(parts),
-        "settings": dict(settings),
-        "versions": {name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
-        "model_hashes": list(model_hashes),
-    }
-    Recognition.from_json(whole)
-    return whole
+    whole = Recognition(
+        version=__version__,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        title=title,
+        summary=tuple(summary),
+        targets=tuple(targets),
+        parts=tuple(parts),
+        settings=settings,
+        versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
+        model_hashes=tuple(model_hashes),
+    )
+    made = to_json(whole)
+    Recognition.from_json(made)
+    return made

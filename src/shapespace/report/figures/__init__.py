@@ -11,7 +11,7 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
-from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_3d, scatter_matrix
+from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_matrix
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit import (
     THRESHOLDS_MM,
@@ -25,14 +25,11 @@ from shapespace.report.figures.fit import (
     threshold_figure,
 )
 from shapespace.report.figures.many import (
-    Entry,
     aligned_grid,
     distance_maps,
     error_curves,
     faces_grid,
-    gallery,
     portrait_figure,
-    worst_first,
 )
 from shapespace.report.figures.model import mean_figure, mode_animation, modes_figure, quality_figure, spectrum_figure
 from shapespace.report.figures.recognition import (
@@ -50,7 +47,6 @@ __all__ = [
     "STAGE_WORDS",
     "THRESHOLDS_MM",
     "Coefficients",
-    "Entry",
     "StagedFit",
     "aligned_grid",
     "b_plane",
@@ -65,7 +61,6 @@ __all__ = [
     "error_curves",
     "face_map_figure",
     "faces_grid",
-    "gallery",
     "history_figure",
     "importance_figure",
     "learning_curve_figure",
@@ -77,11 +72,9 @@ __all__ = [
     "portrait_figure",
     "quality_figure",
     "regions_figure",
-    "scatter_3d",
     "scatter_matrix",
     "signed_maps",
     "spectrum_figure",
     "stages_figure",
     "threshold_figure",
-    "worst_first",
 ]

@@ -76,12 +76,13 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     if shown == 1:
         heading = title or f"The one coefficient of {counted(len(points), 'scan')}, in mm"
     groups = _groups(points)
+    handles = _handles(groups)
     if shown == 1:
         figure, axes = chart(heading, height=2.8)
         _spread(axes, b[:, 0], groups)
         axes.set(xlabel="b1 (mm)", ylabel="scans")
-        if any(name for name, _, _ in groups):
-            legend(axes, handles=_handles(groups), loc="upper right", handlelength=1.0)
+        if handles:
+            legend(axes, handles=handles, loc="upper right", handlelength=1.0)
         return finish(figure)
     side = 5.6 / shown
     figure, plots = charts(heading, [side] * shown, columns=shown)
@@ -109,34 +110,27 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
             if c == 0 and r > 0:
                 axes.set_ylabel(f"b{r + 1}")
     finish(figure, w_pad=0.3, h_pad=0.3)
-    if any(name for name, _, _ in groups):
+    if handles:
         figure.legend(
-            handles=_handles(groups), loc="upper right", fontsize=SMALL, frameon=False, labelcolor=INK,
+            handles=handles, loc="upper right", fontsize=SMALL, frameon=False, labelcolor=INK,
             handletextpad=0.2, ncols=1 if len(groups) < 9 else 2,
             bbox_to_anchor=(0.995, cast(Any, figure).plots_within[3]),
         )  # fmt: skip
     return figure
 
 
-def scatter_3d(points: Sequence[Coefficients], *, title: str = "") -> Figure:
-    """Draw b1, b2 and b3 from two sides, one colour a label.
-
-    Raises:
-        InputError: no scans, or fewer than three coefficients.
-    """
-    return _space(
-        points, title or f"The first three coefficients of {counted(len(points), 'scan')}, from two sides", None, None
-    )
-
-
 def b_plane(
     scans: Sequence[Coefficients],
     *,
     title: str = "",
-    neutral_b: FloatArray | None = None,
-    neutral_z: FloatArray | None = None,
+    neutral: Coefficients | None = None,
 ) -> Figure:
-    """Draw b1 against b2 (figure 9), one colour an expression, larger for stronger, with lines through neutral.
+    """Draw b1 against b2 (figure 9), one colour an expression, larger for stronger.
+
+    Args:
+        scans: expressive ones.
+        title: above the figure.
+        neutral: the neutral face, through which a line is drawn for each expression; None draws no lines.
 
     Raises:
         InputError: no scans, or fewer than two coefficients.
@@ -149,16 +143,14 @@ def b_plane(
     for _, look, at in groups:
         own = [scans[k] for k in at]
         axes.scatter(b[at, 0], b[at, 1], s=_sizes(own), **look, edgecolors="white", linewidths=0.7, zorder=3)
-        line = _line(own, neutral_b, neutral_z)
+        line = _line(own, neutral)
         if line is not None:
             axes.plot(line[:, 0], line[:, 1], color=look["color"], lw=1.8, alpha=0.8, zorder=2)
-    if neutral_b is not None:
-        axes.plot(neutral_b[0], neutral_b[1], marker="+", ms=16, mew=2.6, color=INK, ls="", zorder=4)
+    if neutral is not None:
+        axes.plot(*neutral.b[:2], marker="+", ms=16, mew=2.6, color=INK, ls="", zorder=4)
     axes.set(xlabel="b1 (mm)", ylabel="b2 (mm)")
     axes.margins(0.1)
-    handles = _handles(groups) if any(name for name, _, _ in groups) else []
-    if neutral_b is not None:
-        handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.6))
+    handles = _handles(groups, neutral)
     if handles:
         legend(axes, handles=handles, loc="best", handlelength=1.0, ncols=1 if len(handles) < 9 else 2)
     return finish(figure)
@@ -168,35 +160,29 @@ def b_space(
     scans: Sequence[Coefficients],
     *,
     title: str = "",
-    neutral_b: FloatArray | None = None,
-    neutral_z: FloatArray | None = None,
+    neutral: Coefficients | None = None,
 ) -> Figure:
     """Draw b1, b2 and b3 (figure 10) from two sides, as `b_plane` does.
 
     Raises:
         InputError: no scans, or fewer than three coefficients.
     """
-    return _space(scans, title or "The lines of the expressions in b1, b2 and b3, from two sides", neutral_b, neutral_z)
-
-
-def _space(
-    scans: Sequence[Coefficients], title: str, neutral_b: FloatArray | None, neutral_z: FloatArray | None
-) -> Figure:
     b = _stacked(scans)
     if b.shape[1] < 3:
         raise InputError(f"b1, b2 and b3 need three coefficients a scan, but there are only {b.shape[1]}.")
-    every = b[:, :3] if neutral_b is None else np.concatenate([b[:, :3], neutral_b[None, :3]])
+    every = np.stack([scan.b[:3] for scan in (*scans, *([neutral] if neutral else []))])
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
     groups = _groups(scans)
-    handles = _handles(groups) if any(name for name, _, _ in groups) else []
-    if neutral_b is not None:
-        handles.append(_handle({"marker": "+", "color": INK}, "neutral", mew=2.4))
+    handles = _handles(groups, neutral)
     columns = _legend_columns([str(handle.get_label()) for handle in handles])
     lines = int(np.ceil(len(handles) / columns))
     # Panels are placed by hand, since matplotlib leaves half of a 3-D plot empty.
     foot_px = lines * _LEGEND_LINE * line_height(SMALL)
-    figure, plots = charts(title, [_SPACE_INCHES + foot_px / DPI])
+    of = f"of {counted(len(scans), 'scan')}" if neutral is None else "and the lines of the expressions"
+    figure, plots = charts(
+        title or f"The first three coefficients {of}, from two sides", [_SPACE_INCHES + foot_px / DPI]
+    )
     figure.delaxes(plots[0])
     within = cast(tuple[float, float, float, float], cast(Any, figure).plots_within)
     total = figure.get_figheight()
@@ -208,23 +194,18 @@ def _space(
         axes = cast(Any, figure.add_axes(place, projection="3d"))
         for _, look, at in groups:
             own = [scans[i] for i in at]
-            sizes = _sizes(own) if neutral_b is not None or any(scan.intensity for scan in own) else size
+            sizes = _sizes(own) if neutral is not None or any(scan.intensity for scan in own) else size
             axes.scatter(*b[at, :3].T, s=sizes, **look, edgecolors="white", linewidths=0.5, depthshade=False)
-            line = _line(own, neutral_b, neutral_z)
+            line = _line(own, neutral)
             if line is not None:
                 axes.plot(*line[:, :3].T, color=look["color"], lw=1.5, alpha=0.85)
             if len(scans) <= 2 * _MOST_DOTS_BIG:
                 # Drop lines to the floor, without which a cloud of points has no depth.
                 for point in b[at, :3]:
                     axes.plot([point[0]] * 2, [point[1]] * 2, [low[2] - room[2], point[2]], color="#cfd1d5", lw=0.6)
-        if neutral_b is not None:
-            axes.plot(*neutral_b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
-        _style_space(axes, low - room, high + room)
-        # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
-        wider = _wider_than_three(axes.zaxis)
-        axes.tick_params(axis="z", pad=wider / 2 - 1)
-        axes.zaxis.labelpad = 2 + 0.6 * wider
-        aside = wider / 72 * DPI / WIDTH
+        if neutral is not None:
+            axes.plot(*neutral.b[:3, None], marker="+", ms=14, mew=2.4, color=INK, ls="")
+        aside = _style_space(axes, low - room, high + room) / 72 * DPI / WIDTH
         axes.set_position((place[0] + k * aside, place[1], place[2] - aside, place[3]))
         axes.view_init(elev=20, azim=azimuth)
         axes.set_box_aspect((1, 1, 0.85), zoom=0.92)
@@ -236,8 +217,8 @@ def _space(
     return figure
 
 
-def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> None:
-    """Give a plot in space its names, its ends (3,), and quiet panes."""
+def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
+    """Give a plot in space its names, its ends (3,), and quiet panes; return the points by which it is wider."""
     for axis, at in zip("xyz", range(3), strict=True):
         getattr(axes, f"set_{axis}label")(f"b{at + 1} (mm)", fontsize=SMALL, color=INK, labelpad=2)
         getattr(axes, f"set_{axis}lim")(low[at], high[at])
@@ -246,6 +227,11 @@ def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> None:
     axes.zaxis.set_rotate_label(False)
     axes.zaxis.label.set_rotation(90)
     axes.tick_params(labelsize=SMALL - 2, colors=GREY, pad=-1)
+    # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
+    wider = _wider_than_three(axes.zaxis)
+    axes.tick_params(axis="z", pad=wider / 2 - 1)
+    axes.zaxis.labelpad = 2 + 0.6 * wider
+    return wider
 
 
 def _wider_than_three(axis: Any) -> float:
@@ -295,12 +281,18 @@ def _handle(look: Mapping[str, Any], name: str, **style: Any) -> Line2D:
     return Line2D([], [], ls="", ms=8, label=escaped(short(name, 22)), **{**look, **style})
 
 
-def _handles(groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> list[Line2D]:
+def _handles(
+    groups: Sequence[tuple[str, dict[str, Any], list[int]]], neutral: Coefficients | None = None
+) -> list[Line2D]:
+    """Return the entries of a legend: the labels, where there are any, and the neutral face."""
+    plus = [] if neutral is None else [_handle({"marker": "+", "color": INK}, "neutral", mew=2.6)]
+    if not any(name for name, _, _ in groups):
+        return plus
     named = [(name or "no label", look) for name, look, _ in groups]
     out = [_handle(look, name) for name, look in named[:_MOST_IN_LEGEND]]
     if len(named) > _MOST_IN_LEGEND:
         out.append(Line2D([], [], ls="", label=f"and {len(named) - _MOST_IN_LEGEND} more"))
-    return out
+    return out + plus
 
 
 def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
@@ -324,13 +316,11 @@ def _sizes(scans: Sequence[Coefficients]) -> FloatArray:
     return np.array([28.0 + 110.0 * float(np.clip(scan.intensity, 0, 1)) for scan in scans])
 
 
-def _line(
-    scans: Sequence[Coefficients], neutral_b: FloatArray | None, neutral_z: FloatArray | None
-) -> FloatArray | None:
+def _line(scans: Sequence[Coefficients], neutral: Coefficients | None) -> FloatArray | None:
     """Return two points (2, K), in mm, of the line through neutral that fits the scans best in units of sd."""
-    if neutral_b is None or neutral_z is None or len(scans) < 2:
+    if neutral is None or len(scans) < 2:
         return None
-    v = np.stack([scan.z - neutral_z for scan in scans])
+    v = np.stack([scan.z - neutral.z for scan in scans])
     direction = np.linalg.svd(v, full_matrices=False)[2][0]
     along = v @ direction
     if along.sum() < 0:
@@ -339,4 +329,4 @@ def _line(
     size_b, size_z = (np.abs(np.stack(rows)).sum(axis=0) for rows in ([s.b for s in scans], [s.z for s in scans]))
     stddev = np.divide(size_b, size_z, out=np.zeros_like(size_b), where=size_z > 0)
     ends = np.array([min(0.0, along.min()), 1.08 * max(0.0, along.max())])
-    return neutral_b + ends[:, None] * (direction * stddev)
+    return neutral.b + ends[:, None] * (direction * stddev)

@@ -5,9 +5,10 @@ A figure is 960 pixels wide, and its smallest type stays legible when a phone sh
 
 from __future__ import annotations
 
-import io
-import unicodedata
+import re
+import textwrap
 import warnings
+from bisect import bisect_left
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,20 +21,20 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
-from PIL import Image as PillowImage
 
 from shapespace.errors import InputError
 from shapespace.report.colours import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
+from shapespace.report.staged import StagedFit, measured_mm
+from shapespace.report.stills import Still, encoded
 from shapespace.report.wording import counted as counted
 from shapespace.report.wording import mm as mm
 from shapespace.report.wording import percent as percent
+from shapespace.report.wording import printable
 from shapespace.types import FloatArray, Mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from shapespace.report.staged import StagedFit
 
 STAGE_WORDS = {
     "before": "before",
@@ -75,15 +76,11 @@ class Row:
         panels: (H, W, 3) pictures.
         captions: one above each panel; empty for none.
         heading: above the row.
-        notes: one below each panel; empty for none.
-        frames: colour of the line around each panel, None for no line; empty for none at all.
     """
 
     panels: Sequence[Image]
     captions: Sequence[str] = ()
     heading: str = ""
-    notes: Sequence[str] = ()
-    frames: Sequence[Colour | None] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +146,7 @@ def grid(
     widest = max(row.panels[0].shape[1] for row in rows)
     total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
     texts: list[tuple[float, float, str, dict[str, Any]]] = []
-    pictures: list[tuple[int, float, Image, Colour | None]] = []
+    pictures: list[tuple[int, float, Image]] = []
     y = 6.0
 
     def write(x: float, text: str, width: float, size: float, **style: Any) -> float:
@@ -162,7 +159,7 @@ def grid(
     y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
     for r, row in enumerate(rows):
         y += 10 if r and any(row.captions) and not row.heading else 0
-        panels = row.panels if any(row.frames) else without_empty_rows(row.panels)
+        panels = without_empty_rows(row.panels)
         high, wide = panels[0].shape[:2]
         left = (total_w - len(row.panels) * wide - (len(row.panels) - 1) * _GAP) // 2 if len(rows) == 1 else 0
         if row.heading:
@@ -173,15 +170,8 @@ def grid(
                 write(x, text, wide, TEXT, ha="center", color=INK)
                 for x, text in zip(centres, row.captions, strict=True)
             )
-        frames = row.frames or [None] * len(row.panels)
-        for k, (panel, frame) in enumerate(zip(panels, frames, strict=True)):
-            pictures.append((left + k * (wide + _GAP), y, panel, frame))
+        pictures += [(left + k * (wide + _GAP), y, panel) for k, panel in enumerate(panels)]
         y += high + _GAP
-        if any(row.notes):
-            y += 4 + max(
-                write(x, text, wide - 6, SMALL, ha="center", color=GREY)
-                for x, text in zip(centres, row.notes, strict=True)
-            )
     if keys:
         y += 4
         y += _place_keys(texts, keys, y, total_w)
@@ -198,24 +188,18 @@ def grid(
 
 
 def _drawn(
-    pictures: Sequence[tuple[int, float, Image, Colour | None]],
+    pictures: Sequence[tuple[int, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
     total_w: int,
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
     figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
-    for x, top, image, frame in pictures:
+    for x, top, image in pictures:
         high, wide = image.shape[:2]
-        axes = figure.add_axes(
-            (x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h), frameon=frame is not None
-        )
+        axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
         axes.imshow(image, interpolation="nearest", aspect="auto")
-        axes.set_xticks([])
-        axes.set_yticks([])
-        if frame is not None:
-            for spine in axes.spines.values():
-                spine.set(color=frame, linewidth=2.2)
+        axes.set_axis_off()
     for x, top, text, style in texts:
         figure.text(x / total_w, 1 - top / total_h, escaped(text), **style)
     return figure
@@ -334,17 +318,13 @@ def without_glyph_warnings() -> Generator[None]:
         yield
 
 
-def encode_webp(figure: Figure, *, lossless: bool = False) -> tuple[bytes, tuple[int, int]]:
+def encode_webp(figure: Figure, *, lossless: bool = False) -> Still:
     """Return `figure` as WebP bytes and its size in pixels; flat charts are smaller lossless, stills are not."""
     with without_glyph_warnings():
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]
-    stream = io.BytesIO()
-    PillowImage.fromarray(np.ascontiguousarray(pixels)).save(
-        stream, format="WEBP", lossless=lossless, quality=20 if lossless else 78, method=1 if lossless else 3
-    )
-    return stream.getvalue(), (pixels.shape[1], pixels.shape[0])
+    return encoded(pixels, lossless=lossless, quality=20 if lossless else 78, effort=1 if lossless else 3)
 
 
 @lru_cache(maxsize=1)
@@ -378,53 +358,30 @@ def height_of(text: str, size: float) -> float:
 
 
 def wrap(text: str, width: float, size: float, *, bold: bool = False, most: int = _MOST_LINES) -> str:
-    """Return `text` in at most `most` lines, none wider than `width` pixels, those of a paragraph of like length.
+    """Return `text` in at most `most` lines, none wider than `width` pixels, all of like length.
 
     What is left out ends in `…`.
     """
-    lines: list[str] = []
-    for part in plain(text).split("\n"):
-        filled = _filled(part, width, size, bold)
-        if 1 < len(filled) <= most:
-            low, high = width / len(filled), width
-            while high - low > 8:
-                middle = (low + high) / 2
-                low, high = (low, middle) if len(_filled(part, middle, size, bold)) == len(filled) else (middle, high)
-            filled = _filled(part, high, size, bold)
-        lines += filled
+    parts = plain(text).split("\n")
+
+    def in_lines(letters: int) -> list[str]:
+        wrapper = textwrap.TextWrapper(letters, break_on_hyphens=False)
+        return [line for part in parts for line in wrapper.wrap(part) or [""]]
+
+    def wide(line: str) -> bool:
+        return measured(line, size, bold=bold) > width
+
+    longest = range(1, max(map(len, parts)) + 1)
+    letters = max(bisect_left(longest, True, key=lambda n: any(map(wide, in_lines(n)))), 1)
+    lines = in_lines(letters)
     if len(lines) <= most:
-        return "\n".join(lines).rstrip("\n")
+        return "\n".join(
+            in_lines(1 + bisect_left(longest[:letters], True, key=lambda n: len(in_lines(n)) <= len(lines)))
+        )
     last = lines[most - 1]
-    while last and measured(last + "…", size, bold=bold) > width:
-        last = last[:-1]
-    return "\n".join([*lines[: most - 1], last.rstrip() + "…"])
-
-
-def _filled(text: str, width: float, size: float, bold: bool) -> list[str]:
-    """Return `text` in lines, each as full as can be."""
-    lines: list[str] = []
-    line = ""
-    for word in _pieces(text, width, size, bold):
-        longer = f"{line} {word}" if line else word
-        if line and measured(longer, size, bold=bold) > width:
-            lines.append(line)
-            longer = word
-        line = longer
-    return [*lines, line]
-
-
-def _pieces(text: str, width: float, size: float, bold: bool) -> Generator[str]:
-    """Yield words, those that are wider than `width` in parts."""
-    for word in text.split(" "):
-        while word and measured(word, size, bold=bold) > width:
-            low, high = 1, len(word)
-            while low < high:
-                middle = (low + high + 1) // 2
-                low, high = (middle, high) if measured(word[:middle], size, bold=bold) <= width else (low, middle - 1)
-            yield word[:low]
-            word = word[low:]
-        if word:
-            yield word
+    while last and wide(last + "…"):
+        last = last[:-1].rstrip()
+    return "\n".join([*lines[: most - 1], last + "…"])
 
 
 _LONGEST = 400
@@ -432,16 +389,7 @@ _LONGEST = 400
 
 def plain(text: str) -> str:
     """Return `text` of a user without what cannot be printed, and no longer than a caption could be."""
-    kept = "".join(
-        c
-        if c == "\n"
-        else " "
-        if c.isspace()
-        else "\N{REPLACEMENT CHARACTER}"
-        if unicodedata.category(c)[0] == "C"
-        else c
-        for c in str(text)[: _LONGEST + 1]
-    )
+    kept = re.sub(r"[^\S\n]", " ", printable(str(text)[: _LONGEST + 1]))
     return kept if len(kept) <= _LONGEST else kept[: _LONGEST - 1] + "…"
 
 
@@ -466,14 +414,9 @@ def scan_over(mesh: Mesh) -> Layer:
     return Layer(mesh, SCAN_COLOUR, point_radius_mm=None if mesh.faces is not None else 0.3 * point_spacing(mesh))
 
 
-def absolute(values: FloatArray) -> FloatArray:
-    """Return the lengths of signed distances that were measured, (n,)."""
-    return np.abs(values[np.isfinite(values)])
-
-
 def mean_mm(fit: StagedFit, stage: str = "final") -> float:
     """Return the mean distance to the scan of the vertices that it shows; not-a-number where it shows none."""
-    values = absolute(fit.model_to_scan_mm[stage])
+    values = measured_mm(fit.model_to_scan_mm[stage])
     return float(values.mean()) if len(values) else float("nan")
 
 
@@ -485,7 +428,7 @@ def mean_words(fits: Sequence[StagedFit]) -> str:
 
 def unknown(values: FloatArray) -> float:
     """Return the share of `values` that were not measured."""
-    return 1 - len(absolute(values)) / max(len(values), 1)
+    return 1 - len(measured_mm(values)) / max(len(values), 1)
 
 
 def distance_scale(limit_mm: float, *, signed: bool) -> Scale:

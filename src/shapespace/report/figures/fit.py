@@ -30,7 +30,6 @@ from shapespace.report.figures.draw import (
     STAGE_WORDS,
     TEXT,
     Row,
-    absolute,
     chart,
     charts,
     distance_scale,
@@ -48,8 +47,8 @@ from shapespace.report.figures.draw import (
     unknown,
     view,
 )
-from shapespace.report.render import Image, Layer, distance_layer, render_maps, render_series
-from shapespace.report.staged import StagedFit, scale_end
+from shapespace.report.render import Image, Layer, distance_layer, render, render_series
+from shapespace.report.staged import StagedFit, measured_mm, scale_end
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -140,7 +139,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         seen = view(surroundings(fit), len(_SIDES), yaw_deg=yaw)
         first = view(surroundings(fit), len(_SIDES))
         for row, layer in zip(panels, (on_model, on_scan), strict=True):
-            row += render_series([[layer]], camera=seen.camera, size=first.size)
+            row.append(render(layer, camera=seen.camera, size=first.size))
     unseen, beyond = unknown(forward), unknown(backward)
     keys: list[tuple[str, Colour]] = []
     if unseen:
@@ -171,13 +170,16 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
     """
     several = [fits] if isinstance(fits, StagedFit) else list(fits)
     table = np.array([WITHIN_COLOUR, BEYOND_COLOUR])
-    ranges = [(limit - 1e-3, limit + 1e-3) for limit in THRESHOLDS_MM]
     rows: list[Row] = []
     for fit in several:
         far = np.abs(fit.model_to_scan_mm["final"])
         seen = view(fit.surfaces["final"].vertices, len(THRESHOLDS_MM))
-        panels = render_maps(fit.surfaces["final"], far, ranges, colormap=table, camera=seen.camera, size=seen.size)
-        known = absolute(far)
+        maps = [
+            [Layer(fit.surfaces["final"], scalars=far, colormap=table, vmin=limit - 1e-3, vmax=limit + 1e-3)]
+            for limit in THRESHOLDS_MM
+        ]
+        panels = render_series(maps, camera=seen.camera, size=seen.size)
+        known = measured_mm(far)
         within = [percent(float((known <= limit).mean())) if len(known) else "–" for limit in THRESHOLDS_MM]
         captions = [f"{limit:g} mm\n{share}" for limit, share in zip(THRESHOLDS_MM, within, strict=True)]
         rows.append(Row(panels, captions, short(fit.label, 60) if len(several) > 1 else ""))
@@ -198,7 +200,8 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
     vertices that the scan shows count, and scan points within the model's rim.
     """
     both = {
-        stage: (absolute(fit.model_to_scan_mm[stage]), absolute(fit.scan_to_model_mm[stage])) for stage in fit.surfaces
+        stage: (measured_mm(fit.model_to_scan_mm[stage]), measured_mm(fit.scan_to_model_mm[stage]))
+        for stage in fit.surfaces
     }
     every = np.concatenate([values for pair in both.values() for values in pair])
     low, high = _decades(every)
@@ -389,7 +392,7 @@ def _surface(fit: StagedFit, stage: str) -> Mesh:
 
 
 def _summary(values: FloatArray) -> str:
-    far = absolute(values)
+    far = measured_mm(values)
     if not len(far):
         return "no point counted"
     return f"mean {mm(float(far.mean()))}, 95 % within {mm(float(np.percentile(far, 95)))}"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from shapespace.errors import InputError
 from shapespace.report.colours import (
-    CATEGORIES,
     CLAY,
     MODEL_COLOUR,
     SCAN_COLOUR,
@@ -26,14 +24,11 @@ from shapespace.report.figures.draw import (
     NOT_SHOWN,
     SMALL,
     TEXT,
-    WIDTH,
     Row,
     Scale,
-    absolute,
     chart,
     counted,
     distance_scale,
-    escaped,
     finish,
     grid,
     in_rows,
@@ -49,157 +44,28 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
-from shapespace.report.staged import StagedFit, nice_ceiling, scale_end
+from shapespace.report.staged import StagedFit, measured_mm, nice_ceiling, scale_end
 from shapespace.types import FloatArray, Mesh
 
-if TYPE_CHECKING:
-    pass
-
-STATUS_COLOURS: Mapping[str, Colour] = {
-    "failed": (0.72, 0.11, 0.11),
-    "unreadable": (0.72, 0.11, 0.11),
-    "doubtful": (0.90, 0.55, 0.05),
-    "max_iterations": (0.45, 0.45, 0.75),
-}
-_STATUS_WORDS = {
-    "failed": "failed",
-    "unreadable": "cannot be read",
-    "doubtful": "doubtful",
-    "max_iterations": "stopped at the limit",
-}
-_NO_PICTURE = 0.945
+_DOUBTFUL = as_hex((0.90, 0.55, 0.05))
 
 
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """A fit in the gallery, of which a picture may be missing.
-
-    Args:
-        label: what to call it.
-        status: `converged`, `max_iterations`, `doubtful`, `failed` or `unreadable`.
-        reason: one sentence on why.
-        mean_mm: mean distance from the model to the scan; not-a-number where it is not known.
-        fit: with its surfaces, where they were saved.
-        scan: the scan, where only that is there.
-    """
-
-    label: str
-    status: str
-    reason: str = ""
-    mean_mm: float = float("nan")
-    fit: StagedFit | None = None
-    scan: Mesh | None = None
-
-    @staticmethod
-    def of(fit: StagedFit) -> Entry:
-        """Return the entry of a fit with its surfaces."""
-        return Entry(fit.label, fit.status, fit.reason, mean_mm(fit), fit)
-
-
-def worst_first(entries: Sequence[Entry]) -> list[Entry]:
-    """Return `entries` with those that failed first, then the doubtful, then the others by falling distance."""
-    order = {"failed": 0, "unreadable": 0, "doubtful": 1}
-    return sorted(
-        entries, key=lambda e: (order.get(e.status, 2), -e.mean_mm if np.isfinite(e.mean_mm) else float("inf"))
-    )
-
-
-def gallery(fits: Sequence[StagedFit | Entry], *, columns: int = 3, most: int = 24, title: str = "") -> Figure:
-    """Draw scan and model over each other for many fits: failed ones first, then doubtful ones, then the worst.
-
-    Args:
-        fits: the fits; an `Entry` where a fit failed or kept no surface.
-        columns: pictures in a row.
-        most: pictures in all.
-        title: above the figure.
-
-    Raises:
-        InputError: no fit is given.
-    """
-    entries = worst_first([fit if isinstance(fit, Entry) else Entry.of(fit) for fit in fits])
-    shown = entries[: max(most, 1)]
-    if not shown:
-        raise InputError("There is nothing to draw in a gallery without fits.")
-    framed = [_points(entry) for entry in shown]
-    wide = [view(points, columns).size for points in framed if points is not None]
-    width = (WIDTH - (columns - 1) * 8) // columns
-    size = (width, int(np.median([height for _, height in wide]))) if wide else (width, width)
-    panels = [_gallery_panel(entry, points, size, columns) for entry, points in zip(shown, framed, strict=True)]
-    rows = [
-        Row(
-            [panels[k] for k in at],
-            [short(shown[k].label, 40) for k in at],
-            notes=[_verdict(shown[k]) for k in at],
-            frames=[STATUS_COLOURS.get(shown[k].status) for k in at],
-        )
-        for at in in_rows(range(len(shown)), columns)
-    ]
-    counts = {word: sum(entry.status == key for entry in entries) for key, word in _STATUS_WORDS.items()}
-    told = ", ".join(f"{number} {word}" for word, number in counts.items() if number)
-    left = len(entries) - len(shown)
-    return grid(
-        rows,
-        title=title or f"{counted(len(entries), 'fit')}, the worst first: {told or 'none is in doubt'}",
-        keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
-        note=mean_words([entry.fit for entry in shown if entry.fit is not None])
-        + (f" {counted(left, 'more fit')} with smaller distances not shown." if left else ""),
-    )
-
-
-def _points(entry: Entry) -> FloatArray | None:
-    if entry.fit is not None:
-        return surroundings(entry.fit)
-    return entry.scan.vertices if entry.scan is not None and len(entry.scan.vertices) else None
-
-
-def _gallery_panel(entry: Entry, points: FloatArray | None, size: tuple[int, int], columns: int) -> Image:
-    if points is None:
-        return _empty_panel(size)
-    camera = Camera.framing(points, yaw_deg=15.0, aspect=size[0] / size[1], margin=0.04)
-    if entry.fit is None:
-        return render(cast(Mesh, entry.scan), camera=camera, size=size, colour=SCAN_COLOUR)
-    layers = [scan_over(entry.fit.scan), Layer(entry.fit.surfaces["final"], MODEL_COLOUR)]
-    return render_series([layers], camera=camera, size=size)[0]
-
-
-def _empty_panel(size: tuple[int, int]) -> Image:
-    """Return a grey field with a cross of thin lines, where there is nothing to show."""
-    image = np.full((size[1], size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
-    x, y = np.meshgrid(np.linspace(0, 1, size[0]), np.linspace(0, 1, size[1]))
-    image[(np.abs(x - y) < 0.004) | (np.abs(x + y - 1) < 0.004)] = 214
-    return image
-
-
-def _verdict(entry: Entry) -> str:
-    word = _STATUS_WORDS.get(entry.status)
-    far = f"mean {mm(entry.mean_mm)}" if np.isfinite(entry.mean_mm) else ""
-    if word is None:
-        return far or entry.status
-    return plain(f"{word}{': ' + entry.reason if entry.reason else ''}")
-
-
-def error_curves(
-    fits: Sequence[StagedFit] | Mapping[str, FloatArray], *, stage: str = "final", title: str = "", unit: str = "mm"
-) -> Figure:
+def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str = "") -> Figure:
     """Draw cumulative curves: which share of the points lies within each distance.
 
     Args:
-        fits: fits, for a thin curve each and a thick one of all together, over the vertices that their scans show; or
-            errors (n,) by name, for one named curve each.
+        fits: for a thin curve each and a thick one of all together, over the vertices that their scans show.
         stage: of the fits.
         title: above the figure.
-        unit: of errors given by name.
 
     Raises:
         InputError: there is nothing to draw, or a fit lacks the stage.
     """
-    if isinstance(fits, Mapping):
-        return _named_curves(fits, title, unit)
     if not fits:
         raise InputError("There is nothing to draw of cumulative errors without fits.")
     if any(stage not in fit.surfaces for fit in fits):
         raise InputError(f"Not every fit has the stage {stage!r}, so their errors cannot be compared there.")
-    far = [np.sort(absolute(fit.model_to_scan_mm[stage])) for fit in fits]
+    far = [np.sort(measured_mm(fit.model_to_scan_mm[stage])) for fit in fits]
     fits = [fit for fit, values in zip(fits, far, strict=True) if len(values)]
     far = [values for values in far if len(values)]
     if not far:
@@ -213,7 +79,7 @@ def error_curves(
     for fit, values in sorted(zip(fits, far, strict=True), key=lambda pair: pair[0].status != "converged"):
         doubtful = fit.status in ("doubtful", "failed")
         name = "a doubtful fit" if doubtful else "a fit"
-        colour = as_hex(STATUS_COLOURS["doubtful"]) if doubtful else "#7fa8c9"
+        colour = _DOUBTFUL if doubtful else "#7fa8c9"
         _curve(axes, values, color=colour, label=None if name in seen else name, **thin)
         seen.add(name)
     if len(fits) > 1:
@@ -241,22 +107,6 @@ def _nothing_shown(title: str) -> Figure:
     return finish(figure)
 
 
-def _named_curves(tables: Mapping[str, FloatArray], title: str, unit: str) -> Figure:
-    usable = {name: np.sort(absolute(np.asarray(values, dtype=np.float64))) for name, values in tables.items()}
-    usable = {name: values for name, values in usable.items() if len(values)}
-    if not usable:
-        raise InputError("There is nothing to draw of cumulative errors without numbers.")
-    figure, axes = chart(title or "Which share lies within each distance", height=3.5)
-    for k, (name, values) in enumerate(usable.items()):
-        dashes = "-" if k < len(CATEGORIES) else (0, (4, 2))
-        label = f"{short(name, 30)}: median {mm(float(np.median(values)))}" if unit == "mm" else short(name, 30)
-        _curve(axes, values, color=CATEGORIES[k % len(CATEGORIES)], ls=dashes, lw=2, label=escaped(label))
-    far = max(float(np.quantile(values, 0.98)) for values in usable.values())
-    axes.set(xlabel=f"distance ({unit})", ylabel="share (%)", xlim=(0, nice_ceiling(1.05 * far)), ylim=(0, 102))
-    legend(axes, loc="lower right")
-    return finish(figure)
-
-
 def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
     """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
     share = np.linspace(0, 1, min(len(values), 400) + 1)
@@ -281,7 +131,7 @@ def faces_grid(
         raise InputError(f"{title}: {len(meshes)} meshes do not go with {len(labels)} labels.")
     columns = min(columns, max(len(meshes), 3))
     seen = view(np.concatenate([m.vertices for m in meshes]), columns)
-    images = [render(mesh, camera=seen.camera, size=seen.size, colour=colour) for mesh in meshes]
+    images = [render(Layer(mesh, colour), camera=seen.camera, size=seen.size) for mesh in meshes]
     return grid(
         [Row(i, t) for i, t in zip(in_rows(images, columns), in_rows(list(labels), columns), strict=True)], title=title
     )
@@ -324,9 +174,7 @@ def aligned_grid(
     fits: Sequence[StagedFit], *, title: str = "Scan and fitted model over each other", columns: int = 4
 ) -> Figure:
     """Draw scan and fitted model over each other for many fits, in the order given."""
-    images, _ = _equal_views(
-        fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]
-    )
+    images = _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)])
     return grid(
         _captioned(images, fits, columns),
         title=title,
@@ -341,9 +189,9 @@ def distance_maps(
     """Draw the distance from each fitted model to its scan, on one scale up to the 99th percentile of all."""
     if not fits:
         raise InputError(f"{plain(title)}: there is no fit to draw.")
-    known = np.concatenate([absolute(f.model_to_scan_mm["final"]) for f in fits])
+    known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
     top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
-    images, _ = _equal_views(
+    images = _equal_views(
         fits,
         columns,
         lambda fit: [
@@ -370,24 +218,21 @@ def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
     return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
-def _equal_views(
-    fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]
-) -> tuple[list[Image], tuple[int, int]]:
+def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
     """Return one picture a fit, each from its own front, all of one size."""
     if not fits:
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))
     views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
     size = (views[0].size[0], int(np.median([seen.size[1] for seen in views])))
-    images = [
-        render_series(
-            [layers(fit)],
+    return [
+        render(
+            *layers(fit),
             camera=Camera.framing(fit.surfaces["final"].vertices, aspect=size[0] / size[1], margin=0.07),
             size=size,
-        )[0]
+        )
         for fit in fits
     ]
-    return images, size
 
 
 def _captioned(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:

@@ -14,7 +14,7 @@ from PIL import ImageDraw, ImageFont
 
 from shapespace.errors import FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.colours import CLAY, SEQUENTIAL
+from shapespace.report.colours import SEQUENTIAL
 from shapespace.report.figures.draw import (
     FORWARD,
     INK,
@@ -32,7 +32,7 @@ from shapespace.report.figures.draw import (
     percent,
     view,
 )
-from shapespace.report.render import Camera, Image, Layer, render, render_layers
+from shapespace.report.render import Camera, Image, Layer, render
 from shapespace.report.staged import nice_ceiling
 from shapespace.schemas import Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
@@ -70,7 +70,7 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
         camera = view(mean.vertices, len(sides), yaw_deg=yaw).camera
         height = max(camera.height_mm, front.camera.height_mm)
         turned = Camera(camera.centre, height, yaw, 0.0, camera.distance_mm)
-        panels.append(render_layers(layers, camera=turned, size=front.size))
+        panels.append(render(*layers, camera=turned, size=front.size))
     marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
     return grid(
         [Row(panels, [name for name, _ in sides])],
@@ -101,15 +101,15 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     seen = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
     lengths = [np.linalg.norm(move, axis=1) for move in moves]
     top = nice_ceiling(max(float(length.max()) for length in lengths))
-    middle = render(mean, camera=seen.camera, size=seen.size)
+    middle = render(Layer(mean), camera=seen.camera, size=seen.size)
     rows: list[Row] = []
     for k, (move, length) in enumerate(zip(moves, lengths, strict=True)):
         low, high = (
-            render(mean.with_vertices(mean.vertices + sign * move), camera=seen.camera, size=seen.size)
+            render(Layer(mean.with_vertices(mean.vertices + sign * move)), camera=seen.camera, size=seen.size)
             for sign in (-1, 1)
         )
         mapped = Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top)
-        far = render_layers([mapped], camera=seen.camera, size=seen.size)
+        far = render(mapped, camera=seen.camera, size=seen.size)
         share = float(model.stddev[k] ** 2 / model.total_variance)
         rows.append(
             Row(
@@ -182,7 +182,7 @@ def mode_animation(
     swings = deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, half + 1))
     forth = [
         _labelled(
-            render(mean.with_vertices(mean.vertices + z * move), camera=seen.camera, size=seen.size, colour=CLAY),
+            render(Layer(mean.with_vertices(mean.vertices + z * move)), camera=seen.camera, size=seen.size),
             f"mode {mode + 1}",
             float(z),
             deviations,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from shapespace.errors import InputError
-from shapespace.report.colours import CATEGORIES, CLAY, SEQUENTIAL, oklab
+from shapespace.report.colours import CATEGORIES, SEQUENTIAL, oklab
 from shapespace.report.figures.draw import (
     DPI,
     FORWARD,
@@ -38,7 +38,7 @@ from shapespace.report.figures.draw import (
     view,
     wrap,
 )
-from shapespace.report.render import Image, Layer, render, render_layers
+from shapespace.report.render import Image, Layer, render
 from shapespace.report.staged import nice_ceiling
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -137,32 +137,31 @@ def _map() -> Any:
 
 
 def calibration_figure(
-    low: npt.ArrayLike,
-    high: npt.ArrayLike,
-    confidence: npt.ArrayLike,
-    accuracy: npt.ArrayLike,
-    count: npt.ArrayLike,
-    *,
-    ece: float | None = None,
-    brier: float | None = None,
-    title: str = "",
+    bins: npt.ArrayLike, *, ece: float | None = None, brier: float | None = None, title: str = ""
 ) -> Figure:
     """Draw how often answers are right against the probability that was stated, and how many answers state it.
 
     Args:
-        low: (n,) where each bin of probabilities begins,
-        high: (n,) and where it ends; both are cut to 0 to 1.
-        confidence: (n,) mean probability stated in the bin, 0 to 1.
-        accuracy: (n,) share of right answers in the bin, 0 to 1.
-        count: (n,) answers in the bin; those without any are left out, whatever their other numbers.
+        bins: (n, 5), of each bin of probabilities: where it begins and ends, cut to 0 to 1; the mean probability stated
+            and the share of right answers, 0 to 1; how many answers. One without answers is left out, whatever its
+            other numbers.
         ece: expected calibration error, 0 to 1, where it was measured.
         brier: Brier score, where it was measured.
         title: above the figure; by default it says what the calibration error is.
 
     Raises:
-        InputError: lists of different lengths, no answer in any bin, or shares that are not within 0 to 1.
+        InputError: bins of another shape, no answer in any bin, or shares that are not within 0 to 1.
     """
-    (start, end, stated, right), many = _bins(low, high, confidence, accuracy, count)
+    table = _numbers(bins, "the bins of a calibration", ndim=2, finite=False)
+    if table.shape[1] != 5:
+        raise InputError(f"Each bin of a calibration is five numbers, not {table.shape[1]}.")
+    table = table[np.nan_to_num(table[:, 4]) > 0]
+    if not len(table):
+        raise InputError("There is nothing to draw of a calibration without answers.")
+    start, end = 100 * np.clip(table[:, :2].T, 0, 1)
+    stated, right, many = *(100 * table[:, 2:4].T), table[:, 4]
+    if not ((table[:, 2:4] >= 0) & (table[:, 2:4] <= 1)).all():
+        raise InputError("What is stated and what is right in a calibration must lie within 0 to 1.")
     said = "How often answers are right, against the probability stated for them"
     if ece is not None:
         said = f"Stated probabilities are off by {100 * ece:.1f} points on average"
@@ -188,29 +187,6 @@ def calibration_figure(
     below.set(xlim=(floor, 101.5), xlabel="probability stated (%)", ylabel="answers")
     below.locator_params(axis="y", nbins=3, integer=True)
     return finish(figure, h_pad=0.8)
-
-
-def _bins(
-    low: npt.ArrayLike, high: npt.ArrayLike, confidence: npt.ArrayLike, accuracy: npt.ArrayLike, count: npt.ArrayLike
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return the first four in percent, and the counts, of bins with an answer."""
-    many = _numbers(count, "the counts of a calibration", finite=False)
-    known = np.nan_to_num(many) > 0
-    parts: list[FloatArray] = []
-    for name, values in (("low", low), ("high", high), ("confidence", confidence), ("accuracy", accuracy)):
-        found = _numbers(values, f"the {name} of a calibration", finite=False)
-        if found.shape != many.shape:
-            raise InputError(f"The bins of a calibration have {len(many)} counts but {len(found)} numbers for {name}.")
-        found = found[known]
-        if name in ("low", "high"):
-            found = np.clip(found, 0, 1)
-        if not ((found >= 0) & (found <= 1)).all():
-            raise InputError(f"The {name} of a calibration must lie within 0 to 1.")
-        parts.append(100 * found)
-    many = many[known]
-    if not len(many):
-        raise InputError("There is nothing to draw of a calibration without answers.")
-    return parts, many
 
 
 def learning_curve_figure(
@@ -353,7 +329,7 @@ def face_map_figure(
     size = view(mesh.vertices, columns).size
     for yaw in _SIDES:
         camera = view(mesh.vertices, columns, yaw_deg=yaw).camera
-        panels.append(render_layers([layer], camera=camera, size=size))
+        panels.append(render(layer, camera=camera, size=size))
     captions = ["front", "three-quarter"]
     if ranked:
         panels.append(np.full_like(panels[0], 255))
@@ -448,7 +424,7 @@ def mesh_rows_figure(
     drawn = [
         Row(
             [
-                render(mesh, camera=seen.camera, size=seen.size, colour=CLAY)
+                render(Layer(mesh), camera=seen.camera, size=seen.size)
                 if mesh is not None
                 else np.full((seen.size[1], seen.size[0], 3), round(255 * _NO_PICTURE), dtype=np.uint8)
                 for _, mesh in pictures

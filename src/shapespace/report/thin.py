@@ -1,0 +1,89 @@
+"""Surfaces and point clouds with fewer points, so that they can be sent; no point of them is new."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.types import IntArray, Mesh
+
+_MOST_COLLAPSED = 150_000
+
+
+def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    """Return `scan` with at most `largest` triangles (points, where it has none), and which vertices are left.
+
+    No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
+    collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
+    instead (Rossignac and Borrel 1993): of each cell the vertex nearest to the mean stays.
+
+    Args:
+        scan: any surface or points.
+        largest: at least 1.
+
+    Returns:
+        The mesh, and (S',) indices into the vertices of `scan`.
+    """
+    if _count(scan) <= largest:
+        return scan, np.arange(len(scan.vertices))
+    if scan.faces is not None and len(scan.faces) <= _MOST_COLLAPSED:
+        collapsed = _collapsed(scan, scan.faces, largest)
+        if collapsed is not None:
+            return collapsed
+    cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
+    best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
+    # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
+    for _ in range(8):
+        trial = _clustered(scan, cell)
+        left = _count(trial[0])
+        if left <= largest and (best is None or left > _count(best[0])):
+            best = trial
+            if left >= 0.9 * largest:
+                break
+        cell *= math.sqrt(max(left, 1) / (0.95 * largest))
+    while best is None:
+        cell *= 2.0
+        trial = _clustered(scan, cell)
+        best = trial if _count(trial[0]) <= largest else None
+    return best
+
+
+def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
+    """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
+    import igl as untyped  # pyright: ignore[reportMissingTypeStubs]
+
+    igl = cast(Any, untyped)
+    if not igl.is_edge_manifold(faces.astype(np.int64)):
+        return None
+    _, triangles, _, kept = igl.decimate(scan.vertices, faces.astype(np.int64), largest)
+    if not 0 < len(triangles) <= largest:
+        return None
+    kept = np.asarray(kept, dtype=np.intp)
+    return Mesh(scan.vertices[kept], np.asarray(triangles), name=scan.name), kept
+
+
+def _count(mesh: Mesh) -> int:
+    return len(mesh.vertices) if mesh.faces is None else len(mesh.faces)
+
+
+def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
+    points = scan.vertices
+    at = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    side = at.max(axis=0) + 1
+    _, group = np.unique((at[:, 0] * side[1] + at[:, 1]) * side[2] + at[:, 2], return_inverse=True)
+    size = np.bincount(group)
+    middle = np.stack([np.bincount(group, points[:, k]) / size for k in range(3)], axis=1)
+    far = ((points - middle[group]) ** 2).sum(axis=1)
+    order = np.lexsort((far, group))
+    first = np.r_[0, np.cumsum(size)[:-1]]
+    kept = order[first]
+    if scan.faces is None:
+        return Mesh(points[kept], None, name=scan.name), kept
+    faces = group[scan.faces].astype(np.int32)
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[whole]
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(points[kept], faces[np.sort(once)], name=scan.name), kept
