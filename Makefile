@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+	$(BIN)/python -m pytest -n auto $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -11,15 +11,15 @@ from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
 
-pytestmark = pytest.mark.xdist_group("browser")
 LOADED_S = 3.0
 MAIN_WIDGETS = "figure.turning .widget"
 
 
 @pytest.fixture(scope="module")
-def report(world: World) -> Path:
-    assert main(["report", str(world.fits), "--no-open", "--quiet"]) == 0
-    return world.fits / "report.html"
+def report(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    page = tmp_path_factory.mktemp("report") / "report.html"
+    assert main(["report", str(world.fits), "-o", str(page), "--no-open", "--quiet"]) == 0
+    return page
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

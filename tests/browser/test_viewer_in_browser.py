@@ -20,7 +20,6 @@ from shapespace.batch.results import read_record
 from shapespace.cli import main
 from shapespace.io.meshes import read_mesh
 
-pytestmark = pytest.mark.xdist_group("browser")
 VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 

@@ -21,7 +21,6 @@ from shape_spaces import ShapeSpaces
 from simulated import StudyConfig, model_path, person_path, prepare_folder, read_fits, run_fits
 from study_people import StudyPeople
 
-pytestmark = pytest.mark.xdist_group("study")
 SMALL = StudyConfig(
     people=StudyPeople(people=6, expressions=("smile", "surprise", "anger"), levels=(0.5, 1.0), triangles=5_000),
     folds=2, taught_levels=1, identity_modes=0.99, expression_modes=0.99, strangers=2, stranger_levels=(1.0,),
