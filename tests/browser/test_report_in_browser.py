@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pages import DESKTOP, PHONE, WICKED, World
+from pages import WICKED, WINDOWS, World
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
@@ -22,8 +22,7 @@ def report(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return page
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize(("viewport", "scheme"), WINDOWS)
 def test_every_figure_is_drawn(open_tab, report: Path, viewport: dict, scheme: str) -> None:
     tab = open_tab(report.as_uri(), viewport, scheme)
     where = f"{viewport['width']}-{scheme}"

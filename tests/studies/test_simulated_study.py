@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from shapespace.model.additive import AdditiveModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import recognition
+import shape_space_tables
+import shape_spaces
 import simulated
 import tables
 from shape_spaces import ShapeSpaces
@@ -133,7 +136,16 @@ SPACES = ShapeSpaces(
 )  # fmt: skip
 
 
-def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(done: Path, tmp_path: Path) -> None:
+@pytest.mark.long
+def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In this process, where fewer expressions can be asked for; worker processes made what is done.
+    monkeypatch.setattr(simulated, "_pool", lambda _: ThreadPoolExecutor(1))
+    for module in (shape_spaces, shape_space_tables):
+        monkeypatch.setattr(module, "expressive_people", lambda seed: replace(SMALL.people, seed=seed))
+    # The meshes need not be split for so many, which takes four times as long as all the rest of a scan.
+    monkeypatch.setattr("shapespace.datasets.simulated_scan.PLAIN_TRIANGLES", 16_000)
     run_study = recognition.run_study
     folder = tmp_path / "s"
     shutil.copytree(done, folder)
@@ -151,6 +163,8 @@ def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(done: Path,
     before = {path: path.stat().st_mtime_ns for path in (folder / "shape_spaces").rglob("*.json")}
     gone = next(path for path in before if path.parent.name == "fits")
     gone.unlink()
+    for name in ("make_tables", "write_report"):  # seen above
+        monkeypatch.setattr(recognition, name, lambda *_, **__: folder)
     run_study(folder, SMALL, workers=1, quiet=True, compared=SPACES)
     assert {p for p, at in before.items() if p.stat().st_mtime_ns != at} == {gone}
     with pytest.raises(InputError, match="was measured with other settings"):
