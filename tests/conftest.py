@@ -10,17 +10,18 @@ if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
 FIRST = (
-    "tests/browser/",
+    "tests/browser/test_report_in_browser.py",
     "tests/io/",
     "tests/datasets/",
+    "tests/browser/",
     "tests/docs/test_docs.py::test_examples",
     "tests/studies/test_simulated_study.py",
     "tests/demo/",
     "tests/study/",
     "tests/report/",
 )
-"""What begins first: what takes longest, so that no worker ends alone with it, and beside the browser, which waits for
-the first fits to be compiled, what needs no compiled code."""
+"""What begins first: what takes longest, so that no worker ends alone with it; but beside the first, which compiles a
+fit, what needs none, so that it is not compiled twice."""
 APART = ("tests/docs/test_docs.py",)
 """Files whose tests share nothing."""
 

@@ -144,8 +144,6 @@ def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(
     monkeypatch.setattr(simulated, "_pool", lambda _: ThreadPoolExecutor(1))
     for module in (shape_spaces, shape_space_tables):
         monkeypatch.setattr(module, "expressive_people", lambda seed: replace(SMALL.people, seed=seed))
-    # The meshes need not be split for so many, which takes four times as long as all the rest of a scan.
-    monkeypatch.setattr("shapespace.datasets.simulated_scan.PLAIN_TRIANGLES", 16_000)
     run_study = recognition.run_study
     folder = tmp_path / "s"
     shutil.copytree(done, folder)
