@@ -13,6 +13,7 @@ FIRST = (
     "tests/browser/test_report_in_browser.py",
     "tests/io/",
     "tests/datasets/",
+    "tests/contracts/test_classifiers_contract.py",
     "tests/browser/",
     "tests/docs/test_docs.py::test_examples",
     "tests/studies/test_simulated_study.py",
