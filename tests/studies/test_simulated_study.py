@@ -29,6 +29,8 @@ SMALL = StudyConfig(
     folds=2, taught_levels=1, identity_modes=0.99, expression_modes=0.99, strangers=2, stranger_levels=(1.0,),
 )  # fmt: skip
 
+of_a_study = pytest.mark.long  # a study of a few people alone takes a minute to make
+
 
 @pytest.fixture(scope="module")
 def done(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
@@ -47,6 +49,7 @@ def test_each_person_is_tested_in_one_fold_and_taught_in_the_others() -> None:
     assert taught[0] == 0 and sorted(taught[taught > 0]) == list(range(1, 13))
 
 
+@of_a_study
 def test_a_folds_model_knows_nobody_who_is_tested_in_it(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     faces = StudyPeople.faces
@@ -64,6 +67,7 @@ def test_a_folds_model_knows_nobody_who_is_tested_in_it(done: Path, monkeypatch:
     assert np.allclose(one.shape.mean, other.shape.mean, atol=1e-9)
 
 
+@of_a_study
 def test_raw_scans_are_fitted_to_a_few_millimetres_from_any_pose(done: Path) -> None:
     fits = read_fits([person_path(done, p) for p in range(6)], 400)
     own = SMALL.fold_of()[fits.person]
@@ -75,6 +79,7 @@ def test_raw_scans_are_fitted_to_a_few_millimetres_from_any_pose(done: Path) -> 
     assert np.array_equal(np.isfinite(other).all(axis=1), taught)
 
 
+@of_a_study
 def test_what_is_done_is_kept_and_what_is_not_is_made(done: Path) -> None:
     path = person_path(done, 2)
     before = path.stat().st_mtime_ns
@@ -91,6 +96,7 @@ def test_what_is_done_is_kept_and_what_is_not_is_made(done: Path) -> None:
     assert ("people", 5, 6) in told and ("people", 6, 6) in told
 
 
+@of_a_study
 def test_a_folder_of_another_study_is_refused(done: Path) -> None:
     with pytest.raises(InputError, match="a study with other settings"):
         prepare_folder(done, replace(SMALL, folds=3))
@@ -98,12 +104,14 @@ def test_a_folder_of_another_study_is_refused(done: Path) -> None:
         replace(SMALL, folds=4)
 
 
+@of_a_study
 def test_a_damaged_file_is_named(done: Path, tmp_path: Path) -> None:
     (tmp_path / "person_000.npz").write_bytes(person_path(done, 0).read_bytes()[:200])
     with pytest.raises(FileFormatError, match=r"person_000\.npz is damaged; delete it"):
         read_fits([tmp_path / "person_000.npz"], 40)
 
 
+@of_a_study
 def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path) -> None:
     from shapespace.report.html import write_report
 
@@ -136,7 +144,7 @@ SPACES = ShapeSpaces(
 )  # fmt: skip
 
 
-@pytest.mark.long
+@of_a_study
 def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(
     done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
