@@ -4,13 +4,16 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: demo test lint types contracts check bench clean
+.PHONY: demo test test-all lint types contracts check bench clean
 
 demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+	$(BIN)/python -m pytest -n auto -m "not long" $(PYTEST)
+
+test-all: $(READY)
+	$(BIN)/python -m pytest -n auto $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff check .

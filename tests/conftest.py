@@ -1,8 +1,78 @@
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from xdist.scheduler import LoadScopeScheduling
+
+FIRST = (
+    "tests/browser/test_report_in_browser.py",
+    "tests/io/",
+    "tests/datasets/",
+    "tests/contracts/test_classifiers_contract.py",
+    "tests/browser/",
+    "tests/docs/test_docs.py::test_examples",
+    "tests/studies/test_simulated_study.py",
+    "tests/demo/",
+    "tests/study/",
+    "tests/report/",
+)
+"""What begins first: what takes longest, so that no worker ends alone with it; but beside the first, which compiles a
+fit, what needs none, so that it is not compiled twice."""
+APART = ("tests/docs/test_docs.py",)
+"""Files whose tests share nothing."""
+
+
+def begins(nodeid: str) -> int:
+    """Return the place of a test in `FIRST`, or one after all of them."""
+    return next((place for place, start in enumerate(FIRST) if nodeid.startswith(start)), len(FIRST))
+
+
+def unit(nodeid: str) -> str:
+    """Return what the test is given to a worker with: its file, mostly."""
+    file = nodeid.partition("::")[0]
+    return nodeid if file in APART else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> "LoadScopeScheduling | None":
+    """Give all tests of a file to one worker, which makes what they share once.
+
+    The marks of pytest-xdist do not do it with every pytest: 9.2 no longer passes them on.
+    """
+    if config.getoption("dist") != "load":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Units(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return unit(nodeid)
+
+    config.option.loadscopereorder = False
+    return Units(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: begins(item.nodeid))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(
+    fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest
+) -> Generator[None, object, object]:
+    """Let nothing that a file shares be made by two workers: it would go unnoticed, and cost minutes."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker and fixturedef.scope == "module":
+        base = request.getfixturevalue("tmp_path_factory").getbasetemp().parent
+        makers = base / "makers" / f"{request.node.nodeid}::{fixturedef.argname}".replace("/", "-")
+        makers.mkdir(parents=True, exist_ok=True)
+        (makers / worker).touch()
+        assert [maker.name for maker in makers.iterdir()] == [worker], f"{makers.name} was made by two workers"
+    return (yield)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -12,6 +82,31 @@ def kept(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Iterator[N
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHAPESPACE_KEEP", str((folder if worker_id == "master" else folder.parent) / "kept"))
         yield
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[[Callable[[Path], None]], Path]:
+    """Return a function that has a folder filled by the first worker that asks, while the others wait for it."""
+    base = tmp_path_factory.getbasetemp()
+
+    def made(fill: Callable[[Path], None]) -> Path:
+        if worker_id == "master":
+            fill(folder := tmp_path_factory.mktemp(fill.__name__))
+            return folder
+        import fcntl
+
+        folder = base.parent / "made" / fill.__name__
+        folder.parent.mkdir(exist_ok=True)
+        with folder.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (done := folder.with_suffix(".done")).exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                done.touch()
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,6 @@ from shapespace.geometry.surface import face_areas
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import cases
 
-pytestmark = pytest.mark.xdist_group("benchmark cases")  # what it needs is made once
-
 
 @pytest.fixture(scope="module")
 def ict(shared_data):

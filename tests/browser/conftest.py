@@ -3,7 +3,7 @@
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import chdir
 from pathlib import Path
 
@@ -103,8 +103,11 @@ def open_tab(browser, request):
 
 
 @pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> World:
-    home = tmp_path_factory.mktemp("faces")
+def world(made_once: Callable[[Callable[[Path], None]], Path]) -> World:
+    return World(made_once(faces_and_fits))
+
+
+def faces_and_fits(home: Path) -> None:
     faces, rng = load_faces(), np.random.default_rng(11)
     assert main(["data", "faces", "-o", str(home / "people"), "--subjects", "30", "--quiet"]) == 0
     assert main(["build", str(home / "people"), "-o", str(home / "model.h5"), "--quiet"]) == 0
@@ -126,4 +129,3 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     fit = ["fit", "model.h5", "scans", "-o", "fits", "--stages", "--dense", "--jobs", "1", "--quiet"]
     with chdir(home):  # so that no sentence holds a path of this machine
         assert main(fit) == 1  # the broken one failed, the others went on
-    return World(home)

@@ -8,7 +8,6 @@ import pytest
 from pictures import IMAGES, same_as_kept
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.xdist_group("browser")
 
 
 def test_the_picture_of_the_methods_is_what_they_do(

@@ -6,24 +6,23 @@ import time
 from pathlib import Path
 
 import pytest
-from pages import DESKTOP, PHONE, WICKED, World
+from pages import WICKED, WINDOWS, World
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
 
-pytestmark = pytest.mark.xdist_group("browser")
 LOADED_S = 3.0
 MAIN_WIDGETS = "figure.turning .widget"
 
 
 @pytest.fixture(scope="module")
-def report(world: World) -> Path:
-    assert main(["report", str(world.fits), "--no-open", "--quiet"]) == 0
-    return world.fits / "report.html"
+def report(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    page = tmp_path_factory.mktemp("report") / "report.html"
+    assert main(["report", str(world.fits), "-o", str(page), "--no-open", "--quiet"]) == 0
+    return page
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize(("viewport", "scheme"), WINDOWS)
 def test_every_figure_is_drawn(open_tab, report: Path, viewport: dict, scheme: str) -> None:
     tab = open_tab(report.as_uri(), viewport, scheme)
     where = f"{viewport['width']}-{scheme}"

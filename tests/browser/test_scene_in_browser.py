@@ -12,8 +12,6 @@ from shapespace.report import scene
 from shapespace.report.staged import StagedFit
 from synthetic_shapes import blob_model, raw_scan
 
-pytestmark = pytest.mark.xdist_group("browser")  # what it needs is made once
-
 SHELL = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>scene</title>
 <link rel="icon" href="data:,">
 <style>:root {{ --page: #fff; --ink: #111; --soft: #555; --line: #ccc; --card: #fff; --accent: #1f5f99; }}

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import DESKTOP, PHONE, World
+from pages import DESKTOP, PHONE, WINDOWS, World
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.batch.results import read_record
 from shapespace.cli import main
 from shapespace.io.meshes import read_mesh
 
-pytestmark = pytest.mark.xdist_group("browser")
 VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 
@@ -114,8 +113,7 @@ def verdict(tab) -> str:
     return card.get_attribute("data-status")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize(("viewport", "scheme"), WINDOWS)
 def test_the_model_is_shown_and_a_slider_changes_it(open_tab, address: str, viewport: dict, scheme: str) -> None:
     tab = ready(open_tab(address, viewport, scheme))
     mean = view(tab)

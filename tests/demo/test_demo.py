@@ -7,8 +7,6 @@ from shapespace.batch.results import read_record
 from shapespace.demo import DemoScale, run_demo
 from shapespace.model.shape_model import ShapeModel
 
-pytestmark = pytest.mark.xdist_group("demo")  # what it needs is made once
-
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory, monkeypatch_module):

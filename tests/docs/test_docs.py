@@ -128,7 +128,19 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
     return any(b.language == "python" or any(c.startswith("shapespace") for c in commands(b)) for b in chosen)
 
 
-@pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=False)], ids=named)
+LONG = ("tutorial-recognition.md",)
+"""Documents whose examples take minutes."""
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(document, marks=pytest.mark.long if document.name in LONG else ())
+        for document in DOCUMENTS
+        if has_examples(document, needing_data=False)
+    ],
+    ids=named,
+)
 def test_examples_run_as_they_stand(document: Path, workplace: Path) -> None:
     assert run(document, with_data=False) > 0
 

@@ -18,8 +18,6 @@ from shapespace.model.floor import floor_mm
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 
-pytestmark = pytest.mark.xdist_group("published")  # one worker makes people and models
-
 Measured: TypeAlias = tuple[FloatArray, FloatArray, list[str]]
 BENCHMARKS = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 SCANS, PEOPLE, FEW_PEOPLE, TOLERANCE = 2, 40, 15, 1.05

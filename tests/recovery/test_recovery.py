@@ -17,8 +17,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity
 
-pytestmark = pytest.mark.xdist_group("recovery")  # what it needs is made once
-
 FACTORS = np.random.default_rng(11).uniform(-1.2, 1.2, (4, 5))
 
 

@@ -18,8 +18,6 @@ from report_page import Page, edit
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.report.html import LARGEST_REPORT_BYTES, require_report_extra, write_report
 
-pytestmark = pytest.mark.xdist_group("report demo")  # what it needs is made once
-
 
 @pytest.fixture
 def folder(demo_template: Path, tmp_path: Path, sketched: None) -> Path:

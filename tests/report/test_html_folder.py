@@ -18,8 +18,6 @@ from shapespace.io.tables import write_rows
 from shapespace.report import folder_page, scene
 from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
 
-pytestmark = pytest.mark.xdist_group("report folder")  # what it needs is made once
-
 EVIL = "</script><script>alert(1)</script>"
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from shapespace.model.additive import AdditiveModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import recognition
+import shape_space_tables
+import shape_spaces
 import simulated
 import tables
 from shape_spaces import ShapeSpaces
@@ -22,11 +25,12 @@ from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import model_path, person_path, read_fits
 from study_people import StudyPeople
 
-pytestmark = pytest.mark.xdist_group("study")
 SMALL = StudyConfig(
     people=StudyPeople(people=6, expressions=("smile", "surprise", "anger"), levels=(0.5, 1.0), triangles=5_000),
     folds=2, taught_levels=1, identity_modes=0.99, expression_modes=0.99, strangers=2, stranger_levels=(1.0,),
 )  # fmt: skip
+
+of_a_study = pytest.mark.long  # a study of a few people alone takes a minute to make
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +50,7 @@ def test_each_person_is_tested_in_one_fold_and_taught_in_the_others() -> None:
     assert taught[0] == 0 and sorted(taught[taught > 0]) == list(range(1, 13))
 
 
+@of_a_study
 def test_a_folds_model_knows_nobody_who_is_tested_in_it(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     faces = StudyPeople.faces
@@ -63,6 +68,7 @@ def test_a_folds_model_knows_nobody_who_is_tested_in_it(done: Path, monkeypatch:
     assert np.allclose(one.shape.mean, other.shape.mean, atol=1e-9)
 
 
+@of_a_study
 def test_raw_scans_are_fitted_to_a_few_millimetres_from_any_pose(done: Path) -> None:
     fits = read_fits([person_path(done, p) for p in range(6)], 400)
     own = SMALL.fold_of()[fits.person]
@@ -74,6 +80,7 @@ def test_raw_scans_are_fitted_to_a_few_millimetres_from_any_pose(done: Path) -> 
     assert np.array_equal(np.isfinite(other).all(axis=1), taught)
 
 
+@of_a_study
 def test_what_is_done_is_kept_and_what_is_not_is_made(done: Path) -> None:
     path = person_path(done, 2)
     before = path.stat().st_mtime_ns
@@ -90,6 +97,7 @@ def test_what_is_done_is_kept_and_what_is_not_is_made(done: Path) -> None:
     assert ("people", 5, 6) in told and ("people", 6, 6) in told
 
 
+@of_a_study
 def test_a_folder_of_another_study_is_refused(done: Path) -> None:
     with pytest.raises(InputError, match="a study with other settings"):
         prepare_folder(done, replace(SMALL, folds=3))
@@ -97,12 +105,14 @@ def test_a_folder_of_another_study_is_refused(done: Path) -> None:
         replace(SMALL, folds=4)
 
 
+@of_a_study
 def test_a_damaged_file_is_named(done: Path, tmp_path: Path) -> None:
     (tmp_path / "person_000.npz").write_bytes(person_path(done, 0).read_bytes()[:200])
     with pytest.raises(FileFormatError, match=r"person_000\.npz is damaged; delete it"):
         read_fits([tmp_path / "person_000.npz"], 40)
 
 
+@of_a_study
 def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path) -> None:
     from shapespace.report.html import write_report
 
@@ -135,7 +145,14 @@ SPACES = ShapeSpaces(
 )  # fmt: skip
 
 
-def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(done: Path, tmp_path: Path) -> None:
+@of_a_study
+def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(
+    done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In this process, where fewer expressions can be asked for; worker processes made what is done.
+    monkeypatch.setattr(simulated, "_pool", lambda _: ThreadPoolExecutor(1))
+    for module in (shape_spaces, shape_space_tables):
+        monkeypatch.setattr(module, "expressive_people", lambda seed: replace(SMALL.people, seed=seed))
     run_study = recognition.run_study
     folder = tmp_path / "s"
     shutil.copytree(done, folder)
@@ -153,6 +170,8 @@ def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(done: Path,
     before = {path: path.stat().st_mtime_ns for path in (folder / "shape_spaces").rglob("*.json")}
     gone = next(path for path in before if path.parent.name == "fits")
     gone.unlink()
+    for name in ("make_tables", "write_report"):  # seen above
+        monkeypatch.setattr(recognition, name, lambda *_, **__: folder)
     run_study(folder, SMALL, workers=1, quiet=True, compared=SPACES)
     assert {p for p, at in before.items() if p.stat().st_mtime_ns != at} == {gone}
     with pytest.raises(InputError, match="was measured with other settings"):

@@ -11,8 +11,6 @@ from shapespace import cli
 from shapespace.io.tables import write_rows
 from shapespace.model.additive import AdditiveModel
 
-pytestmark = pytest.mark.xdist_group("own study")  # what it needs is made once
-
 
 def command(*arguments: str) -> int:
     return cli.main([*arguments, "--quiet"])
