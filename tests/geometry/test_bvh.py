@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
+from shapespace.geometry import bvh
 from shapespace.geometry.bvh import TriangleTree
 from shapespace.types import FloatArray, IntArray
 from synthetic_shapes import sphere
@@ -93,3 +94,15 @@ def test_bad_triangles_queries_and_guesses_are_refused() -> None:
         tree.closest(np.zeros((4, 2)))
     with pytest.raises(InputError, match="guess"):
         tree.closest(np.zeros((1, 3)), np.array([5], dtype=np.int32))
+
+
+def test_a_face_of_a_surface_is_as_far_as_its_corners_say() -> None:
+    rng = np.random.default_rng(0)
+    vertices, faces = rng.standard_normal((30, 3)), rng.integers(0, 30, (200, 3)).astype(np.int32)  # some have no area
+    corners = vertices[faces].reshape(-1, 9)
+    for f, (x, y, z) in enumerate(rng.standard_normal((200, 3))):
+        told = bvh.on_face(vertices, faces, f, x, y, z, np.inf)
+        assert told == bvh.on_triangle(corners, f, x, y, z, np.inf)
+        b, c = bvh.over_face(vertices, faces, f, x, y, z)
+        if b > 0.0 and c > 0.0 and b + c < 1.0:
+            assert np.allclose((b, c), told[1:])

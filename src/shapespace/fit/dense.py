@@ -283,14 +283,14 @@ def unfolded(
     faces = topology.faces
     before = face_vectors(start, faces)
     before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-300)
-    corners, normals = np.empty((len(faces), 9)), np.empty_like(start)
+    normals = np.empty_like(start)
     cosine, was_even, even = np.empty(len(faces)), np.empty(len(faces), np.bool_), np.empty(len(faces), np.bool_)
-    normals_into(start, faces, corners, normals)
+    normals_into(start, faces, normals)
     compare_triangles(start, normals, faces, before, cosine, was_even)
     share, out, halvings = np.ones(len(start)), moved, 0
     can_turn = cosine > turn_cosine  # all but those without area
     while True:
-        normals_into(out, faces, corners, normals)
+        normals_into(out, faces, normals)
         compare_triangles(out, normals, faces, before, cosine, even)
         folded = (can_turn & (cosine < turn_cosine)) | (was_even & ~even)
         if not folded.any():

@@ -6,23 +6,18 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.compiled import compiled
-from shapespace.geometry.bvh import on_triangle
+from shapespace.geometry.bvh import on_face, over_face
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 
 
 @compiled
-def normals_into(vertices: FloatArray, faces: IntArray, corners: FloatArray, normals: FloatArray) -> None:
-    """Write the corners (F, 9) of all triangles and the area-weighted unit normals (V, 3) of the vertices."""
+def normals_into(vertices: FloatArray, faces: IntArray, normals: FloatArray) -> None:
+    """Write the area-weighted unit normals (V, 3) of the vertices."""
     normals[:] = 0.0
     for f in range(len(faces)):
-        for k in range(3):
-            for axis in range(3):
-                corners[f, 3 * k + axis] = vertices[faces[f, k], axis]
-        ux, uy, uz = corners[f, 3] - corners[f, 0], corners[f, 4] - corners[f, 1], corners[f, 5] - corners[f, 2]
-        vx, vy, vz = corners[f, 6] - corners[f, 0], corners[f, 7] - corners[f, 1], corners[f, 8] - corners[f, 2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        nx, ny, nz = _twice_the_area(vertices, faces, f)
         for k in range(3):
             v = faces[f, k]
             normals[v, 0] += nx
@@ -36,15 +31,22 @@ def normals_into(vertices: FloatArray, faces: IntArray, corners: FloatArray, nor
 
 
 @compiled
-def areas_into(corners: FloatArray, faces: IntArray, areas: FloatArray) -> None:
-    """Add to `areas` (V,) a third of the area of each triangle, corners (F, 9), at each of its vertices."""
+def areas_into(vertices: FloatArray, faces: IntArray, areas: FloatArray) -> None:
+    """Add to `areas` (V,) a third of the area of each triangle at each of its vertices."""
     for f in range(len(faces)):
-        ux, uy, uz = corners[f, 3] - corners[f, 0], corners[f, 4] - corners[f, 1], corners[f, 5] - corners[f, 2]
-        vx, vy, vz = corners[f, 6] - corners[f, 0], corners[f, 7] - corners[f, 1], corners[f, 8] - corners[f, 2]
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        x, y, z = _twice_the_area(vertices, faces, f)
         third = np.sqrt(x * x + y * y + z * z) / 6.0
         for k in range(3):
             areas[faces[f, k]] += third
+
+
+@compiled
+def _twice_the_area(vertices: FloatArray, faces: IntArray, f: int) -> tuple[float, float, float]:
+    """Return the normal of triangle `f`, as long as twice its area."""
+    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    ux, uy, uz = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
+    vx, vy, vz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
 @compiled
@@ -52,7 +54,6 @@ def walk_into(
     points: FloatArray,
     vertex: IntArray,
     vertices: FloatArray,
-    corners: FloatArray,
     faces: IntArray,
     ring_start: IntArray,
     ring: IntArray,
@@ -71,8 +72,7 @@ def walk_into(
         points: (M, 3).
         vertex: (M,) where each walk starts, and then where it ended.
         vertices: (V, 3) of the model in the frame of `points`.
-        corners: (F, 9) its triangles.
-        faces: (F, 3).
+        faces: (F, 3) its triangles.
         ring_start: (V + 1,) where the neighbours of each vertex start in
         ring: (R,).
         fan_start: (V + 1,) where the triangles around each vertex start in
@@ -83,7 +83,7 @@ def walk_into(
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if triangle[i] >= 0:
-            found, b, c = on_triangle(corners, triangle[i], x, y, z, np.inf)
+            b, c = over_face(vertices, faces, triangle[i], x, y, z)
             if b > 0.0 and c > 0.0 and b + c < 1.0:
                 weights[i, 0], weights[i, 1], weights[i, 2] = 1.0 - b - c, b, c
                 continue
@@ -101,7 +101,7 @@ def walk_into(
         vertex[i] = v
         best, b, c, found = -1, 0.0, 0.0, np.inf
         for at in range(fan_start[v], fan_start[v + 1]):
-            d, wb, wc = on_triangle(corners, fan[at], x, y, z, found)
+            d, wb, wc = on_face(vertices, faces, fan[at], x, y, z, found)
             if d < found or best < 0:
                 best, found, b, c = fan[at], d, wb, wc
         triangle[i] = best

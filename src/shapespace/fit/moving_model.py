@@ -116,11 +116,10 @@ class MovingSurface:
         self._mean = vertices
         self.vertices = np.array(vertices)
         self.normals = np.empty_like(self.vertices)
-        self._corners = np.empty((len(topology.faces), 9))
         self._refresh()
 
     def _refresh(self) -> None:
-        normals_into(self.vertices, self.topology.faces, self._corners, self.normals)
+        normals_into(self.vertices, self.topology.faces, self.normals)
 
     def deform(self, b: FloatArray) -> None:
         """Take the shape with coefficients `b` (k,) mm."""
@@ -143,8 +142,7 @@ class MovingSurface:
         """Bring `vertex` and `triangle` (M,) of the closest points up to date; return their weights (M, 3)."""
         weights, t = np.empty((len(points), 3)), self.topology
         walk_into(
-            points, vertex, self.vertices, self._corners, t.faces, t.ring_start, t.ring, t.fan_start, t.fan,
-            triangle, weights,
+            points, vertex, self.vertices, t.faces, t.ring_start, t.ring, t.fan_start, t.fan, triangle, weights
         )  # fmt: skip
         return weights
 

@@ -59,9 +59,9 @@ class ScanTarget:
         normals, areas = np.zeros(self.mesh.vertices.shape), np.zeros(len(self.mesh.vertices))
         if self.mesh.faces is None:
             return normals, np.ones(len(areas))
-        faces, corners = np.array(self.mesh.faces), np.empty((len(self.mesh.faces), 9))
-        normals_into(np.array(self.mesh.vertices), faces, corners, normals)
-        areas_into(corners, faces, areas)
+        vertices, faces = np.array(self.mesh.vertices), np.array(self.mesh.faces)
+        normals_into(vertices, faces, normals)
+        areas_into(vertices, faces, areas)
         return normals, areas
 
     @property
