@@ -130,3 +130,11 @@ def test_no_point_that_is_not_noted_lies_within_reach(name: str) -> None:
     for i, rows in enumerate(followed.rows[:, :NOTED]):
         d[i, tree.arrays.original[rows[rows >= 0]]] = np.inf
     assert np.allclose(followed.reach, d.min(axis=1), rtol=1e-14)
+
+
+def test_a_tree_of_points_that_moved_tells_what_a_new_one_does() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((500, 3))
+    moved, queries = points[::-1] + 0.3 * rng.standard_normal((500, 3)), rng.standard_normal((300, 3))
+    told, wanted = KdTree(points).moved(moved).nearest(queries), KdTree(moved).nearest(queries)
+    assert np.array_equal(told[0], wanted[0]) and np.array_equal(told[1], wanted[1])

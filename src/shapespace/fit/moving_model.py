@@ -69,6 +69,7 @@ class PreparedModel:
     Args:
         model: the shape space.
         topology: of its surface.
+        tree: of the mean's vertices that some triangle has: entry i is vertex `used[i]` of the topology.
         modes: (V, 3, K) float32 basis vectors: the rows of the normal equations are made from them.
         pose: (3V, 7) what a small rotation, translation and scaling do to the mean.
         pose_in_span: (K, 7) what of that the modes can do.
@@ -76,6 +77,7 @@ class PreparedModel:
 
     model: ShapeModel
     topology: Topology
+    tree: KdTree
     modes: Float32Array
     pose: FloatArray
     pose_in_span: FloatArray
@@ -97,7 +99,9 @@ def prepare(model: ShapeModel) -> PreparedModel:
             )
         modes = np.ascontiguousarray(model.vertex_basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
         pose = small_poses(model.mean_vertices)
-        _PREPARED[model] = PreparedModel(model, Topology.of(model.mesh()), modes, pose, model.vertex_basis.T @ pose)
+        topology = Topology.of(model.mesh())
+        tree = KdTree(model.mean_vertices[topology.used])
+        _PREPARED[model] = PreparedModel(model, topology, tree, modes, pose, model.vertex_basis.T @ pose)
     return _PREPARED[model]
 
 

@@ -258,7 +258,7 @@ def robust_icp(
     prepared = prepare(model)
     problem = Problem.of(prepared, target, settings, start.T_scan_model.scale, with_scale=with_scale)
     at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
-    tree, tree_fits = problem.surface.vertex_tree(), False
+    tree, tree_fits = prepared.tree, False
     matcher = problem.matcher(settings.levels[0], at, tree, None)
     look = problem.look(matcher, at)
     state, winding = IcpState(1, 0, at.T_scan_model, at.b, look.rms_mm, float("inf")), look.matches.winding
@@ -269,7 +269,7 @@ def robust_icp(
             state = replace(state, phase=2, iteration=0, stopped=None)
         # The surface changes little from level to level, and what it does the walks make up for.
         if level.modes is None and not tree_fits:
-            tree, tree_fits = problem.surface.vertex_tree(), True
+            tree, tree_fits = tree.moved(problem.surface.vertices[prepared.topology.used]), True
         matcher = problem.matcher(level, at, tree, winding)
         at, state = yield from _states(problem.descent(matcher, at, level), at, state, level, max_iterations)
         if begins and len(start.b) and state.iteration < max_iterations:

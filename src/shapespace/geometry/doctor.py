@@ -364,10 +364,11 @@ class _Doctor:
         is_open = ~closed[patch]
         if not is_open.any():
             return
-        weight = areas[is_open]
-        arm = middles[is_open] - weight @ middles[is_open] / weight.sum()
-        reach = float((weight * _lengths(arm)).sum())
-        score = float(np.einsum("fi,fi->", normals[is_open], arm)) / reach if reach > 0 else 0.0
+        weight = np.where(is_open, areas, 0.0)
+        arm = middles - weight @ middles / weight.sum()
+        reach = float(weight @ _lengths(arm))
+        outward = np.where(is_open, np.einsum("fi,fi->f", normals, arm), 0.0)
+        score = float(outward.sum()) / reach if reach > 0 else 0.0
         if score < _REVERSED:
             self._turn(is_open)
             normals[is_open] *= -1
