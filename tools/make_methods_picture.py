@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.render import Camera, render
+from shapespace.report.render import Camera, Layer, render
 from shapespace.types import Mesh
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -35,7 +35,7 @@ def panels(model: ShapeModel, scan: Mesh) -> np.ndarray:
         scan_free(in_model(robust.surface(model, "dense").vertices), model),
     ]
     camera = Camera(model.mesh(robust.b).vertices.mean(axis=0), 300.0, 25.0)
-    return np.concatenate([np.asarray(render(s, camera=camera, size=SIZE)) for s in surfaces], axis=1)
+    return np.concatenate([np.asarray(render(Layer(s), camera=camera, size=SIZE)) for s in surfaces], axis=1)
 
 
 def scan_free(vertices: np.ndarray, model: ShapeModel) -> Mesh:
