@@ -1,6 +1,9 @@
 from graphlib import TopologicalSorter
+from importlib import metadata
 
 import grimp
+
+from shapespace.version import __version__
 
 
 def test_no_modules_import_each_other_in_a_circle_not_even_for_their_types() -> None:
@@ -9,3 +12,7 @@ def test_no_modules_import_each_other_in_a_circle_not_even_for_their_types() -> 
     modules = graph.modules - {"shapespace"}
     assert len(modules) > 100
     TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in modules}).prepare()
+
+
+def test_the_version_of_the_files_is_that_of_the_package() -> None:
+    assert metadata.version("shapespace") == __version__

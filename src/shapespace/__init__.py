@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from shapespace.version import __version__
+
 if TYPE_CHECKING:
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
@@ -20,8 +22,6 @@ if TYPE_CHECKING:
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
     from shapespace.types import Mesh, Similarity
-
-__version__ = "0.1.0"
 
 __all__ = [
     "CLASSIFIERS",

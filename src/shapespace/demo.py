@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace import __version__
 from shapespace.batch.results import read_record
 from shapespace.batch.run import fit_files, make_executor, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
@@ -51,6 +50,7 @@ from shapespace.schemas import (
     to_json,
 )
 from shapespace.types import FloatArray, Mesh, Similarity
+from shapespace.version import __version__
 
 PAPER_EXPRESSIONS = ("anger", "disgust", "fear", "smile")
 _SEED = 2007

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace import __version__
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
@@ -22,6 +21,7 @@ from shapespace.io.files import atomic_path, read_bytes, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord, to_json
+from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")

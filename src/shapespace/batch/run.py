@@ -13,7 +13,6 @@ from typing import Any, get_args
 
 from threadpoolctl import threadpool_limits
 
-from shapespace import __version__
 from shapespace.batch.folder import CoefficientTable, names_for
 from shapespace.batch.results import (
     Source,
@@ -35,6 +34,7 @@ from shapespace.io.landmarks import read_landmarks
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
+from shapespace.version import __version__
 
 _SAVE_EVERY_S = 5.0
 _SAVES_APART = 20.0

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any, cast
 
-from shapespace import __version__
 from shapespace.cli import run
+from shapespace.version import __version__
 
 _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
 

@@ -11,7 +11,6 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from shapespace import __version__
 from shapespace.errors import FitError, InputError
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.methods import method_named
@@ -26,6 +25,7 @@ from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
+from shapespace.version import __version__
 
 _FAR_OUT = 3.0
 _FAR_OUT_BY_CHANCE = 0.01

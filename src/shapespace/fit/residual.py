@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace import __version__
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
@@ -29,6 +28,7 @@ from shapespace.model import local_modes
 from shapespace.model.local_modes import smooth_fields, strongest_products
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity
+from shapespace.version import __version__
 
 _MOST_PRODUCTS = 600
 _BLOCK = 250

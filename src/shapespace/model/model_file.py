@@ -10,11 +10,11 @@ from typing import Any, TypedDict, cast
 import numpy as np
 import numpy.typing as npt
 
-from shapespace import __version__
 from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
 from shapespace.types import FloatArray, IntArray
+from shapespace.version import __version__
 
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1

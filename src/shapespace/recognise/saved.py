@@ -21,13 +21,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.lib import format as npy
 
-from shapespace import __version__
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.learn import Pipeline, skops_io
 from shapespace.recognise.scores import calibrated
 from shapespace.types import FloatArray
+from shapespace.version import __version__
 
 FORMAT = "shapespace classifier"
 FORMAT_VERSION = 1

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shapespace import __version__
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.labels import Label
 from shapespace.report import recognition, sections, tables
@@ -37,6 +36,7 @@ from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder, SavedFit, model_of, posed, raw_scan, staged_fit
 from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, setting, words
 from shapespace.schemas import Quality, read
+from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel

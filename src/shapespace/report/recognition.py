@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, cast
 
-from shapespace import __version__
 from shapespace.report import tables
 from shapespace.report.blocks import Block, Cell, Column, Facts, Folded, Group, Table, Text, facts_of, text_table
 from shapespace.report.page import Chapter, Make, Page, Step, rendered
@@ -17,6 +16,7 @@ from shapespace.report.saved import Folder, has_fits
 from shapespace.report.study_parts import FILE, MOST_PARAGRAPH, MOST_ROWS, TITLES, StudyParts, paragraphs, wrong
 from shapespace.report.wording import DASH, counted, moment
 from shapespace.schemas import STUDY_AGAIN, Recognition, Target, check_format, read, read_part
+from shapespace.version import __version__
 
 SECTION_BYTES = 1_500_000
 """How much of a report of fits is kept free for this section."""

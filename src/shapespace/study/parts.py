@@ -10,7 +10,6 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from shapespace import __version__
 from shapespace.errors import InputError
 from shapespace.recognise import evaluate
 from shapespace.schemas import (
@@ -26,6 +25,7 @@ from shapespace.schemas import (
     to_json,
 )
 from shapespace.types import FloatArray
+from shapespace.version import __version__
 
 BoolRow = npt.NDArray[np.bool_]
 TextArray = npt.NDArray[np.str_]

@@ -21,13 +21,13 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from shapespace import __version__
 from shapespace.errors import ShapespaceError
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks import write_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.report import colours
 from shapespace.types import Mesh
+from shapespace.version import __version__
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
 from shapespace.viewer.guard import Guard, cookie, refusal
 from shapespace.viewer.scratch import new_folder
