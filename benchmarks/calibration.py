@@ -13,14 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import trust
-from cases import CASES, MISSING_SHARE, Bench, Case, Split, run
+from cases import CASES, MISSING_SHARE, NOISE_MM, OFF_DEG, OFF_MM, OFF_SCALE, TRIANGLES, Bench, Case, Split, run
 from threadpoolctl import threadpool_limits
 
 from shapespace import fit_scan
+from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
 from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
+from shapespace.types import Mesh
 
 SCANS = 30
+DRAWN_SEED = 3000
 BOUNDS = {"68 %": (0.60, 0.76), "95 %": (0.90, 0.98)}
 _WIDTHS = {"68 %": 1.0, "95 %": 1.96}
 _GROUPS = ((0, 10), (10, 50), (50, 1000))
@@ -34,12 +37,14 @@ class Condition:
         case: a name of `cases.CASES`, whose scans are taken.
         people: number of people in the model.
         modes: the model is cut to its first so many; None for all.
+        drawn: whether the shapes are drawn from the model itself, so that they lie in its span; they are scanned whole.
     """
 
     name: str
     case: str
     people: int
     modes: int | None = None
+    drawn: bool = False
 
 
 CONDITIONS = (
@@ -49,6 +54,9 @@ CONDITIONS = (
     Condition("4,000 triangles", "coarse", 200),
     Condition("outside the span", "complete", 60),
     Condition(f"outside, {100 * MISSING_SHARE:.0f} % missing", "missing40", 60),
+    Condition("outside the span of 20", "complete", 20),
+    Condition(f"outside 20, {100 * MISSING_SHARE:.0f} % missing", "missing40", 20),
+    *(Condition(f"in the span of {n}", "complete", n, drawn=True) for n in (20, 60, 200)),
     Condition("50 modes of 200", "complete", 200, 50),
     Condition(f"50 modes, {100 * MISSING_SHARE:.0f} % missing", "missing40", 200, 50),
 )
@@ -80,7 +88,7 @@ def measure(bench: Bench, condition: Condition, scans: int) -> list[Coverage]:
     case: Case = CASES[condition.case]
     z, shrinkage, off = [], [], []
     for index in range(scans):
-        raw, face = case.make(bench, index)
+        raw, face = _scan_of(model, index) if condition.drawn else case.make(bench, index)
         assert face is not None
         result = fit_scan(model, raw)
         error = result.b - model.project(face)
@@ -103,6 +111,14 @@ def measure(bench: Bench, condition: Condition, scans: int) -> list[Coverage]:
         )
 
     return [of(0, K)] + [of(a, min(b, K)) for a, b in _GROUPS if a < K]
+
+
+def _scan_of(model: ShapeModel, index: int) -> tuple[Mesh, Mesh]:
+    """Return a scan of a shape drawn from `model`, near it, and that shape."""
+    rng = np.random.default_rng([DRAWN_SEED, index])
+    face = model.mesh(model.stddev * rng.standard_normal(model.n_modes))
+    T = random_similarity(rng, max_angle_deg=OFF_DEG, scale_range=(1.0, OFF_SCALE), translation_mm=OFF_MM)
+    return simulate_scan(face, rng, triangles=TRIANGLES, noise_mm=NOISE_MM, T_scan_model=T).scan, face
 
 
 def _model(bench: Bench, condition: Condition) -> ShapeModel:
