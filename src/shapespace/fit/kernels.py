@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.compiled import compiled
-from shapespace.geometry.bvh import on_face, over_face
+from shapespace.geometry.bvh import edges_of, on_face, over_face
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
@@ -43,9 +43,7 @@ def areas_into(vertices: FloatArray, faces: IntArray, areas: FloatArray) -> None
 @compiled
 def _twice_the_area(vertices: FloatArray, faces: IntArray, f: int) -> tuple[float, float, float]:
     """Return the normal of triangle `f`, as long as twice its area."""
-    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-    ux, uy, uz = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
-    vx, vy, vz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+    ux, uy, uz, vx, vy, vz = edges_of(vertices, faces, f)
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 

@@ -14,7 +14,15 @@ import numpy as np
 
 from shapespace.compiled import compiled
 from shapespace.errors import InputError
-from shapespace.geometry.kdtree import STACK_SIZE, box_distance, checked_guess, order_into_leaves, start_at, writable
+from shapespace.geometry.kdtree import (
+    STACK_SIZE,
+    box_distance,
+    checked_guess,
+    cover_children,
+    order_into_leaves,
+    start_at,
+    writable,
+)
 from shapespace.types import FloatArray, IntArray
 
 _LEAF_TRIANGLES = 4
@@ -123,10 +131,7 @@ def _cover(
                     corners[row, 3 * corner + k] = value
                     box[k] = value if value < box[k] else box[k]
                     box[3 + k] = value if value > box[3 + k] else box[3 + k]
-    for node in range(first_leaf - 1, -1, -1):
-        for k in range(3):
-            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
-            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
+    cover_children(boxes, first_leaf)
 
 
 @compiled
@@ -162,6 +167,15 @@ def on_triangle(
 
 
 @compiled
+def edges_of(vertices: FloatArray, faces: IntArray, f: int) -> tuple[float, float, float, float, float, float]:
+    """Return the edges from the first corner of triangle `f` to its second and to its third."""
+    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    ux, uy, uz = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
+    vx, vy, vz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+    return ux, uy, uz, vx, vy, vz
+
+
+@compiled
 def on_face(
     vertices: FloatArray, faces: IntArray, f: int, x: float, y: float, z: float, limit: float
 ) -> tuple[float, float, float]:
@@ -173,8 +187,7 @@ def on_face(
     ax, ay, az = vertices[i, 0] - x, vertices[i, 1] - y, vertices[i, 2] - z
     bx, by, bz = vertices[j, 0] - x, vertices[j, 1] - y, vertices[j, 2] - z
     cx, cy, cz = vertices[k, 0] - x, vertices[k, 1] - y, vertices[k, 2] - z
-    ux, uy, uz = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
-    vx, vy, vz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+    ux, uy, uz, vx, vy, vz = edges_of(vertices, faces, f)
     return _nearest_on(ax, ay, az, bx, by, bz, cx, cy, cz, ux, uy, uz, vx, vy, vz, limit)
 
 
@@ -221,10 +234,9 @@ def over_face(vertices: FloatArray, faces: IntArray, f: int, x: float, y: float,
 
     The foot lies in the triangle where both are above 0 and their sum is below 1; of one without area they are not.
     """
-    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    i = faces[f, 0]
     ax, ay, az = x - vertices[i, 0], y - vertices[i, 1], z - vertices[i, 2]
-    ux, uy, uz = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
-    vx, vy, vz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+    ux, uy, uz, vx, vy, vz = edges_of(vertices, faces, f)
     uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
     au, av = ax * ux + ay * uy + az * uz, ax * vx + ay * vy + az * vz
     area = uu * vv - uv * uv

@@ -215,6 +215,15 @@ def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, de
 
 
 @compiled
+def cover_children(boxes: FloatArray, first_leaf: int) -> None:
+    """Fill the `boxes` before `first_leaf`, each around its two children, from those of the leaves."""
+    for node in range(first_leaf - 1, -1, -1):
+        for k in range(3):
+            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
+            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
+
+
+@compiled
 def _boxes_of_leaves(points: FloatArray, boxes: FloatArray, depth: int) -> None:
     """Fill `boxes` of `points` in leaf order, leaves first."""
     count, first_leaf = len(points), (1 << depth) - 1
@@ -226,10 +235,7 @@ def _boxes_of_leaves(points: FloatArray, boxes: FloatArray, depth: int) -> None:
                 value = points[row, k]
                 box[k] = value if value < box[k] else box[k]
                 box[3 + k] = value if value > box[3 + k] else box[3 + k]
-    for node in range(first_leaf - 1, -1, -1):
-        for k in range(3):
-            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
-            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
+    cover_children(boxes, first_leaf)
 
 
 @compiled
