@@ -10,10 +10,10 @@ demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto -m "not long" $(PYTEST)
+	$(BIN)/python -m pytest -n auto --max-worker-restart 0 -m "not long" $(PYTEST)
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -n auto $(PYTEST)
+	$(BIN)/python -m pytest -n auto --max-worker-restart 0 $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff check .

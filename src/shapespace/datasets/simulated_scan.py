@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from shapespace.datasets.hair_and_collar import Collar, Hair, LongArray, collar_part, hair_parts
-from shapespace.errors import InputError, MeshError
+from shapespace.errors import InputError
+from shapespace.geometry import remesh
 from shapespace.geometry.surface import faces_of, vertex_normals
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
 
@@ -134,7 +134,7 @@ def simulate_scan(
 
     Raises:
         InputError: an option out of range, or holes and cuts that leave nothing.
-        MeshError: `mesh` has no faces, or edges that more than two triangles share.
+        MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
     """
     if triangles < 4 or noise_mm < 0 or not 0 <= outlier_fraction < 1:
         raise InputError(
@@ -202,24 +202,15 @@ def retriangulate(
         split: False splits only as far as it must, which for fewer triangles than the mesh has is four times faster.
 
     Raises:
-        MeshError: `mesh` has no faces, or edges that more than two triangles share.
+        MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
     """
     original = np.asarray(mesh.vertices)
     faces = faces_of(mesh).astype(np.int64)
     fine_vertices, fine_faces = original, faces
     while len(fine_faces) < 1.5 * triangles or (split and fine_faces is faces):
-        fine_vertices, fine_faces = _split(fine_vertices, fine_faces)
+        fine_vertices, fine_faces = remesh.split(fine_vertices, fine_faces, mesh.name)
     fine_vertices = _slide(original, faces, fine_vertices, fine_faces, 0.2, rng)
-    try:
-        coarse_vertices, coarse_faces = _collapse(fine_vertices, fine_faces, triangles)
-    except (RuntimeError, ValueError) as error:
-        raise MeshError(
-            f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
-        ) from error
-    if not len(coarse_faces):
-        raise MeshError(
-            f"{mesh.name} cannot be re-triangulated: more than two triangles share an edge; clean the mesh first."
-        )
+    coarse_vertices, coarse_faces, _ = remesh.collapse(fine_vertices, fine_faces, triangles, mesh.name)
     coarse_vertices = _slide(original, faces, coarse_vertices, coarse_faces, 0.1, rng)
     return coarse_vertices, coarse_faces
 
@@ -242,24 +233,7 @@ def _slide(
     step = rng.uniform(-1.0, 1.0, vertices.shape)
     step -= normals * (step * normals).sum(axis=1, keepdims=True)
     moved = vertices + share * shortest[:, None] * step
-    _, _, nearest = _igl().point_mesh_squared_distance(moved, np.ascontiguousarray(surface_vertices), surface_faces)
-    return np.asarray(nearest, dtype=np.float64)
-
-
-def _igl() -> Any:
-    import igl  # pyright: ignore[reportMissingTypeStubs]  # half of the import time of the package
-
-    return cast(Any, igl)
-
-
-def _split(vertices: FloatArray, faces: LongArray) -> tuple[FloatArray, LongArray]:
-    fine, triangles = _igl().upsample(vertices, faces, 1)
-    return np.asarray(fine, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
-
-
-def _collapse(vertices: FloatArray, faces: LongArray, triangles: int) -> tuple[FloatArray, LongArray]:
-    coarse, left, _, _ = _igl().decimate(vertices, faces, triangles)
-    return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64)
+    return remesh.onto(moved, surface_vertices, surface_faces)
 
 
 def _kept(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.errors import MeshError
+from shapespace.geometry.remesh import collapse
 from shapespace.types import IntArray, Mesh
 
 _MOST_COLLAPSED = 150_000
@@ -53,16 +54,13 @@ def thinned(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
 
 def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
     """Return the surface with collapsed edges and its vertices that are left; None where it branches."""
-    import igl as untyped  # pyright: ignore[reportMissingTypeStubs]
-
-    igl = cast(Any, untyped)
-    if not igl.is_edge_manifold(faces.astype(np.int64)):
+    try:
+        _, triangles, kept = collapse(scan.vertices, faces, largest, scan.name)
+    except MeshError:
         return None
-    _, triangles, _, kept = igl.decimate(scan.vertices, faces.astype(np.int64), largest)
-    if not 0 < len(triangles) <= largest:
+    if len(triangles) > largest:
         return None
-    kept = np.asarray(kept, dtype=np.intp)
-    return Mesh(scan.vertices[kept], np.asarray(triangles), name=scan.name), kept
+    return Mesh(scan.vertices[kept], triangles.astype(np.int32), name=scan.name), kept
 
 
 def _count(mesh: Mesh) -> int:
