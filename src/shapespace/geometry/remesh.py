@@ -41,8 +41,8 @@ def collapse(
 ) -> tuple[FloatArray, LongArray, LongArray]:
     """Return vertices (S, 3) and about `triangles`, the shortest edges collapsed, each to its middle.
 
-    Also returned is (S,) a vertex of the surface from which each is made. Where no edge can collapse without a fold of the
-    surface, more triangles are left.
+    Also returned is (S,) a vertex of the surface from which each is made. Where no edge can collapse without a fold,
+    more triangles are left.
 
     Raises:
         MeshError: `faces` are no sheet, as `is_sheet` has it; `name` says whose.
