@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
+    from shapespace.correspondence.rounds import CorrespondSettings, correspond
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CLASSIFIERS",
     "AdditiveModel",
+    "CorrespondSettings",
     "FitConfig",
     "FitResult",
     "Mesh",
@@ -36,6 +38,7 @@ __all__ = [
     "ShapespaceError",
     "Similarity",
     "__version__",
+    "correspond",
     "fit_scan",
     "load_faces",
     "read_landmarks",
@@ -49,6 +52,7 @@ __all__ = [
 _HOMES = {
     "AdditiveModel": "model.additive",
     "CLASSIFIERS": "recognise.classifiers",
+    "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
     "Mesh": "types",
@@ -58,6 +62,7 @@ _HOMES = {
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
     "Similarity": "types",
+    "correspond": "correspondence.rounds",
     "fit_scan": "fit.fit",
     "load_faces": "datasets.faces",
     "read_landmarks": "io.landmarks",

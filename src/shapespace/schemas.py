@@ -316,6 +316,76 @@ class Demo(Struct, frozen=True, kw_only=True):
     paper_table: tuple[Claim, ...] = ()
 
 
+# NAME.correspond.json and correspondence.json
+
+
+class CorrespondRecord(Struct, frozen=True, kw_only=True):
+    """A NAME.correspond.json: what came of one scan; lengths are in the scan's own unit, shares from 0 to 1.
+
+    Args:
+        name: NAME of the result files.
+        path: of the scan, relative to the folder where there is such a path.
+        hash: SHA-256 of its content.
+        status: `corresponding` or `set aside`.
+        reason: why it is set aside.
+        seen_share: share of the template's vertices that it shows; the others are not-a-number.
+        covered_share: share of its points that the template reaches.
+        distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
+        scale: of the scan beside the template.
+        moved_share: RMS by which vertices moved in each round, as a share of its size.
+        cpu_s: of each round.
+    """
+
+    CALLED: ClassVar = "a record of correspondence"
+    FORMAT: ClassVar = "shapespace corresponding"
+    VERSION: ClassVar = 1
+
+    name: str
+    path: str
+    hash: str
+    status: Literal["corresponding", "set aside"]
+    reason: str = ""
+    seen_share: float | None = None
+    covered_share: float | None = None
+    distance_mean: float | None = None
+    distance_p95: float | None = None
+    distance_p99: float | None = None
+    distance_max: float | None = None
+    scale: float | None = None
+    moved_share: list[float] = []
+    cpu_s: list[float] = []
+    format: str = FORMAT
+    format_version: int = VERSION
+
+
+class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
+    """A correspondence.json: the run as a whole.
+
+    Args:
+        template: where the first template came from, and why, in a sentence.
+        vertices: of the template.
+        rounds: RMS by which vertices moved in each, as a share of the size.
+        corresponding: NAMEs in correspondence.
+        set_aside: NAME to reason of the others.
+        settings: of the run.
+        version: of shapespace.
+    """
+
+    CALLED: ClassVar = "a correspondence"
+    FORMAT: ClassVar = "shapespace correspondence"
+    VERSION: ClassVar = 1
+
+    template: str
+    vertices: int
+    rounds: list[float]
+    corresponding: list[str]
+    set_aside: dict[str, str]
+    settings: dict[str, Any]
+    version: str
+    format: str = FORMAT
+    format_version: int = VERSION
+
+
 # quality.json
 
 

@@ -22,6 +22,7 @@ def parser() -> argparse.ArgumentParser:
     _add_demo(commands)
     _add_data(commands)
     _add_check(commands)
+    _add_correspond(commands)
     _add_build(commands)
     _add_info(commands)
     _add_fit(commands)
@@ -94,6 +95,23 @@ def _add_check(commands: Any) -> None:
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _add_recursive(sub)
     sub.set_defaults(run=run.check)
+
+
+def _add_correspond(commands: Any) -> None:
+    sub = _add(commands, "correspond", "raw scans to the same surfaces in correspondence, with no model to begin with",
+               "shapespace correspond scans -o same\n"
+               "         shapespace build same -o model.h5")  # fmt: skip
+    sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans of one kind of object, or folders")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
+    _add_recursive(sub)
+    sub.add_argument("--template", type=Path, metavar="FILE",
+                     help="a mesh to begin with, as it is (default: the scan nearest to all others)")  # fmt: skip
+    sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
+                     help="of the template where a scan is chosen (default 10000)")  # fmt: skip
+    sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="scans at a time (default: one a core)")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.set_defaults(run=run.correspond, goes_on="; the same command goes on from there")
 
 
 def _add_build(commands: Any) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shapespace.cli.printing import now, say, short, show, show_json, warn
+
+if TYPE_CHECKING:
+    from shapespace.schemas import CorrespondenceRecord, CorrespondRecord
 
 _LISTED = 10
 """Scans that the terminal lists."""
@@ -134,6 +137,26 @@ def _print_check(report: Mapping[str, Any]) -> None:
             + (f"{what[:-1]}; {action}" if finding["level"] == "refused" else f"{what} {action}")
         )
     print("  usable" if report["usable"] else "  not usable for fitting")
+
+
+def correspond(arguments: argparse.Namespace) -> int:
+    """Bring scans into correspondence."""
+    if arguments.jobs != 1:
+        from shapespace.batch.workers import start_loading
+
+        start_loading(tell=not arguments.quiet)
+    from shapespace.commands.correspond import CorrespondFiles, correspond_files
+    from shapespace.correspondence.rounds import CorrespondSettings
+    from shapespace.schemas import to_json
+
+    settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds, seed=arguments.seed)
+    files = CorrespondFiles(arguments.scans, arguments.template, arguments.jobs, arguments.recursive)
+    summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
+    if arguments.json:
+        show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})
+    else:
+        _print_correspondence(summary, records, arguments.output)
+    return 1 if summary.set_aside else 0
 
 
 def build(arguments: argparse.Namespace) -> int:
@@ -349,6 +372,22 @@ def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, i
         + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
         + f"; results in {folder}"
     )
+
+
+def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> None:
+    show(summary.template)
+    for number, moved in enumerate(summary.rounds, 1):
+        show(f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)")
+    for record in records:
+        if record.reason:
+            warn(f"{record.name} is set aside: {record.reason}")
+    there = [record for record in records if not record.reason]
+    seen = sum(record.seen_share or 0.0 for record in there) / len(there)
+    show(
+        f"{len(there)} of {len(records)} scans in correspondence, {summary.vertices} vertices, of which a scan shows "
+        f"{100 * seen:.1f} % on average; results in {folder}"
+    )
+    show(f"next: shapespace build {folder} -o model.h5")
 
 
 def _print_fit(name: str, record: Mapping[str, Any]) -> None:

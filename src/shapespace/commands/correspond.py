@@ -1,0 +1,174 @@
+"""What `correspond` does: raw scans in files to the same surfaces in correspondence, in a folder that `build` takes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.batch.folder import names_for
+from shapespace.batch.progress import progress, telling_of_compiling, waiting
+from shapespace.batch.results import Source
+from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.workers import cores
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.rounds import (
+    Correspondence,
+    Corresponding,
+    CorrespondSettings,
+    correspond,
+    first_template,
+)
+from shapespace.errors import ShapespaceError
+from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
+from shapespace.io.folders import mesh_files
+from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, to_json
+from shapespace.types import Mesh
+from shapespace.version import __version__
+
+SURFACE, RECORD, SUMMARY, MEAN = ".corresponding.ply", ".correspond.json", "correspondence.json", "template/mean.ply"
+_KEPT = ".rounds"
+
+
+@dataclass(frozen=True)
+class CorrespondFiles:
+    """What is brought into correspondence, and how.
+
+    Args:
+        scans: files and folders.
+        template: a mesh to begin with, or None.
+        jobs: scans at a time; 0 for one a core.
+        recursive: take scans in folders below those given too.
+    """
+
+    scans: Sequence[Path]
+    template: Path | None = None
+    jobs: int = 0
+    recursive: bool = False
+
+
+def correspond_files(
+    files: CorrespondFiles,
+    folder: Path,
+    settings: CorrespondSettings,
+    *,
+    quiet: bool,
+    say: Callable[[str], None],
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    """Bring scans from files into correspondence and write what came of each into `folder`.
+
+    What was done is kept in the folder until the end, so the same command goes on from there after an interruption.
+
+    Raises:
+        FileError: the results cannot be written.
+        InputError: fewer than two scans, or too few that can be reached.
+    """
+    found = mesh_files(files.scans, recursive=files.recursive, apart_from=folder)
+    for sentence in found.left_out:
+        say(sentence)
+    paths = list(dict.fromkeys(path for path in found.files if not path.name.endswith(SURFACE)))
+    names = names_for(paths, None)
+    make_folder(folder)
+    scans, unread = _read_all(paths, names, quiet=quiet)
+    template = None if files.template is None else read_mesh(files.template)
+    rounds = _Rounds(folder / _KEPT, files.jobs or cores(), quiet=quiet)
+    with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
+        first = first_template(list(scans.values()), template, settings)
+    made = correspond(list(scans.values()), settings, first=first, run=rounds)
+    records = _records(made, list(scans), names, paths, unread, folder)
+    _write(made, records, list(scans), folder)
+    summary = CorrespondenceRecord(
+        template=made.why,
+        vertices=len(made.template.vertices),
+        rounds=list(made.moved),
+        corresponding=[record.name for record in records if not record.reason],
+        set_aside={record.name: record.reason for record in records if record.reason},
+        settings=asdict(settings),
+        version=__version__,
+    )
+    write_text(folder / SUMMARY, _json(summary))
+    shutil.rmtree(folder / _KEPT, ignore_errors=True)
+    return summary, records
+
+
+class _Rounds:
+    """Runs rounds with a bar for each."""
+
+    def __init__(self, folder: Path, jobs: int, *, quiet: bool) -> None:
+        self._folder, self._jobs, self._quiet, self._number = folder, jobs, quiet, 0
+
+    def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
+        self._number += 1
+        with progress(len(tasks), f"round {self._number}: registering", "scan", quiet=self._quiet) as bar:
+
+            def one_more() -> None:
+                bar.update()
+
+            return list(KeptRounds(self._folder, self._jobs, self._quiet, one_more)(bench, tasks))
+
+
+def _read_all(paths: Sequence[Path], names: Sequence[str], *, quiet: bool) -> tuple[dict[str, Mesh], dict[str, str]]:
+    scans: dict[str, Mesh] = {}
+    unread: dict[str, str] = {}
+    with progress(len(paths), "reading", "scan", quiet=quiet) as bar:
+        for path, name in zip(paths, names, strict=True):
+            try:
+                mesh = read_mesh(path)
+                scans[name] = Mesh(mesh.vertices, mesh.faces, name=name)
+            except ShapespaceError as error:
+                unread[name] = f"broken: {error}"
+            bar.update()
+    return scans, unread
+
+
+def _records(
+    made: Correspondence,
+    read: Sequence[str],
+    names: Sequence[str],
+    paths: Sequence[Path],
+    unread: dict[str, str],
+    folder: Path,
+) -> list[CorrespondRecord]:
+    came = dict(zip(read, made.scans, strict=True))
+    size = float(np.median([s.T_scan_template.scale for s in made.scans if s.T_scan_template is not None]))
+    records: list[CorrespondRecord] = []
+    for name, path in zip(names, paths, strict=True):
+        source = Source.at(path, sha256_of_file(path) if name in came else "", folder)
+        records.append(_record(name, source, came.get(name), unread.get(name, ""), size))
+    return records
+
+
+def _record(name: str, source: Source, one: Corresponding | None, unread: str, size: float) -> CorrespondRecord:
+    path = source.path or source.name
+    if one is None or one.vertices is None or one.T_scan_template is None:
+        reason = unread if one is None else one.reason
+        return CorrespondRecord(name=name, path=path, hash=source.content_hash, status="set aside", reason=reason)
+    mean, p95, p99, largest = one.distance
+    return CorrespondRecord(
+        name=name, path=path, hash=source.content_hash, status="corresponding", seen_share=one.seen,
+        covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
+        scale=one.T_scan_template.scale / size, moved_share=list(one.moved), cpu_s=list(one.seconds),
+    )  # fmt: skip
+
+
+def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequence[str], folder: Path) -> None:
+    came = dict(zip(read, made.scans, strict=True))
+    for record in records:
+        surface = folder / f"{record.name}{SURFACE}"
+        one = came.get(record.name)
+        if record.reason or one is None or one.vertices is None:
+            remove_file(surface)
+        else:
+            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name))
+        write_text(folder / f"{record.name}{RECORD}", _json(record))
+    make_folder((folder / MEAN).parent)
+    write_mesh(folder / MEAN, made.template)
+
+
+def _json(record: CorrespondRecord | CorrespondenceRecord) -> str:
+    return json.dumps(to_json(record), indent=1, allow_nan=False) + "\n"

@@ -1,0 +1,1 @@
+"""Surfaces in correspondence from raw scans, with no model to begin with."""

@@ -1,0 +1,198 @@
+"""One scan of one round: where it lies, the template on it, and how well that is so."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from shapespace.correspondence.generic import generic_model
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.register import ElasticSettings, Template, register
+from shapespace.correspondence.template import Glance
+from shapespace.errors import FitError, InputError, ShapespaceError
+from shapespace.fit.dense import dense_surface
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.settings import DenseSettings
+from shapespace.fit.start import Start
+from shapespace.geometry.closest import build_engine, on_boundary
+from shapespace.geometry.surface import boundary_vertices
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+
+REACHED = 0.03
+"""A scan's point is reached when the surface is this near, as a share of the size."""
+_ALTERNATIVES = 3
+_AS_GOOD = 0.8
+"""Poses are all tried whose score times this is no worse than the best one's."""
+_LEFT_OVER = 0.05
+_OTHERS_SAY = 0.95
+"""A pose that the other shapes make likelier than all others is tried beside the one there is."""
+_SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
+_FEW_HARMONICS = 4
+_MEASURED = 20_000
+_FAR = (np.inf, np.inf, np.inf, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceTask:
+    """What to do with one scan.
+
+    Args:
+        index: of the scan.
+        scan: repaired, in its own frame and unit.
+        T_scan_template: where the template lies in it; None searches from anywhere.
+        expected: (V, 3) the shape to begin from, in the template's frame; None is the template.
+        settings: of the registration.
+        glance: which of the bench's glances knows nothing of this scan.
+    """
+
+    index: int
+    scan: Mesh
+    T_scan_template: Similarity | None
+    expected: FloatArray | None
+    settings: ElasticSettings
+    glance: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What came of it.
+
+    Args:
+        index: of the scan.
+        vertices: (V, 3) in the template's frame.
+        T_scan_template: to the scan's own frame.
+        seen: (V,) which vertices the scan shows.
+        covered: share of the scan's points that the surface reaches.
+        distance: (4,) mean, 95 %, 99 % and largest distance both ways, in the template's unit.
+        seconds: CPU time.
+        reason: why there is nothing, where there is nothing; the arrays are then those of the template.
+        rivals: what came of other poses that are about as likely.
+    """
+
+    index: int
+    vertices: FloatArray
+    T_scan_template: Similarity
+    seen: BoolArray
+    covered: float
+    distance: tuple[float, float, float, float]
+    seconds: float
+    reason: str = ""
+    rivals: tuple[Placed, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Workbench:
+    """What all tasks of a round share.
+
+    Args:
+        mesh: the template.
+        harmonics: its smooth functions.
+        glances: the template with few vertices, for poses: one, or one for each part of the scans that it leaves out.
+        seed: of all that is drawn.
+    """
+
+    mesh: Mesh
+    harmonics: Harmonics
+    glances: tuple[Glance, ...]
+    seed: int
+
+    @cached_property
+    def template(self) -> Template:
+        """The template made ready."""
+        return Template.of(self.mesh, self.harmonics)
+
+    @cached_property
+    def model(self) -> ShapeModel:
+        """The template as a shape model, of which the dense stage uses the mean alone."""
+        return generic_model(self.mesh, self.harmonics.slowest(_FEW_HARMONICS))
+
+    def place(self, task: PlaceTask) -> Placed:
+        """Return the template on the task's scan; a scan that cannot be reached gives a reason."""
+        begun = time.process_time()
+        try:
+            with threadpool_limits(limits=1, user_api="blas"):
+                placed = self._best(task)
+        except ShapespaceError as error:
+            placed = self._nothing(task, str(error))
+        return replace(placed, seconds=time.process_time() - begun)
+
+    def _best(self, task: PlaceTask) -> Placed:
+        start = self.glances[task.glance].start(np.array(task.scan.vertices), self.seed)
+        T = task.T_scan_template
+        if T is not None:
+            placed = self._from(task, T)
+            if start.score_mm > _OTHERS_SAY * start.runner_up_score_mm or _is_same_turn(T, start.T_scan_model):
+                return placed
+            rival = self._tried(replace(task, expected=None), start)
+            return placed if rival is None else replace(placed, rivals=(rival,))
+        tries = [self._tried(task, one) for one in likely(start)]
+        good = [placed for placed in tries if placed is not None]
+        if not good:
+            raise FitError("surface not reached: too little of the scan matches the template from any pose")
+        # By how near it comes a smooth object fits in wrong poses too, so the search decides, unless much is left over.
+        most = max(placed.covered for placed in good)
+        first, *others = [placed for placed in good if placed.covered > most - _LEFT_OVER]
+        return replace(first, rivals=tuple(others))
+
+    def _tried(self, task: PlaceTask, start: Start) -> Placed | None:
+        try:
+            return self._from(task, start.T_scan_model)
+        except (FitError, InputError):
+            return None
+
+    def _from(self, task: PlaceTask, T: Similarity) -> Placed:
+        scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
+        target = ScanTarget(scan)
+        found = register(
+            self.template, target, Similarity.identity(), task.settings, expected=task.expected, seed=self.seed
+        )
+        start = found.T_scan_template.apply(found.vertices)
+        dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
+        covered, distance = self._judged(dense.vertices_scan_mm, dense.seen, target)
+        back = found.T_scan_template.inverse()
+        mean, p95, p99, largest = (back.scale * length for length in distance)
+        return Placed(
+            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, dense.seen, covered,
+            (mean, p95, p99, largest), 0.0,
+        )  # fmt: skip
+
+    def _judged(
+        self, vertices: FloatArray, seen: BoolArray, target: ScanTarget
+    ) -> tuple[float, tuple[float, float, float, float]]:
+        """Return the share of the scan that is reached, and distances both ways over what both show."""
+        surface = Mesh(vertices, self.mesh.faces)
+        rng = np.random.default_rng(self.seed)
+        points = target.mesh.vertices
+        if len(points) > _MEASURED:
+            points = points[np.sort(rng.choice(len(points), _MEASURED, replace=False))]
+        back = build_engine(surface).query(points)
+        beyond = on_boundary(back, surface, boundary_vertices(surface))
+        limit = REACHED * self.template.size_mm
+        covered = float((back.distance[~beyond] < limit).mean()) if not beyond.all() else 0.0
+        forward = target.engine.query(vertices[seen]).distance if seen.any() else np.empty(0)
+        both = np.concatenate([forward, back.distance[~beyond]])
+        if not len(both):
+            return 0.0, _FAR
+        shares = np.quantile(both, [0.95, 0.99, 1.0])
+        return covered, (float(both.mean()), float(shares[0]), float(shares[1]), float(shares[2]))
+
+    def _nothing(self, task: PlaceTask, reason: str) -> Placed:
+        vertices = np.array(self.mesh.vertices)
+        return Placed(
+            task.index, vertices, Similarity.identity(), np.zeros(len(vertices), np.bool_), 0.0, _FAR, 0.0, reason
+        )  # fmt: skip
+
+
+def _is_same_turn(one: Similarity, other: Similarity) -> bool:
+    return float(np.trace(one.rotation @ other.rotation.T)) > _SAME_TURN_TRACE
+
+
+def likely(start: Start) -> list[Start]:
+    """Return the best start and those about as good."""
+    others = [one for one in start.alternatives if _AS_GOOD * one.score_mm <= start.score_mm]
+    return [start, *others][:_ALTERNATIVES]

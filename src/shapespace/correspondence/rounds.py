@@ -1,0 +1,365 @@
+"""From raw scans to surfaces in correspondence, in rounds: each knows what the last one found.
+
+    round 1    the template goes to each scan, by itself
+    round k    the mean of the round is the template, and what the other scans say of a scan is where it begins
+
+A scan that no round can reach is set aside with the reason, and the others go on without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from shapespace.correspondence.guide import Others, aligned, told_by_others
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.template import Glance, choose, clean, resampled
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.doctor import repair
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import faces_of, rms_size
+from shapespace.types import FloatArray, Mesh, Similarity
+
+SIZE = 100.0
+"""The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
+FEWEST = 2
+_ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
+_PARTS = 4
+
+
+@dataclass(frozen=True)
+class CorrespondSettings:
+    """How scans are brought into correspondence; lengths are shares of the object's size (RMS from its middle).
+
+    Args:
+        vertices: of the template, about.
+        rounds: at most.
+        settled: a round that moves vertices by less (RMS over all) is the last.
+        first: the registration of round 1,
+        next: and of the others, which begin at what the other scans say.
+        guided: whether later rounds begin at what the others say, or at the mean.
+        noise_share: how little the others are believed, as a share of a mode's mean variance.
+        fewest_seen: share of the template that a scan must show,
+        fewest_covered: and share of a scan that the template must reach.
+        strange: shapes whose distance from what the others say of them is beyond this many times the usual are other
+            objects.
+        seed: of all that is drawn.
+    """
+
+    vertices: int = 10_000
+    rounds: int = 3
+    settled: float = 0.002
+    first: ElasticSettings = field(default_factory=ElasticSettings)
+    next: ElasticSettings = field(default_factory=ElasticSettings)
+    guided: bool = True
+    noise_share: float = 1.0
+    fewest_seen: float = 0.4
+    fewest_covered: float = 0.6
+    strange: float = 3.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Corresponding:
+    """One scan after the rounds.
+
+    Args:
+        name: of the scan.
+        reason: why it is set aside; empty where it is not.
+        vertices: (V, 3) in the scan's own frame and unit, not-a-number where the scan shows nothing; None if set aside.
+        T_scan_template: to the scan's own frame; None where no pose was found.
+        seen: share of the template's vertices that the scan shows.
+        covered: share of the scan that the template reaches.
+        distance: (4,) mean, 95 %, 99 % and largest distance both ways over what is seen, in the scan's unit.
+        moved: RMS by which its vertices moved in each round, shares of its size.
+        seconds: CPU time of each round.
+    """
+
+    name: str
+    reason: str
+    vertices: FloatArray | None = None
+    T_scan_template: Similarity | None = None
+    seen: float = 0.0
+    covered: float = 0.0
+    distance: tuple[float, float, float, float] = (np.nan, np.nan, np.nan, np.nan)
+    moved: tuple[float, ...] = ()
+    seconds: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """Scans in correspondence.
+
+    Args:
+        template: the mean shape of the last round, in mm of `SIZE`.
+        scans: in the order given.
+        why: where the first template came from, in a sentence.
+        moved: RMS movement in each round, share of the size.
+    """
+
+    template: Mesh
+    scans: tuple[Corresponding, ...]
+    why: str
+    moved: tuple[float, ...]
+
+    def meshes(self) -> list[Mesh]:
+        """Return the surfaces of those that are not set aside, in their scans' own frames."""
+        return [
+            Mesh(scan.vertices, self.template.faces, name=scan.name) for scan in self.scans if scan.vertices is not None
+        ]
+
+
+class Runner(Protocol):
+    """Does the tasks of a round, here or elsewhere, and yields them as they end."""
+
+    def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> Iterable[Placed]:
+        """Yield what came of each of `tasks`, in any order."""
+        ...
+
+
+def run_here(bench: Workbench, tasks: Sequence[PlaceTask]) -> Iterable[Placed]:
+    """Do one task after the other in this process."""
+    return map(bench.place, tasks)
+
+
+@dataclass(frozen=True, eq=False)
+class First:
+    """What the first round goes by.
+
+    Args:
+        mesh: the template, of the size `SIZE`, about the origin.
+        why: where it comes from, in a sentence.
+        repaired: the scans that can be used, by their number.
+        broken: why the others cannot.
+    """
+
+    mesh: Mesh
+    why: str
+    repaired: Mapping[int, Mesh]
+    broken: Mapping[int, str]
+
+
+def first_template(scans: Sequence[Mesh], template: Mesh | None, settings: CorrespondSettings) -> First:
+    """Return what the first round goes by: `template` as it is, or the scan nearest to the others, meshed evenly.
+
+    Raises:
+        InputError: fewer than two scans, or scans that are all equal.
+        MeshError: no scan can be a template, or the template is none.
+    """
+    if len(scans) < FEWEST:
+        raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
+    good, broken = _repaired(scans)
+    if len(good) < FEWEST:
+        raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
+    _refuse_equal(list(good.values()))
+    if template is not None:
+        mesh, why = repair(template)[0], f"{template.name} was given as the template."
+        faces_of(mesh)
+    else:
+        numbers = list(good)
+        choice = choose(list(good.values()), settings.seed)
+        chosen = scans[numbers[choice.index]]
+        mesh = resampled(clean(chosen), settings.vertices)
+        why = (
+            f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
+            f"to the others, {100 * choice.nearness[choice.index]:.1f} % of its size off after a smooth change."
+        )
+    scale = SIZE / rms_size(mesh.vertices)
+    centred = Mesh((mesh.vertices - mesh.vertices.mean(axis=0)) * scale, mesh.faces, name=mesh.name)
+    return First(centred, why, good, broken)
+
+
+def correspond(
+    scans: Sequence[Mesh],
+    settings: CorrespondSettings | None = None,
+    *,
+    template: Mesh | None = None,
+    first: First | None = None,
+    run: Runner = run_here,
+) -> Correspondence:
+    """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
+
+    Args:
+        scans: of one kind of object.
+        settings: how.
+        template: the surface that the first round goes by, as it is; None chooses a scan and meshes it evenly.
+        first: what `first_template` made of these scans, where it was called already.
+        run: does the tasks of a round.
+
+    Raises:
+        InputError: fewer than two scans, scans that are all equal, or too few that can be reached.
+        MeshError: no scan can be a template, or the template is none.
+    """
+    settings = settings or CorrespondSettings()
+    first = first or first_template(scans, template, settings)
+    state = _State([scan.name for scan in scans], first, settings)
+    for _ in range(settings.rounds):
+        if state.take(run(state.bench(), state.tasks())) < settings.settled:
+            break
+    return state.result(first.why)
+
+
+def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
+    good: dict[int, Mesh] = {}
+    broken: dict[int, str] = {}
+    for i, scan in enumerate(scans):
+        try:
+            good[i] = repair(scan)[0]
+        except MeshError as error:
+            broken[i] = f"broken: {error}"
+    return good, broken
+
+
+def _refuse_equal(scans: Sequence[Mesh]) -> None:
+    first = scans[0].vertices
+    if all(scan.vertices.shape == first.shape and np.array_equal(scan.vertices, first) for scan in scans[1:]):
+        raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different ones.")
+
+
+class _State:
+    """What the rounds know: the template, and where each scan is."""
+
+    def __init__(self, names: Sequence[str], first: First, settings: CorrespondSettings) -> None:
+        self.names, self.scans, self.settings = list(names), first.repaired, settings
+        self.broken, self.reasons = first.broken, dict(first.broken)
+        self.template = first.mesh
+        self.harmonics = Harmonics.of(first.mesh, settings.first.harmonics)
+        self.placed: dict[int, Placed] = {}
+        self.expected: dict[int, FloatArray] = {}
+        self.moved: list[float] = []
+        self.moves: dict[int, list[float]] = {i: [] for i in first.repaired}
+        self.seconds: dict[int, list[float]] = {i: [] for i in first.repaired}
+
+    def tasks(self) -> list[PlaceTask]:
+        """Return what is to be done in the next round: all scans, those that were set aside from anywhere."""
+        return [self._task(i) for i in self.scans]
+
+    def bench(self) -> Workbench:
+        """Return what its tasks share."""
+        order = sorted(self.placed)
+        if len(order) < _ENOUGH_TO_JUDGE:
+            return Workbench(self.template, self.harmonics, (Glance.of(self.template),), self.settings.seed)
+        shapes, parts = self._stacked(order)[0], np.array([self._part(i) for i in order])
+        glances = tuple(Glance.of(self.template, shapes[parts != part]) for part in range(_PARTS))
+        return Workbench(self.template, self.harmonics, glances, self.settings.seed)
+
+    def take(self, ended: Iterable[Placed]) -> float:
+        """Take what came of a round; return by how much vertices moved (RMS), as a share of the size."""
+        last, self.placed, self.reasons = self.placed, {}, dict(self.broken)
+        for placed in sorted(ended, key=lambda one: one.index):
+            self.seconds[placed.index].append(placed.seconds)
+            if reason := self._why_not(placed):
+                self.reasons[placed.index] = reason
+            else:
+                self.placed[placed.index] = placed
+        self._set_strange_aside([i for i in sorted(self.placed) if not self.placed[i].rivals])
+        self._settle_rivals()
+        self._set_strange_aside(sorted(self.placed))
+        if len(self.placed) < FEWEST:
+            why = "; ".join(f"{self.names[i]}: {reason}" for i, reason in list(self.reasons.items())[:3])
+            raise InputError(f"Only {len(self.placed)} of {len(self.names)} scans could be reached: {why}.")
+        moved = self._agree(last)
+        self.moved.append(moved)
+        return moved
+
+    def _part(self, i: int) -> int:
+        """Return the part of the scans that number `i` belongs to; the glance of that part knows nothing of it."""
+        return i % _PARTS
+
+    def _task(self, i: int) -> PlaceTask:
+        part = self._part(i) if len(self.placed) >= _ENOUGH_TO_JUDGE else 0
+        if i not in self.placed:
+            return PlaceTask(i, self.scans[i], None, None, self.settings.first, part)
+        T = self.placed[i].T_scan_template
+        return PlaceTask(i, self.scans[i], T, self.expected.get(i), self.settings.next, part)
+
+    def _why_not(self, placed: Placed) -> str:
+        s = self.settings
+        if placed.reason:
+            return placed.reason
+        if placed.covered < s.fewest_covered:
+            return (
+                f"surface not reached: the template covers {100 * placed.covered:.0f} % of it; another object, or "
+                "one with much beside it"
+            )
+        if placed.seen.mean() < s.fewest_seen:
+            return f"half missing: it shows {100 * placed.seen.mean():.0f} % of the template"
+        return ""
+
+    def _settle_rivals(self) -> None:
+        """Where several poses were about as likely, take the one whose shape the scans of sure pose tell best."""
+        sure = [i for i in sorted(self.placed) if not self.placed[i].rivals]
+        if len(sure) < _ENOUGH_TO_SETTLE:
+            return
+        shapes, seen = self._stacked(sure)
+        others = Others.of(aligned(shapes, seen, self.template.vertices)[0], self.settings.noise_share)
+        for i, placed in self.placed.items():
+            if placed.rivals:
+                self.placed[i] = min(
+                    (placed, *placed.rivals), key=lambda one: others.apart(one.vertices, one.seen.astype(np.float64))
+                )
+
+    def _set_strange_aside(self, order: Sequence[int]) -> None:
+        """Set aside what is like no other in `order`, measured by what the others say of it."""
+        if len(order) < _ENOUGH_TO_JUDGE:
+            return
+        shapes, seen = self._stacked(order)
+        shapes, _ = aligned(shapes, seen, self.template.vertices)
+        told = told_by_others(shapes, seen, self.settings.noise_share)
+        apart = ((shapes - told) ** 2).sum(axis=2)
+        rms = np.sqrt((seen * apart).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
+        usual = float(np.median(rms))
+        for i, value in zip(order, rms, strict=True):
+            if value > self.settings.strange * usual:
+                self.reasons[i] = (
+                    f"another object, or wrongly placed: {value / usual:.1f} times as far as usual from what the other "
+                    "scans say of it"
+                )
+                del self.placed[i]
+
+    def _stacked(self, order: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        shapes = np.stack([self.placed[i].vertices for i in order])
+        return shapes, np.stack([self.placed[i].seen for i in order]).astype(np.float64)
+
+    def _agree(self, last: dict[int, Placed]) -> float:
+        """Make the mean of the round the template, and say what the others expect of each."""
+        order = sorted(self.placed)
+        shapes, seen = self._stacked(order)
+        shapes, mean = aligned(shapes, seen, self.template.vertices)
+        squares: list[float] = []
+        for i, shape in zip(order, shapes, strict=True):
+            now = self.placed[i]
+            T = now.T_scan_template @ fit_similarity(shape, now.vertices)
+            before = last[i].vertices if i in last else np.array(self.template.vertices)
+            square = float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
+            squares.append(square)
+            self.moves[i].append(float(np.sqrt(square)) / SIZE)
+            self.placed[i] = replace(now, vertices=shape, T_scan_template=T)
+        if self.settings.guided:
+            self.expected = dict(zip(order, told_by_others(shapes, seen, self.settings.noise_share), strict=True))
+        self.template = Mesh(mean, self.template.faces, name=self.template.name)
+        return float(np.sqrt(np.mean(squares))) / SIZE
+
+    def result(self, why: str) -> Correspondence:
+        """Return the scans with what is known of each."""
+        scans = [self._ended(i) for i in range(len(self.names))]
+        return Correspondence(self.template, tuple(scans), why, tuple(self.moved))
+
+    def _ended(self, i: int) -> Corresponding:
+        moves, seconds = tuple(self.moves.get(i, ())), tuple(self.seconds.get(i, ()))
+        if i not in self.placed:
+            return Corresponding(self.names[i], self.reasons[i], moved=moves, seconds=seconds)
+        placed = self.placed[i]
+        T = placed.T_scan_template
+        vertices = T.apply(placed.vertices)
+        vertices[~placed.seen] = np.nan
+        mean, p95, p99, largest = (T.scale * length for length in placed.distance)
+        return Corresponding(
+            self.names[i], "", vertices, T, float(placed.seen.mean()), placed.covered, (mean, p95, p99, largest), moves,
+            seconds,
+        )  # fmt: skip

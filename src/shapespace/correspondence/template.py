@@ -1,0 +1,192 @@
+"""The first template: the scan that is nearest to all others, whole and evenly meshed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from shapespace.correspondence.generic import generic_model
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.errors import MeshError, ShapespaceError
+from shapespace.fit.start import Start, start_from_any_pose
+from shapespace.geometry import remesh
+from shapespace.geometry.doctor import repair
+from shapespace.geometry.surface import boundary_edges, faces_of, rms_size, without_vertices
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+_GLANCE_VERTICES = 1500
+_GLANCE_HARMONICS = 40
+_CANDIDATES, _OTHERS = 6, 6
+_SMALL_HOLE = 0.05
+"""Holes with a border shorter than this share of the longest border, or of the surface's size, are closed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """A surface with few vertices and generic modes, to find poses with; in mm, of the size it has.
+
+    Args:
+        model: the shape space of one shape.
+    """
+
+    model: ShapeModel
+
+    @staticmethod
+    def of(mesh: Mesh, known: FloatArray | None = None) -> Glance:
+        """Return a glance at `mesh`; of aligned shapes `known` (N, V, 3) on the same vertices it has the modes too.
+
+        Raises:
+            MeshError: it is no sheet.
+        """
+        wanted = round(len(faces_of(mesh)) * min(1.0, _GLANCE_VERTICES / len(mesh.vertices)))
+        _, faces, origin = remesh.collapse(mesh.vertices, faces_of(mesh), wanted, mesh.name)
+        coarse = Mesh(mesh.vertices[origin], faces.astype(np.int32), name=mesh.name)
+        harmonics = Harmonics.of(coarse, _GLANCE_HARMONICS)
+        return Glance(generic_model(coarse, harmonics, None if known is None else known[:, origin]))
+
+    def start(self, vertices_mm: FloatArray, seed: int) -> Start:
+        """Return where the surface lies in a scan with `vertices_mm` (S, 3), whatever the scan's size and pose.
+
+        The score is in mm of this surface.
+        """
+        size = rms_size(self.model.mean_vertices)
+        centre, ratio = np.median(vertices_mm, axis=0), rms_size(vertices_mm) / size
+        T = Similarity(1.0 / ratio, np.eye(3), -centre / ratio)
+        start = start_from_any_pose(self.model, T.apply(vertices_mm), seed=seed, with_scale=True)
+        back = T.inverse()
+        return Start(
+            back @ start.T_scan_model, start.how, start.score_mm, start.b, start.runner_up_score_mm,
+            tuple(Start(back @ s.T_scan_model, s.how, s.score_mm, s.b) for s in start.alternatives),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which scan was chosen as the first template.
+
+    Args:
+        index: of it.
+        nearness: (N,) mean distance from a candidate to other scans after smooth adaptation, share of its size;
+            not-a-number for scans that were no candidates.
+    """
+
+    index: int
+    nearness: tuple[float, ...]
+
+
+def choose(scans: Sequence[Mesh], seed: int) -> Choice:
+    """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
+
+    Candidates are those of middle size among the ones with few pieces and short borders, as those lack least.
+
+    Raises:
+        MeshError: none of them can be a template.
+    """
+    rng = np.random.default_rng(seed)
+    whole = np.array([_wholeness(scan) for scan in scans])
+    candidates = np.argsort(whole, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
+    candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))
+    others = np.sort(rng.choice(len(scans), min(_OTHERS, len(scans)), replace=False))
+    nearness = np.full(len(scans), np.nan)
+    for i in map(int, candidates):
+        try:
+            glance = Glance.of(clean(scans[i]))
+        except ShapespaceError:
+            continue
+        size = rms_size(glance.model.mean_vertices)
+        apart = [glance.start(np.array(scans[j].vertices), seed).score_mm / size for j in map(int, others) if j != i]
+        nearness[i] = float(np.median(apart)) if apart else 0.0
+    if not np.isfinite(nearness).any():
+        raise MeshError(
+            "None of the scans can be a template, since none is a sheet of triangles in one piece; give --template."
+        )
+    return Choice(int(np.nanargmin(nearness)), tuple(float(share) for share in nearness))
+
+
+def clean(scan: Mesh) -> Mesh:
+    """Return the largest piece of `scan`, repaired, small holes closed by a fan.
+
+    Raises:
+        MeshError: it has no triangles, or cannot be repaired.
+    """
+    mesh = repair(scan)[0]
+    vertices, faces = _largest_piece(mesh.vertices, faces_of(mesh))
+    faces = _without_branches(faces)
+    vertices, faces = _largest_piece(vertices, faces)
+    for hole in _small_holes(vertices, faces):
+        fan = np.column_stack([np.roll(hole, -1), hole, np.full(len(hole), len(vertices), dtype=np.int32)])
+        vertices = np.concatenate([vertices, vertices[hole].mean(axis=0, keepdims=True)])
+        faces = np.concatenate([faces, fan.astype(np.int32)])
+    return Mesh(vertices, faces, name=scan.name)
+
+
+def resampled(mesh: Mesh, vertices: int) -> Mesh:
+    """Return `mesh` with about that many vertices, evenly spread: split until fine enough, shortest edges collapsed.
+
+    Raises:
+        MeshError: it is no sheet.
+    """
+    x, faces = np.array(mesh.vertices), faces_of(mesh).astype(np.int64)
+    while len(x) < 2 * vertices:
+        x, faces = remesh.split(x, faces, mesh.name)
+    wanted = round(len(faces) * vertices / len(x))
+    coarse, left, _ = remesh.collapse(x, faces, wanted, mesh.name)
+    return Mesh(remesh.onto(coarse, mesh.vertices, faces_of(mesh)), left.astype(np.int32), name=mesh.name)
+
+
+def _wholeness(scan: Mesh) -> float:
+    """Return a number that grows with the border of `scan`; infinite for points."""
+    if scan.faces is None:
+        return np.inf
+    ends = scan.vertices[boundary_edges(scan.faces)]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum()) / max(rms_size(scan.vertices), 1e-12)
+
+
+def _largest_piece(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    flat = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_array((np.ones(len(flat)), (flat[:, 0], flat[:, 1])), shape=(len(vertices), len(vertices)))
+    _, piece = connected_components(graph, directed=False)
+    largest = np.bincount(piece[faces[:, 0]]).argmax()
+    return without_vertices(vertices, faces, piece == largest)
+
+
+def _without_branches(faces: IntArray) -> IntArray:
+    """Return `faces` without those at edges that are passed twice in one direction."""
+    count = int(faces.max()) + 1
+    key = (faces.astype(np.int64) * count + faces[:, [1, 2, 0]]).ravel()
+    _, which, often = np.unique(key, return_inverse=True, return_counts=True)
+    return faces[(often[which] == 1).reshape(-1, 3).all(axis=1)]
+
+
+def _small_holes(vertices: FloatArray, faces: IntArray) -> list[IntArray]:
+    loops = _borders(faces)
+    length = np.array([np.linalg.norm(vertices[loop] - vertices[np.roll(loop, 1)], axis=1).sum() for loop in loops])
+    if not len(length):
+        return []
+    most = _SMALL_HOLE * max(float(length.max()), 2 * np.pi * rms_size(vertices))
+    return [loop for loop, around in zip(loops, length, strict=True) if around < most and len(loop) >= 3]
+
+
+def _borders(faces: IntArray) -> list[IntArray]:
+    """Return the closed borders that meet no other, each (n,) in the direction of its triangles."""
+    count = int(faces.max()) + 1
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    lone = ~np.isin(ends[:, 1] * count + ends[:, 0], ends[:, 0] * count + ends[:, 1])
+    start, end = ends[lone].T
+    simple = np.bincount(start, minlength=count) == 1
+    following = {int(a): int(b) for a, b in zip(start, end, strict=True) if simple[a] and simple[b]}
+    loops: list[IntArray] = []
+    while following:
+        first = next(iter(following))
+        loop, at = [first], following.pop(first)
+        while at in following:
+            loop.append(at)
+            at = following.pop(at)
+        if at == first:
+            loops.append(np.array(loop, dtype=np.int32))
+    return loops

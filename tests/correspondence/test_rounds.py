@@ -1,0 +1,95 @@
+"""Raw scans in correspondence: true to the shapes they were made from, whatever pose, unit and holes they have."""
+
+import numpy as np
+import pytest
+from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
+from synthetic_shapes import sphere
+
+import shapespace as ss
+from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.rounds import Correspondence, CorrespondSettings
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.closest import build_engine
+from shapespace.types import Mesh
+
+QUICK = ElasticSettings(harmonics=150, points=1000)
+SETTINGS = CorrespondSettings(vertices=900, rounds=2, first=QUICK, next=QUICK)
+HOLED, METRES, OTHER = 2, 3, 8
+
+
+@pytest.fixture(scope="module")
+def blobs() -> list[RawBlob]:
+    return [raw_blob(k) for k in range(8)]
+
+
+@pytest.fixture(scope="module")
+def scans(blobs: list[RawBlob]) -> list[Mesh]:
+    scans = [one.scan for one in blobs]
+    scans[HOLED] = without_ball(scans[HOLED], scans[HOLED].vertices[100], 25.0)
+    scans[METRES] = scans[METRES].with_vertices(1e-3 * scans[METRES].vertices)
+    directions, faces = sphere(1500, 0.9)
+    rod = Mesh(directions * np.array([20.0, 180.0, 20.0]), faces, name="rod")
+    return [*scans, rod]
+
+
+@pytest.fixture(scope="module")
+def made(scans: list[Mesh]) -> Correspondence:
+    return ss.correspond(scans, SETTINGS)
+
+
+def surfaces(made: Correspondence) -> list[np.ndarray]:
+    found = [np.array(scan.vertices) for scan in made.scans[:8]]
+    found[METRES] *= 1e3
+    return found
+
+
+def test_the_same_vertex_is_the_same_place_on_all(blobs: list[RawBlob], made: Correspondence) -> None:
+    assert dispersion_mm(blobs, surfaces(made)) < 3.0
+
+
+def test_surfaces_lie_on_their_scans_in_their_own_unit(scans: list[Mesh], made: Correspondence) -> None:
+    for k, scan in enumerate(made.scans[:8]):
+        there = np.isfinite(scan.vertices).all(axis=1)
+        unit = 1e-3 if k == METRES else 1.0
+        assert build_engine(scans[k]).query(scan.vertices[there]).distance.mean() < 0.5 * unit
+        assert scan.distance[0] < 0.7 * unit
+        assert scan.covered > 0.97
+
+
+def test_what_a_scan_does_not_show_is_missing_and_nothing_else(scans: list[Mesh], made: Correspondence) -> None:
+    for k, scan in enumerate(made.scans[:8]):
+        assert scan.seen == np.isfinite(scan.vertices).all(axis=1).mean()
+        assert (0.85 < scan.seen < 0.99) if k == HOLED else scan.seen > 0.99
+
+
+def test_another_object_is_set_aside_with_a_reason(made: Correspondence) -> None:
+    assert [bool(scan.reason) for scan in made.scans] == [False] * 8 + [True]
+    assert made.scans[OTHER].vertices is None
+    assert len(made.meshes()) == 8
+
+
+def test_the_same_scans_give_the_same_result(scans: list[Mesh], made: Correspondence) -> None:
+    again = ss.correspond(scans, SETTINGS)
+    for one, other in zip(made.scans[:8], again.scans[:8], strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_a_template_given_keeps_its_triangles(scans: list[Mesh], blobs: list[RawBlob]) -> None:
+    directions, faces = sphere(700, 2.0)
+    template = Mesh(directions * np.array([70.0, 100.0, 85.0]), faces, name="egg")
+    made = ss.correspond(scans[:3], SETTINGS, template=template)
+    np.testing.assert_array_equal(made.template.faces, faces)
+    assert made.why == "egg was given as the template."
+
+
+def test_what_cannot_be_brought_into_correspondence_is_said(scans: list[Mesh]) -> None:
+    with pytest.raises(InputError, match="at least 2 scans, not 1"):
+        ss.correspond(scans[:1], SETTINGS)
+    with pytest.raises(InputError, match="All scans are equal"):
+        ss.correspond([scans[0], scans[0]], SETTINGS)
+    cloud = [Mesh(scan.vertices, None, name=scan.name) for scan in scans[:3]]
+    with pytest.raises(MeshError, match="None of the scans can be a template"):
+        ss.correspond(cloud, SETTINGS)
+    flat = Mesh(np.column_stack([scans[0].vertices[:, :2], np.zeros(2500)]), scans[0].faces, name="flat")
+    with pytest.raises(InputError, match="Hardly any of the scans can be used"):
+        ss.correspond([flat, scans[0]], SETTINGS)
