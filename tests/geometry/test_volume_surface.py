@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from shapespace.errors import InputError
 from shapespace.geometry.doctor import examine
-from shapespace.geometry.volume_surface import VolumeSurface, labels_in, surface_of_volume
+from shapespace.geometry.volume_surface import VolumeSurface, _grown, _squared_distance, labels_in, surface_of_volume
 from shapespace.types import FloatArray, LabelVolume, Mesh
 
 pytest.importorskip("skimage", reason="the extra `volumes` is not installed")
@@ -86,6 +86,19 @@ def test_a_sheared_affine_shears_the_surface_alone() -> None:
     made = surface_of_volume(LabelVolume(volume.labels, shear @ volume.affine))
     plain = surface_of_volume(volume).mesh.vertices
     assert np.allclose(made.mesh.vertices, plain @ shear[:3, :3].T, atol=0.01)
+
+
+@pytest.mark.parametrize("step", [(1, 1, 1), (0.7, 0.7, 2.0), (3.0, 0.5, 1.0)])
+def test_distances_are_those_of_scipy_up_to_the_bound(step: Any) -> None:
+    side = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(17, 13, 15)), 1.2) > -0.1
+    exact = ndimage.distance_transform_edt(side, sampling=step)
+    found = np.sqrt(_squared_distance(side, np.array(step), 2.5))
+    assert np.allclose(found, np.minimum(exact, 2.5), atol=1e-6) and (exact > 2.5).any()
+
+
+def test_growing_takes_all_neighbours() -> None:
+    mask = np.random.default_rng(4).random((9, 8, 7)) < 0.05
+    assert (_grown(mask) == ndimage.binary_dilation(mask, np.ones((3, 3, 3)))).all()
 
 
 @pytest.mark.parametrize("seed", range(12))

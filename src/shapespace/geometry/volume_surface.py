@@ -34,7 +34,7 @@ _CLEAR = np.float32(0.05)
 _FINER = (0.5, 0.25)
 _FEWEST = 8
 _HALVINGS, _STEP = 20, 0.1
-_MOST_VOXELS = 1 << 28
+_MOST_VOXELS = 1 << 27
 _LONG = 2.5
 _LISTED = 10
 
@@ -193,7 +193,8 @@ class _Part:
             return _Part(whole, int(sizes.sum()), pieces, 0, 0, int(whole.sum() - mask.sum()), kept)
         largest = 1 + int(np.argmax(sizes[1:]))
         piece = label == largest
-        closed = np.asarray(ndimage.binary_fill_holes(piece), dtype=np.bool_)
+        outside, _ = _components(~piece)
+        closed = outside != outside[0, 0, 0]
         filled = int((closed & ~piece).sum())
         added = int((piece & ~mask).sum())
         left_out = int(sizes.sum() - sizes[largest] - (closed & mask & ~piece).sum())
@@ -269,13 +270,30 @@ def _levelled(distance: _Field, sigma: FloatArray, mask: BoolArray) -> _Field:
 
 def _signed_distance(mask: BoolArray, voxel_mm: FloatArray) -> _Field:
     """Return the distance of each voxel from the border of `mask` in voxels of mean size, positive inside, cut off."""
-    unit = float(np.cbrt(np.prod(voxel_mm)))
+    step = voxel_mm / np.cbrt(np.prod(voxel_mm))
+    half = 0.5 * float(step.min())
 
     def depth(side: BoolArray) -> _Field:
-        far = ndimage.distance_transform_edt(side, sampling=voxel_mm / unit)
-        return np.clip(far - 0.5 * voxel_mm.min() / unit, 0, _CLIP).astype(np.float32)
+        return np.maximum(np.sqrt(_squared_distance(side, step, _CLIP + half)) - np.float32(half), np.float32(0))
 
     return np.where(mask, depth(mask), -depth(~mask))
+
+
+def _squared_distance(side: BoolArray, step: FloatArray, most: float) -> _Field:
+    """Return the squared distance from each voxel of `side` to the nearest other, at most that of `most`.
+
+    One axis after the other, as squares add up; SciPy's transform, without a bound, takes ten times as long.
+    """
+    found = np.where(side, np.float32(most**2), np.float32(0))
+    for axis, length in enumerate(step):
+        before = np.moveaxis(found, axis, 0)
+        found = found.copy()
+        after = np.moveaxis(found, axis, 0)
+        for k in range(1, int(most / length) + 1):
+            cost = np.float32((k * length) ** 2)
+            np.minimum(after[:-k], before[k:] + cost, out=after[:-k])
+            np.minimum(after[k:], before[:-k] + cost, out=after[k:])
+    return found
 
 
 def _level(field: _Field, voxels: int) -> float:
@@ -299,10 +317,19 @@ def _level(field: _Field, voxels: int) -> float:
 
 def _vanished(mask: BoolArray, side: BoolArray) -> BoolArray:
     """Return where, and two voxels around, a voxel of `mask` or of the rest has no neighbour on its side in `side`."""
-    around = ndimage.generate_binary_structure(3, 3)
-    lost = mask & ~ndimage.binary_dilation(side, around)
-    lost |= ~mask & ~ndimage.binary_dilation(~side, around, border_value=1)
-    return np.asarray(ndimage.binary_dilation(lost, around, iterations=2) if lost.any() else lost, dtype=np.bool_)
+    lost = (mask & ~_grown(side)) | (~mask & ~_grown(~side))
+    return _grown(_grown(lost)) if lost.any() else lost
+
+
+def _grown(mask: BoolArray) -> BoolArray:
+    """Return `mask` with the 26 neighbours of its voxels."""
+    for axis in range(3):
+        before = np.moveaxis(mask, axis, 0)
+        mask = mask.copy()
+        after = np.moveaxis(mask, axis, 0)
+        after[1:] |= before[:-1]
+        after[:-1] |= before[1:]
+    return mask
 
 
 def _triangles(field: _Field, name: str) -> tuple[FloatArray, IntArray]:
