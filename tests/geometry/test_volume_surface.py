@@ -156,6 +156,9 @@ def test_a_label_is_chosen_and_several_are_one_object() -> None:
         surface_of_volume(volume)
     assert np.allclose(_around(surface_of_volume(volume, 1)), 10, atol=0.2)
     assert np.allclose(_around(surface_of_volume(volume, [2])), (30, 10, 10), atol=0.2)
+    assert surface_of_volume(volume, np.uint8(2)).labels == (2,)
+    with pytest.raises(InputError, match="'all', not 'both'"):
+        surface_of_volume(volume, "both")  # type: ignore[arg-type]
     assert surface_of_volume(volume, "all").labels == surface_of_volume(volume, (2, 1)).labels == (1, 2)
     with pytest.raises(InputError, match="there is no label 3 in it; it has 1, 2"):
         surface_of_volume(volume, 3)
@@ -188,6 +191,15 @@ def test_what_touches_the_border_is_closed_there_and_said() -> None:
     is_clean(made.mesh)
     assert made.at_border > 0 and made.notes[0].startswith("It touches the border")
     assert abs(made.volume_mm3 / 720 - 1) < 0.03
+
+
+def test_the_border_counts_where_what_is_kept_touches_it() -> None:
+    labels = np.zeros((12, 12, 12))
+    labels[3:9, 3:9, 3:9] = labels[0, 0, :3] = 1
+    assert surface_of_volume(volume_of(labels)).at_border == 0
+    assert surface_of_volume(volume_of(labels), keep_pieces=True).at_border == 3
+    labels[9:, 3:9, 3:9] = 1
+    assert surface_of_volume(volume_of(labels)).at_border == 36
 
 
 def test_long_voxels_are_said() -> None:

@@ -94,7 +94,6 @@ def surface_of_volume(
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen = _chosen(volume, labels)
     inside = np.isin(volume.labels, chosen)
-    at_border = sum(int(face.sum()) for axis in range(3) for face in (inside.take(0, axis), inside.take(-1, axis)))
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
     mask, corner = _cut_out(inside, np.ceil(3 * sigma).astype(int) + 3, volume.name)
     part = _Part.of(mask, keep_pieces=keep_pieces)
@@ -103,6 +102,7 @@ def surface_of_volume(
             f"{volume.name}: {_named(chosen)} has only {part.voxels} {'voxel' if part.voxels == 1 else 'voxels'} "
             f"that hang together; a surface needs {_FEWEST}."
         )
+    at_border = _at_border(part.mask, corner, inside.shape)
     field, share = _smoothed(part, volume.voxel_mm, sigma)
     vertices, faces = _triangles(field, volume.name)
     points = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -145,8 +145,10 @@ def _chosen(volume: LabelVolume, labels: int | Sequence[int] | Literal["all"] | 
             )
         return found
     if isinstance(labels, str):
+        if labels != "all":
+            raise InputError(f"Labels must be whole numbers or 'all', not {labels!r}.")
         return found
-    asked = {labels} if isinstance(labels, int) else set(labels)
+    asked = {int(label) for label in np.atleast_1d(np.asarray(labels, dtype=np.int64))}
     absent = tuple(sorted(asked - set(found)))
     if absent or not asked:
         raise InputError(f"{volume.name}: there is no {_named(absent) if absent else 'label'} in it; it has {listed}.")
@@ -168,6 +170,12 @@ def _cut_out(inside: BoolArray, margin: npt.NDArray[np.int_], name: str) -> tupl
         raise InputError(f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it.")
     box = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     return np.pad(box, [(int(m), int(m)) for m in margin]), (low - margin).astype(np.float64)
+
+
+def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
+    """Return how many voxels of `mask`, which begins at `corner` of a volume of that `shape`, are its outermost."""
+    inner = tuple(slice(1 - int(at), count - 1 - int(at)) for at, count in zip(corner, shape, strict=True))
+    return int(mask.sum() - mask[inner].sum())
 
 
 @dataclass(frozen=True, eq=False)
