@@ -200,6 +200,9 @@ def test_the_border_counts_where_what_is_kept_touches_it() -> None:
     assert surface_of_volume(volume_of(labels), keep_pieces=True).at_border == 3
     labels[9:, 3:9, 3:9] = 1
     assert surface_of_volume(volume_of(labels)).at_border == 36
+    assert surface_of_volume(volume_of(np.pad(labels, ((20, 0), (9, 30), (0, 1))))).at_border == 36
+    assert surface_of_volume(volume_of(np.pad(labels, 1))).at_border == 0
+    assert surface_of_volume(volume_of(np.pad(labels, 20))).at_border == 0
 
 
 def test_long_voxels_are_said() -> None:

@@ -32,6 +32,8 @@ _CLIP = 2.0
 _CLEAR = np.float32(0.05)
 # Shares of the smoothing that are tried where something thin would vanish.
 _FINER = (0.5, 0.25)
+# How often voxels that vanish are put back, with more around them each time.
+_ROUNDS = 3
 _FEWEST = 8
 _HALVINGS, _STEP = 20, 0.1
 _MOST_VOXELS = 1 << 27
@@ -174,7 +176,7 @@ def _cut_out(inside: BoolArray, margin: npt.NDArray[np.int_], name: str) -> tupl
 
 def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
     """Return how many voxels of `mask`, which begins at `corner` of a volume of that `shape`, are its outermost."""
-    inner = tuple(slice(1 - int(at), count - 1 - int(at)) for at, count in zip(corner, shape, strict=True))
+    inner = tuple(slice(max(1 - int(at), 0), count - 1 - int(at)) for at, count in zip(corner, shape, strict=True))
     return int(mask.sum() - mask[inner].sum())
 
 
@@ -239,12 +241,18 @@ def _smoothed(part: _Part, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Fi
     distance = _signed_distance(part.mask, voxel_mm)
     for share in (1.0, *_FINER):
         field = _freed(distance, share * sigma, part)
-        side = _without_edge_contacts(field > 0)
-        if part.kept == (1, 0):
-            side = _Part.of(side, keep_pieces=False).mask
-        counts = _components(side)[1], _components(~side)[1] - 1
-        if counts == part.kept and not _vanished(part.mask, side).any():
-            return _clear_of_middles(field, side), share
+        held = np.zeros_like(part.mask)
+        for _ in range(_ROUNDS):
+            side = _without_edge_contacts(field > 0)
+            if part.kept == (1, 0):
+                side = _Part.of(side, keep_pieces=False).mask
+            lost = _vanished(part.mask, side)
+            if not lost.any():
+                if (_components(side)[1], _components(~side)[1] - 1) == part.kept:
+                    return _clear_of_middles(field, side), share
+                break
+            held = _grown(held) | lost
+            field = np.where(held, _clear_of_middles(field, part.mask), field)
     return _clear_of_middles(_levelled(distance, _FINER[-1] * sigma, part.mask), part.mask), 0.0
 
 
