@@ -130,14 +130,15 @@ def test_nothing_that_is_labelled_vanishes_or_parts(smooth: float) -> None:
     assert (np.ptp(thin.vertices, axis=0) > (11.5, 11.5, 0.2)).all()
 
 
-def test_no_part_of_the_surface_is_farther_off_than_a_voxel() -> None:
+def test_no_part_of_the_surface_is_farther_from_the_border_of_the_labels_than_a_voxel_or_so() -> None:
     rng = np.random.default_rng(1)
-    labels = ndimage.gaussian_filter(rng.normal(size=(40, 40, 40)), 2.5) > 0.02
-    made = surface_of_volume(volume_of(labels), keep_pieces=True, smooth=3.0)
+    pieces, _ = ndimage.label(ndimage.gaussian_filter(rng.normal(size=(40, 40, 40)), 2.5) > 0.02)
+    labels = ndimage.binary_fill_holes(pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:]))
+    made = surface_of_volume(volume_of(labels), smooth=3.0)
     inside = np.pad(labels, 1)
     away = np.where(inside, ndimage.distance_transform_edt(inside), ndimage.distance_transform_edt(~inside))
     at = ndimage.map_coordinates(away, (made.mesh.vertices + 1).T, order=1, mode="nearest")
-    assert at.max() < 3
+    assert at.max() < 2.25 and np.quantile(at, 0.99) < 1.75  # the voxels at the border have 1
 
 
 def _two_balls() -> LabelVolume:
