@@ -15,14 +15,16 @@ if TYPE_CHECKING:
     from shapespace.fit.result import FitResult
     from shapespace.fit.robust_method import Robust
     from shapespace.geometry.distance import surface_distances
+    from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
+    from shapespace.io.volumes import read_volume
     from shapespace.model.additive import AdditiveModel
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
-    from shapespace.types import Mesh, Similarity
+    from shapespace.types import LabelVolume, Mesh, Similarity
 
 __all__ = [
     "CLASSIFIERS",
@@ -30,6 +32,7 @@ __all__ = [
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
+    "LabelVolume",
     "Mesh",
     "Paper",
     "Robust",
@@ -37,14 +40,17 @@ __all__ = [
     "ShapeSpace",
     "ShapespaceError",
     "Similarity",
+    "VolumeSurface",
     "__version__",
     "correspond",
     "fit_scan",
     "load_faces",
     "read_landmarks",
     "read_mesh",
+    "read_volume",
     "simulate_scan",
     "surface_distances",
+    "surface_of_volume",
     "train_classifier",
     "write_mesh",
 ]
@@ -55,6 +61,7 @@ _HOMES = {
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
+    "LabelVolume": "types",
     "Mesh": "types",
     "Paper": "fit.paper_method",
     "Robust": "fit.robust_method",
@@ -63,12 +70,15 @@ _HOMES = {
     "ShapespaceError": "errors",
     "Similarity": "types",
     "correspond": "correspondence.rounds",
+    "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
     "load_faces": "datasets.faces",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
+    "read_volume": "io.volumes",
     "simulate_scan": "datasets.simulated_scan",
     "surface_distances": "geometry.distance",
+    "surface_of_volume": "geometry.volume_surface",
     "train_classifier": "recognise.predict",
     "write_mesh": "io.meshes",
 }

@@ -1,4 +1,4 @@
-"""The plain data that travels between the parts: meshes and similarities.
+"""The plain data that travels between the parts: meshes, similarities and label volumes.
 
 Arrays are float64 and read-only. Lengths are millimetres, except the vertices of a scan as read from its file,
 which are in the file's own unit until the fit has found that unit.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -138,6 +138,43 @@ class Similarity:
     def __matmul__(self, other: Similarity) -> Similarity:
         """Compose: `T_c_b @ T_b_a` is `T_c_a`."""
         return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVolume:
+    """Labels in voxels, and where these lie in the patient.
+
+    Args:
+        labels: (X, Y, Z) whole numbers of any type, read-only; 0 is what has no label.
+        affine: (4, 4) float64 from the indices of a voxel to its middle in mm: right, anterior, superior (RAS).
+        name: where it came from, used in messages.
+        notes: sentences on what is worth knowing of the file.
+
+    Raises:
+        InputError: arrays of the wrong shape or type, or an affine that is singular or not finite.
+    """
+
+    labels: npt.NDArray[np.integer[Any]]
+    affine: FloatArray
+    name: str = "volume"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        labels, affine = np.asarray(self.labels).view(), read_only(self.affine)
+        if labels.ndim != 3 or not labels.size or labels.dtype.kind not in "iu":
+            raise InputError(
+                f"{self.name}: labels must be whole numbers of the shape (X, Y, Z), not {labels.dtype} {labels.shape}."
+            )
+        if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.linalg.det(affine[:3, :3]):
+            raise InputError(f"{self.name}: the affine must be a (4, 4) array of finite numbers that can be inverted.")
+        labels.setflags(write=False)
+        object.__setattr__(self, "labels", labels)
+        object.__setattr__(self, "affine", affine)
+
+    @property
+    def voxel_mm(self) -> FloatArray:
+        """(3,) the size of a voxel along each axis of `labels`, mm."""
+        return read_only(np.linalg.norm(self.affine[:3, :3], axis=0))
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:

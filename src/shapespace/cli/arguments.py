@@ -21,6 +21,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_data(commands)
+    _add_surface(commands)
     _add_check(commands)
     _add_correspond(commands)
     _add_build(commands)
@@ -87,6 +88,22 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--wide", action="store_true",
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
+
+
+def _add_surface(commands: Any) -> None:
+    sub = _add(commands, "surface", "surfaces of labels in volumes (NIfTI, NRRD), as PLY in RAS mm",
+               "shapespace surface masks -o surfaces --label 1\n"
+               "         shapespace fit model.h5 surfaces -o out --unit mm")  # fmt: skip
+    sub.add_argument("volumes", nargs="+", type=Path, metavar="MASK", help="label volumes, or folders of them")
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where NAME.ply is written")
+    _add_recursive(sub)
+    sub.add_argument("--label", type=_labels, metavar="N|N,N|all",
+                     help="what to take as one object (default: the only label there is)")  # fmt: skip
+    sub.add_argument("--smooth", type=_smoothing, default=1.3, metavar="S",
+                     help="standard deviation of the smoothing in voxels (default 1.3; 0: none)")  # fmt: skip
+    sub.add_argument("--keep-pieces", action="store_true",
+                     help="all pieces and cavities (default: the largest piece, cavities filled)")  # fmt: skip
+    sub.set_defaults(run=run.surface)
 
 
 def _add_check(commands: Any) -> None:
@@ -317,6 +334,28 @@ def _control_points(text: str) -> tuple[int, int]:
     if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
         raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
     return int(counts[0]), int(counts[1])
+
+
+def _smoothing(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 10:
+        raise argparse.ArgumentTypeError(f"must be a number from 0 to 10, not {text!r}")
+    return value
+
+
+def _labels(text: str) -> str | tuple[int, ...]:
+    if text == "all":
+        return text
+    try:
+        labels = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        labels = (0,)
+    if 0 in labels:
+        raise argparse.ArgumentTypeError(f"must be all, or whole numbers other than 0 such as 1 or 1,2, not {text!r}")
+    return labels
 
 
 def _modes(text: str) -> int | str:

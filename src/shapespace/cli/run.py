@@ -103,6 +103,48 @@ def data_faces(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def surface(arguments: argparse.Namespace) -> int:
+    """Surfaces of labels in volumes."""
+    from shapespace.commands.surface import write_surfaces
+
+    records = write_surfaces(
+        arguments.volumes,
+        arguments.output,
+        labels=arguments.label,
+        smooth=arguments.smooth,
+        keep_pieces=arguments.keep_pieces,
+        recursive=arguments.recursive,
+        quiet=arguments.quiet,
+        say=warn,
+    )
+    made = [record for record in records if "error" not in record]
+    if arguments.json:
+        show_json({"folder": str(arguments.output), "volumes": len(records), "surfaces": len(made), "records": records})
+    elif made:
+        _print_surfaces(made, len(records), arguments.output)
+    if not made:
+        return 2
+    return 1 if len(made) < len(records) else 0
+
+
+def _print_surfaces(made: Sequence[Mapping[str, Any]], volumes: int, folder: Path) -> None:
+    for record in made[:_LISTED]:
+        size = " x ".join(f"{mm:.3g}" for mm in record["voxel_mm"])
+        what = f"label{'s' if len(record['labels']) > 1 else ''} {', '.join(map(str, record['labels']))}"
+        show(
+            f"{record['name']}.ply: {record['triangles']:,} triangles around {record['volume_mm3']:.4g} mm3 of {what}, "
+            f"voxels of {size} mm"
+        )
+        for note in record["notes"]:
+            show(f"  {note}")
+    if len(made) > _LISTED:
+        show(f"and {len(made) - _LISTED} more")
+    for record in made[_LISTED:]:
+        for note in record["odd"]:
+            show(f"{record['name']}.ply: {note}")
+    show(f"{len(made)} of {volumes} {'volume' if volumes == 1 else 'volumes'} to surfaces in {folder}: RAS, mm")
+
+
 def check(arguments: argparse.Namespace) -> int:
     """What is in each mesh, and what fitting will do about it."""
     from shapespace.commands.look import check

@@ -1,4 +1,4 @@
-"""Meshes in files and folders: which are taken, and what is left out, in words."""
+"""Meshes and other files in folders: which are taken, and what is left out, in words."""
 
 from __future__ import annotations
 
@@ -28,19 +28,29 @@ class MeshFiles:
 
 @dataclass
 class _Found:
+    endings: tuple[str, ...]
     files: list[Path] = field(default_factory=list[Path])
     folders: list[str] = field(default_factory=list[str])
     linked: list[str] = field(default_factory=list[str])
     broken: list[str] = field(default_factory=list[str])
 
 
-def mesh_files(paths: Sequence[Path], *, recursive: bool = False, apart_from: Path | None = None) -> MeshFiles:
-    """Return `paths` with each folder replaced by the meshes in it.
+def mesh_files(
+    paths: Sequence[Path],
+    *,
+    recursive: bool = False,
+    apart_from: Path | None = None,
+    endings: Sequence[str] = MESH_ENDINGS,
+    what: str = "meshes",
+) -> MeshFiles:
+    """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
 
     Args:
         paths: files, taken as they are, and folders.
         recursive: whether to take what lies in folders below these too. Links to folders are not followed.
         apart_from: a folder below that is not looked into, such as that of the results.
+        endings: of the files to take, in small letters.
+        what: they are called.
 
     Raises:
         InputError: a folder without meshes.
@@ -52,13 +62,13 @@ def mesh_files(paths: Sequence[Path], *, recursive: bool = False, apart_from: Pa
         if not _is_folder(path):
             files.append(path)
             continue
-        found = _Found()
+        found = _Found(tuple(endings))
         _look_into(path, path, found, recursive, None if apart_from is None else apart_from.resolve())
         if not found.files:
             below = "; give --recursive for what lies in the folders below it" if found.folders else ""
-            raise InputError(f"{path} holds no meshes{below}; shapespace reads {', '.join(MESH_ENDINGS)}.")
+            raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(endings)}.")
         files += found.files
-        left_out += _sentences(path, found)
+        left_out += _sentences(path, found, what)
     return MeshFiles(tuple(files), tuple(left_out))
 
 
@@ -74,7 +84,7 @@ def _look_into(folder: Path, top: Path, found: _Found, recursive: bool, apart_fr
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
         for path in inside:
             name = path.relative_to(top).as_posix()
-            mesh = path.suffix.lower() in MESH_ENDINGS
+            of_kind = path.name.lower().endswith(found.endings)
             if path.is_dir():
                 if path.resolve() == apart_from:
                     continue
@@ -84,17 +94,17 @@ def _look_into(folder: Path, top: Path, found: _Found, recursive: bool, apart_fr
                     found.linked.append(name)
                 else:
                     _look_into(path, top, found, recursive, apart_from)
-            elif mesh and path.is_file():
+            elif of_kind and path.is_file():
                 found.files.append(path)
-            elif path.is_symlink() and not path.exists() and (mesh or not path.suffix):
+            elif path.is_symlink() and not path.exists() and (of_kind or not path.suffix):
                 found.broken.append(name)
     except OSError as error:
         raise read_error(folder, error) from error
 
 
-def _sentences(folder: Path, found: _Found) -> Iterator[str]:
+def _sentences(folder: Path, found: _Found, kind: str) -> Iterator[str]:
     for names, one, several, done, advice in (
-        (found.folders, "folder", "folders", "looked into", "--recursive takes the meshes there"),
+        (found.folders, "folder", "folders", "looked into", f"--recursive takes the {kind} there"),
         (found.linked, "link to a folder", "links to folders", "followed", "give that folder too"),
         (found.broken, "broken link", "broken links", "taken", "mend or remove it"),
     ):

@@ -1,0 +1,139 @@
+"""What `surface` does: label volumes in files to surfaces in files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from shapespace.batch.folder import names_for
+from shapespace.batch.progress import progress
+from shapespace.batch.run import naming
+from shapespace.errors import ShapespaceError
+from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
+from shapespace.io.files import make_folder, remove_file
+from shapespace.io.folders import mesh_files
+from shapespace.io.meshes import write_mesh
+from shapespace.io.volumes import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
+
+_MANY = 4
+_OTHER_SIZE = 0.02
+_OTHER_VOLUME = 4.0
+
+
+def write_surfaces(
+    paths: Sequence[Path],
+    folder: Path,
+    *,
+    labels: int | Sequence[int] | Literal["all"] | None = None,
+    smooth: float = SMOOTH,
+    keep_pieces: bool = False,
+    recursive: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """Write the surface of each volume as NAME.ply into `folder`, RAS in mm, and return the facts of each, in order.
+
+    A volume that cannot be used has an `error`, and the others go on.
+
+    Args:
+        paths: label volumes, and folders of them.
+        folder: where surfaces go.
+        labels: as for `surface_of_volume`.
+        smooth: as for `surface_of_volume`.
+        keep_pieces: as for `surface_of_volume`.
+        recursive: take volumes in folders below those given too.
+        quiet: no progress.
+        say: told what was not taken, and which volumes cannot be used.
+
+    Raises:
+        ShapespaceError: the extra `volumes` is not installed.
+        FileError: the folder cannot be written.
+        InputError: a folder without volumes.
+    """
+    require_volumes_extra()
+    found = mesh_files(paths, recursive=recursive, apart_from=folder, endings=VOLUME_ENDINGS, what="volumes")
+    for sentence in found.left_out:
+        say(sentence)
+    make_folder(folder)
+    files = list({path.resolve(): path for path in found.files}.values())
+    records: list[dict[str, Any]] = []
+    with progress(len(files), "making", "surface", quiet=quiet) as bar:
+        for path, name in zip(files, _names(files), strict=True):
+            target = folder / f"{name}.ply"
+            facts: dict[str, Any] = {"name": name, "volume": str(path)}
+            try:
+                made = surface_of_volume(read_volume(path), labels, smooth=smooth, keep_pieces=keep_pieces)
+            except (ShapespaceError, MemoryError) as error:
+                short = f"{path}: there is not enough memory for it; crop it or resample it."
+                reason = short if isinstance(error, MemoryError) else naming(path, str(error))
+                # A surface of an earlier run would contradict what is said.
+                remove_file(target)
+                bar.clear()
+                say(reason)
+                records.append({**facts, "error": reason})
+            else:
+                write_mesh(target, made.mesh)
+                records.append({**facts, "surface": str(target), **_facts(made)})
+            bar.update()
+    _name_the_odd([record for record in records if "error" not in record])
+    return records
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return NAME of the surface of each volume; those of one folder that differ in their ending alone keep it."""
+    bare = [path.with_name(volume_name(path)) for path in files]
+    times = Counter(bare)
+    alone = [short if times[short] == 1 else path for path, short in zip(files, bare, strict=True)]
+    # What stands after the last dot would not be part of a name.
+    return names_for([path.with_name(f"{path.name}.volume") for path in alone])
+
+
+def _facts(made: VolumeSurface) -> dict[str, Any]:
+    faces = made.mesh.faces
+    return {
+        "frame": "RAS",
+        "unit": "mm",
+        "labels": list(made.labels),
+        "voxel_mm": made.voxel_mm.tolist(),
+        "voxels": made.voxels,
+        "pieces": made.pieces,
+        "left_out_voxels": made.left_out,
+        "filled_voxels": made.filled,
+        "border_voxels": made.at_border,
+        "vertices": len(made.mesh.vertices),
+        "triangles": 0 if faces is None else len(faces),
+        "volume_mm3": made.volume_mm3,
+        "bounds_mm": [made.mesh.vertices.min(axis=0).tolist(), made.mesh.vertices.max(axis=0).tolist()],
+        "notes": list(made.notes),
+        "odd": [],
+    }
+
+
+def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
+    """Say of each surface whether it is an earlier one again, of other voxels than most, or of quite another size."""
+    first: dict[Any, str] = {}
+    for record in records:
+        earlier = first.setdefault((record["vertices"], record["volume_mm3"], *record["bounds_mm"][0]), record["name"])
+        if earlier != record["name"]:
+            _add(record, f"It is the same surface as {earlier}.ply.")
+    if len(records) < _MANY:
+        return
+    middle = float(np.median([record["volume_mm3"] for record in records]))
+    usual = np.median(np.array([record["voxel_mm"] for record in records]), axis=0)
+    others = [bool((np.abs(np.array(record["voxel_mm"]) / usual - 1) > _OTHER_SIZE).any()) for record in records]
+    told = " x ".join(f"{mm:.3g}" for mm in usual)
+    for record, other in zip(records, others, strict=True):
+        if other and sum(others) < len(others) / 2:
+            _add(record, f"Most of the others have voxels of {told} mm.")
+        ratio = float(record["volume_mm3"]) / middle
+        if not 1 / _OTHER_VOLUME < ratio < _OTHER_VOLUME:
+            _add(record, f"Its volume is {ratio:.2g} times that in the middle of all.")
+
+
+def _add(record: dict[str, Any], note: str) -> None:
+    record["odd"].append(note)
+    record["notes"].append(note)

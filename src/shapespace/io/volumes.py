@@ -1,0 +1,388 @@
+"""Label volumes in: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS millimetres.
+
+nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
+holds, and a compressed stream that grows without end, are refused before memory is taken. No other file is opened.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import math
+import zlib
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.io.files import read_bytes, read_error
+from shapespace.io.parsing import CUT_SHORT, damaged
+from shapespace.types import FloatArray, LabelVolume
+
+VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
+"""The endings that `read_volume` takes."""
+
+_MOST_BYTES = 1 << 31
+_MOST_HEADER = 1 << 20
+# No deflate stream grows by more than 1032 to 1.
+_MOST_GROWTH = 1032
+_HEADS = {348: "Nifti1Header", 540: "Nifti2Header"}
+_SINGLE, _PAIR = (b"n+1", b"n+2"), (b"ni1", b"ni2")
+_MAGIC_AT = {348: 344, 540: 4}
+_NIFTI_MM = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
+_NRRD_MM = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "m": 1e3, "meter": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+_NRRD_TYPES = {
+    "i1": ("signed char", "int8", "int8_t"),
+    "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
+    "i2": ("short", "short int", "signed short", "signed short int", "int16", "int16_t"),
+    "u2": ("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"),
+    "i4": ("int", "signed int", "int32", "int32_t"),
+    "u4": ("uint", "unsigned int", "uint32", "uint32_t"),
+    "i8": ("longlong", "long long", "long long int", "signed long long", "signed long long int", "int64", "int64_t"),
+    "u8": ("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"),
+    "f4": ("float",),
+    "f8": ("double",),
+}
+# Sign of each axis of a space that takes it to right, anterior, superior.
+_NRRD_SPACES = {
+    "right-anterior-superior": (1, 1, 1), "ras": (1, 1, 1),
+    "left-anterior-superior": (-1, 1, 1), "las": (-1, 1, 1),
+    "left-posterior-superior": (-1, -1, 1), "lps": (-1, -1, 1),
+}  # fmt: skip
+_UNORIENTED = "Its header does not say how it lies in the patient, so that left and right may be swapped."
+_LEAST_MM, _MOST_MM = 1e-4, 1e3
+_FLAT = 1e-4
+_APART_MM = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """What a header declares.
+
+    Args:
+        shape: of the voxels, in the order of the file, which runs along the first axis first.
+        kind: of a voxel.
+        start: bytes before the first voxel.
+        affine: (4, 4) from voxels to RAS mm.
+        slope: what a value in the file is multiplied with.
+        shift: what is then added.
+        notes: what is worth saying.
+        axes: which of the axes are those of space.
+    """
+
+    shape: tuple[int, ...]
+    kind: np.dtype[Any]
+    start: int
+    affine: FloatArray
+    slope: float = 1.0
+    shift: float = 0.0
+    notes: tuple[str, ...] = ()
+    axes: tuple[int, ...] = (0, 1, 2)
+
+    @property
+    def bytes(self) -> int:
+        return math.prod(self.shape) * self.kind.itemsize
+
+
+def require_volumes_extra() -> None:
+    """Check that what volumes need is there.
+
+    Raises:
+        ShapespaceError: the extra `volumes` is not installed.
+    """
+    packages = {"nibabel": "nibabel", "nrrd": "pynrrd", "skimage": "scikit-image"}
+    missing = [package for module, package in packages.items() if find_spec(module) is None]
+    if missing:
+        raise ShapespaceError(
+            f"Volumes need {' and '.join(missing)}, which is not installed; run pip install 'shapespace[volumes]'."
+        )
+
+
+def volume_name(path: Path) -> str:
+    """Return the name of the file without its ending, of which `.nii.gz` and `.seg.nrrd` have two parts."""
+    for ending in (*sorted(VOLUME_ENDINGS, key=len, reverse=True), ".seg"):
+        if path.name.lower().endswith(ending) and len(path.name) > len(ending):
+            path = path.with_name(path.name[: -len(ending)])
+    return path.name
+
+
+def read_volume(path: Path | str) -> LabelVolume:
+    """Read a label volume and where its voxels lie in the patient.
+
+    Args:
+        path: a file with one of the endings in `VOLUME_ENDINGS`, in any case.
+
+    Returns:
+        Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
+        directions and origin, with LPS and LAS turned to RAS, and units to millimetres.
+
+    Raises:
+        ShapespaceError: the extra `volumes` is not installed.
+        FileError: it does not exist, cannot be read, or is too large.
+        FileFormatError: it is no such volume, cut short or damaged, or declares more than it holds.
+        InputError: it is not one volume of labels in a space of three dimensions.
+    """
+    path = Path(path)
+    require_volumes_extra()
+    name = path.name.lower()
+    if name.endswith((".nhdr", ".hdr", ".img")):
+        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
+    if not name.endswith(VOLUME_ENDINGS):
+        raise damaged(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
+    data = _bounded(path)
+    values, head = _read_nrrd(data, path) if name.endswith(".nrrd") else _read_nifti(data, path)
+    affine = _sound(head.affine, path)
+    return LabelVolume(_whole(_three(values, head.axes, path), path), affine, path.name, head.notes)
+
+
+def _bounded(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise read_error(path, error) from error
+    if size > _MOST_BYTES + _MOST_HEADER:
+        raise FileError(f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it.")
+    data = read_bytes(path)
+    if not data:
+        raise damaged(path, "it is empty; export or copy it again")
+    return data
+
+
+def _read_nifti(data: bytes, path: Path) -> tuple[npt.NDArray[Any], _Head]:
+    zipped = data[:2] == b"\x1f\x8b"
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) if zipped else io.BytesIO(data) as stream:
+        start = _taken(stream, 540, path)
+        head = _nifti_head(start, path)
+        _check_declared(head, len(data), _MOST_GROWTH if zipped else 1, path)
+        rest = _taken(stream, head.start + head.bytes - len(start), path)
+        # The checksum of a stream is only looked at where it ends.
+        _taken(stream, 1, path)
+    content = memoryview(start + rest)[head.start :]
+    values = _voxels(content, head, path)
+    if (head.slope, head.shift) != (1.0, 0.0):
+        values = values * head.slope + head.shift
+    return values, head
+
+
+def _taken(stream: Any, count: int, path: Path) -> bytes:
+    try:
+        return cast(bytes, stream.read(max(count, 0)))
+    except (OSError, EOFError, zlib.error) as error:
+        raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+
+
+def _nifti_head(start: bytes, path: Path) -> _Head:
+    import nibabel
+
+    size = next((n for n in _HEADS for order in ("<", ">") if start[:4] == np.array(n, order + "i4").tobytes()), 0)
+    magic = start[_MAGIC_AT[size] :][:3] if size else b""
+    if magic in _PAIR:
+        raise damaged(path, "its header and its data are two files; save it as one, .nii.gz")
+    if magic not in _SINGLE or len(start) < size:
+        raise damaged(path, "its header is not that of a NIfTI volume; export it again as .nii.gz")
+    try:
+        header: Any = getattr(nibabel, _HEADS[size]).from_fileobj(io.BytesIO(start[:size]), check=False)
+        slope, shift = header.get_slope_inter()
+        kind, shape = np.dtype(header.get_data_dtype()), tuple(map(int, header.get_data_shape()))
+        offset = int(header.get_data_offset())
+        affine, notes = _nifti_affine(header)
+        unit = str(header.get_xyzt_units()[0])
+    except Exception as error:
+        # What nibabel raises of a header that was tampered with is of any kind.
+        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+    if unit not in _NIFTI_MM:
+        raise damaged(path, f"its header gives lengths in '{unit}', so export it again in mm")
+    if offset < size:
+        raise damaged(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
+    slope, shift = (1.0, 0.0) if slope is None else (float(slope), float(shift or 0.0))
+    return _Head(shape, kind, offset, _in_mm(affine, _NIFTI_MM[unit]), slope, shift, notes)
+
+
+def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
+    form, code = header.get_sform(coded=True)
+    other, other_code = header.get_qform(coded=True) if not code else _quiet_qform(header)
+    if not code and not other_code:
+        return np.array(header.get_base_affine(), dtype=np.float64), (_UNORIENTED,)
+    if not code:
+        return np.array(other, dtype=np.float64), ()
+    affine = np.array(form, dtype=np.float64)
+    notes: tuple[str, ...] = ()
+    if other_code and other is not None:
+        ends = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
+        apart = float(np.abs(ends @ (affine - np.asarray(other)).T).max())
+        if apart > _APART_MM:
+            notes = (f"Its header says in two ways where it lies, up to {apart:.3g} mm apart; the sform is taken.",)
+    return affine, notes
+
+
+def _quiet_qform(header: Any) -> tuple[Any, int]:
+    try:
+        return header.get_qform(coded=True)
+    except Exception:  # the sform is taken, so that a bad qform does no harm
+        return None, 0
+
+
+def _read_nrrd(data: bytes, path: Path) -> tuple[npt.NDArray[Any], _Head]:
+    import nrrd
+
+    if data[:4] != b"NRRD":
+        raise damaged(path, "its header is not that of a NRRD volume; export it again as .nrrd")
+    ends = [(at, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (at := data.find(blank, 0, _MOST_HEADER)) >= 0]
+    if not ends:
+        raise damaged(path, f"its header has no end; {CUT_SHORT}")
+    stop, blank = min(ends)
+    try:
+        fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[: stop + blank])))
+    except Exception as error:
+        # What pynrrd raises of a header that was tampered with is of any kind.
+        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+    if "data file" in fields or "datafile" in fields:
+        raise damaged(path, "its data are in another file; save it with header and data in one")
+    if any(fields.get(key) for key in ("line skip", "lineskip", "byte skip", "byteskip")):
+        raise damaged(path, "its header skips a part of the data, which is not read; save it again")
+    head = _nrrd_head(fields, path)
+    encoding = str(fields.get("encoding", "")).lower()
+    content = memoryview(data)[stop + blank :]
+    if encoding == "raw":
+        _check_declared(head, len(content), 1, path)
+    elif encoding in ("gzip", "gz"):
+        _check_declared(head, len(content), _MOST_GROWTH, path)
+        with gzip.GzipFile(fileobj=io.BytesIO(content)) as stream:
+            content = memoryview(_taken(stream, head.bytes, path))
+            _taken(stream, 1, path)
+    elif encoding in ("bzip2", "bz2"):
+        _check_declared(head, _MOST_BYTES, 1, path)
+        with bz2.BZ2File(io.BytesIO(content)) as stream:
+            content = memoryview(_taken(stream, head.bytes, path))
+            _taken(stream, 1, path)
+    else:
+        raise damaged(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
+    return _voxels(content, head, path), head
+
+
+def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
+    kinds = {name: code for code, names in _NRRD_TYPES.items() for name in names}
+    code = kinds.get(str(fields.get("type", "")).lower())
+    if code is None:
+        raise damaged(
+            path, f"its voxels are of the type '{fields.get('type')}', which holds no labels; export it again"
+        )
+    order = str(fields.get("endian", "little")).lower()
+    if order not in ("little", "big"):
+        raise damaged(path, f"its header says endian '{order[:40]}', so export it again")
+    try:
+        shape = tuple(int(n) for n in fields["sizes"])
+        if len(shape) != int(fields["dimension"]):
+            raise ValueError("sizes and dimension disagree")
+        affine, notes, axes = _nrrd_affine(fields, path)
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
+    kind = np.dtype(code).newbyteorder("<" if order == "little" else ">")
+    return _Head(shape, kind, 0, affine, notes=notes, axes=axes)
+
+
+def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
+    """Return the affine, what is worth saying, and which of the axes are those of space."""
+    directions, space = fields.get("space directions"), str(fields.get("space", "")).lower()
+    if directions is None:
+        if fields.get("spacings") is None:
+            raise InputError(f"{path}: its header does not say how large a voxel is; export it again with spacings.")
+        spacings = np.asarray(fields["spacings"], dtype=np.float64)
+        axes = tuple(map(int, np.flatnonzero(~np.isnan(spacings))))
+        return _affine(np.diag(spacings[list(axes[:3])]), np.zeros(3)), (_UNORIENTED,), axes
+    given = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
+    rows = {axis: row for axis, row in enumerate(given) if row is not None and not np.isnan(row).all()}
+    if len(rows) != 3 or any(row.shape != (3,) for row in rows.values()):
+        raise InputError(f"{path}: it does not lie in a space of three dimensions; save one volume of labels as LPS.")
+    signs = _NRRD_SPACES.get(space)
+    if signs is None and space not in ("", "3d-right-handed", "scanner-xyz"):
+        raise InputError(f"{path}: its space is '{space[:60]}', which is not known; save it as LPS or RAS.")
+    units = {str(unit).strip('" ').lower() for unit in fields.get("space units") or ("mm",)}
+    if len(units) != 1 or (unit := units.pop()) not in _NRRD_MM:
+        raise InputError(f"{path}: its space units are not one of mm, cm, m and um; save it in mm.")
+    origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=np.float64).reshape(3)
+    turn = np.diag(np.array(signs or (1, 1, 1), dtype=np.float64))
+    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), _NRRD_MM[unit])
+    return affine, () if signs else (_UNORIENTED,), tuple(rows)
+
+
+def _affine(steps: FloatArray, origin: FloatArray) -> FloatArray:
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = steps, origin
+    return affine
+
+
+def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
+    return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
+
+
+def _check_declared(head: _Head, available: int, growth: int, path: Path) -> None:
+    size = " x ".join(map(str, head.shape)) or "no"
+    if head.kind.kind not in "iuf":
+        raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
+    if not head.shape or min(head.shape) < 1:
+        raise damaged(path, f"its header declares {size} voxels, so that there are none; export it again")
+    if head.bytes > _MOST_BYTES:
+        raise damaged(
+            path, f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it"
+        )
+    if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > growth * available:
+        raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
+
+
+def _voxels(content: memoryview, head: _Head, path: Path) -> npt.NDArray[Any]:
+    if len(content) < head.bytes:
+        raise damaged(path, f"it ends after {len(content):,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}")
+    return np.frombuffer(content[: head.bytes], dtype=head.kind).reshape(head.shape, order="F")
+
+
+def _three(values: npt.NDArray[Any], axes: tuple[int, ...], path: Path) -> npt.NDArray[Any]:
+    """Return `values` with the `axes` of space alone, where all others have the length 1."""
+    size = " x ".join(map(str, values.shape))
+    if values.ndim < 3 or len(axes) != 3:
+        raise InputError(f"{path} has {values.ndim} dimensions ({size}), which is no volume; give one of labels.")
+    if math.prod(values.shape) != math.prod(values.shape[axis] for axis in axes):
+        raise InputError(f"{path} has {values.ndim} dimensions ({size}), more than one volume; give one of labels.")
+    return values.reshape([values.shape[axis] for axis in axes], order="F")
+
+
+def _whole(values: npt.NDArray[Any], path: Path) -> npt.NDArray[np.integer[Any]]:
+    if values.dtype.kind in "iu":
+        return values.astype(values.dtype.newbyteorder("="), copy=False)
+    low, high = float(values.min()), float(values.max())
+    if not math.isfinite(low) or not math.isfinite(high):
+        raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
+    if not (values == np.rint(values)).all() or max(-low, high) >= 2**31:
+        raise InputError(
+            f"{path} has values between {low:.4g} and {high:.4g} that are not whole numbers, such as probabilities; "
+            "make labels of them first, by a threshold say."
+        )
+    return values.astype(np.int32)
+
+
+def _sound(affine: FloatArray, path: Path) -> FloatArray:
+    steps = affine[:3, :3]
+    wrong = ""
+    if not np.isfinite(affine).all():
+        wrong = "has numbers that are not finite"
+    else:
+        lengths = np.linalg.norm(steps, axis=0)
+        told = " x ".join(f"{length:.3g}" for length in lengths)
+        if not lengths.all() or abs(np.linalg.det(steps / lengths)) < _FLAT:
+            wrong = "is singular, so that voxels have no volume"
+        elif lengths.min() < _LEAST_MM or lengths.max() > _MOST_MM:
+            wrong = f"gives voxels of {told} mm"
+    if wrong:
+        raise InputError(f"{path}: its affine {wrong}; export it again with voxel sizes and directions.")
+    return affine
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).rstrip(".").split())[:80] or type(error).__name__

@@ -1,0 +1,295 @@
+"""Volumes are read as labels in RAS millimetres, and what is no sound volume is refused in one sentence."""
+
+import bz2
+import gzip
+import struct
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
+from shapespace.io.volumes import read_volume, volume_name
+from shapespace.types import LabelVolume
+
+nib = pytest.importorskip("nibabel", reason="the extra `volumes` is not installed")
+nrrd = pytest.importorskip("nrrd", reason="the extra `volumes` is not installed")
+
+LABELS = np.random.default_rng(0).integers(0, 4, (5, 6, 7))
+TILTED = np.array([[0.0, -0.9, 0.1, 10], [1.1, 0.0, 0, -20], [0.0, 0.1, 2.5, 30], [0, 0, 0, 1]])
+
+
+def write_nifti(path: Path, labels: Any = LABELS, affine: Any = TILTED, *, kind: Any = np.uint8, two: bool = False,
+                change: Callable[[Any], None] = lambda header: None) -> Path:  # fmt: skip
+    image = (nib.Nifti2Image if two else nib.Nifti1Image)(np.asarray(labels, dtype=kind), affine)
+    change(image.header)
+    nib.save(image, path)
+    return path
+
+
+def write_nrrd(path: Path, labels: Any = LABELS, **header: Any) -> Path:
+    fields = {"space": "left-posterior-superior", "space directions": np.eye(3), "space origin": np.zeros(3)}
+    fields = {key: value for key, value in {**fields, **header}.items() if value is not None}
+    nrrd.write(str(path), np.asarray(labels).astype(np.uint8), fields, index_order="F")
+    return path
+
+
+def patched(path: Path, at: int, content: bytes) -> Path:
+    data = path.read_bytes()
+    path.write_bytes(data[:at] + content + data[at + len(content) :])
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "A.NII.GZ"])
+@pytest.mark.parametrize("two", [False, True])
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int32, np.float32, np.float64, np.uint16, ">i2"])
+def test_nifti_labels_and_affine_are_those_written(name: str, two: bool, kind: Any, tmp_path: Path) -> None:
+    volume = read_volume(write_nifti(tmp_path / name, kind=kind, two=two))
+    assert (volume.labels == LABELS).all() and volume.labels.dtype.kind in "iu"
+    assert np.allclose(volume.affine, TILTED, atol=1e-6)
+    assert volume.notes == () and not volume.labels.flags.writeable
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2"])
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.uint32, np.int64, np.float64])
+def test_nrrd_labels_are_those_written(encoding: str, kind: Any, tmp_path: Path) -> None:
+    fields = {"space": "RAS", "space directions": TILTED[:3, :3].T, "space origin": TILTED[:3, 3]}
+    nrrd.write(str(tmp_path / "a.nrrd"), LABELS.astype(kind), {**fields, "encoding": encoding}, index_order="F")
+    volume = read_volume(tmp_path / "a.nrrd")
+    assert (volume.labels == LABELS).all()
+    assert np.allclose(volume.affine, TILTED)
+
+
+@pytest.mark.parametrize(
+    ("space", "signs"),
+    [("left-posterior-superior", (-1, -1, 1)), ("LPS", (-1, -1, 1)), ("left-anterior-superior", (-1, 1, 1)),
+     ("RAS", (1, 1, 1))],
+)  # fmt: skip
+def test_nrrd_of_any_patient_space_is_turned_to_ras(space: str, signs: tuple[int, ...], tmp_path: Path) -> None:
+    directions, origin = TILTED[:3, :3].T, np.array([1.0, 2, 3])
+    path = write_nrrd(tmp_path / "a.nrrd", space=space, **{"space directions": directions, "space origin": origin})
+    volume = read_volume(path)
+    assert np.allclose(volume.affine[:3, :3], np.diag(signs) @ TILTED[:3, :3])
+    assert np.allclose(volume.affine[:3, 3], np.array(signs) * origin)
+
+
+def test_both_formats_put_one_volume_in_one_place(tmp_path: Path) -> None:
+    lps = np.diag([-1.0, -1, 1, 1]) @ TILTED
+    path = write_nrrd(tmp_path / "a.nrrd", **{"space directions": lps[:3, :3].T, "space origin": lps[:3, 3]})
+    assert np.allclose(read_volume(path).affine, read_volume(write_nifti(tmp_path / "a.nii")).affine, atol=1e-6)
+
+
+def test_units_other_than_millimetres_are_turned_to_them(tmp_path: Path) -> None:
+    metres = write_nifti(
+        tmp_path / "m.nii", affine=np.diag([1e-3, 1e-3, 2e-3, 1]), change=lambda h: h.set_xyzt_units(1)
+    )
+    assert np.allclose(read_volume(metres).voxel_mm, (1, 1, 2))
+    cm = write_nrrd(tmp_path / "cm.nrrd", **{"space units": ["cm", "cm", "cm"]})
+    assert np.allclose(read_volume(cm).voxel_mm, 10)
+
+
+def test_the_qform_counts_where_there_is_no_sform(tmp_path: Path) -> None:
+    path = write_nifti(tmp_path / "a.nii", affine=None, change=lambda h: h.set_qform(np.diag([2.0, 2, 3, 1]), 1))
+    volume = read_volume(path)
+    assert np.allclose(volume.affine, np.diag([2, 2, 3, 1])) and volume.notes == ()
+
+
+def test_that_a_header_says_nothing_of_the_patient_is_noted(tmp_path: Path) -> None:
+    def neither(header: Any) -> None:
+        header.set_qform(None, 0)
+        header.set_sform(None, 0)
+
+    nifti = write_nifti(tmp_path / "a.nii", affine=None, change=neither)
+    for path in (nifti, write_nrrd(tmp_path / "a.nrrd", space=None, **{"space dimension": 3})):
+        (note,) = read_volume(path).notes
+        assert "left and right may be swapped" in note
+    spacings = write_nrrd(tmp_path / "b.nrrd", **dict.fromkeys(("space", "space directions", "space origin")),
+                          spacings=[1, 2, 3])  # fmt: skip
+    assert np.allclose(read_volume(spacings).voxel_mm, (1, 2, 3)) and read_volume(spacings).notes
+
+
+def test_two_places_in_one_header_are_noted(tmp_path: Path) -> None:
+    path = write_nifti(tmp_path / "a.nii", change=lambda h: h.set_qform(np.diag([1, 1, 1, 1.0]), 1))
+    assert "in two ways" in read_volume(path).notes[0]
+    assert np.allclose(read_volume(path).affine, TILTED)
+
+
+def test_scaled_labels_are_what_the_header_makes_of_them(tmp_path: Path) -> None:
+    path = write_nifti(tmp_path / "a.nii")
+    data = bytearray(path.read_bytes())
+    data[112:120] = struct.pack("<2f", 2.0, 1.0)
+    path.write_bytes(data)
+    assert (read_volume(path).labels == 2 * LABELS + 1).all()
+
+
+def test_axes_of_length_one_beyond_space_do_no_harm(tmp_path: Path) -> None:
+    assert read_volume(write_nifti(tmp_path / "a.nii", LABELS[..., None])).labels.shape == LABELS.shape
+    directions = np.vstack([np.full(3, np.nan), np.eye(3)])
+    path = write_nrrd(tmp_path / "a.nrrd", LABELS[None], **{"space directions": directions})
+    assert (read_volume(path).labels == LABELS).all()
+
+
+def _affine_of(value: float, at: tuple[int, int]) -> Any:
+    affine = np.eye(4)
+    affine[at] = value
+    return affine
+
+
+def _placed(path: Path, affine: Any) -> Path:
+    """Return the file with the first rows of `affine` as its sform, whatever they are."""
+    return patched(write_nifti(path), 280, np.asarray(affine, dtype="<f4")[:3].tobytes())
+
+
+FLAT = np.array([[1, 1, 0, 0], [1, 1 + 1e-6, 0, 0], [0, 0, 1, 0]])
+BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "no file": (lambda d: d / "a.nii.gz", "no such file"),
+    "empty file": (lambda d: _put(d / "a.nii", b""), "it is empty"),
+    "text": (lambda d: _put(d / "a.nii", b"Dear reader, this is no volume." * 20), "not that of a NIfTI"),
+    "text as nrrd": (lambda d: _put(d / "a.nrrd", b"Dear reader, this is no volume." * 20), "not that of a NRRD"),
+    "other ending": (lambda d: _put(d / "a.mha", b"x"), ".nii.gz"),
+    "cut short": (lambda d: _cut(write_nifti(d / "a.nii")), "than the file can hold"),
+    "cut short, gz": (lambda d: _cut(write_nifti(d / "a.nii.gz", np.arange(8000).reshape(20, 20, 20) % 251)),
+                      "end early"),
+    "cut in the header": (lambda d: _put(d / "a.nii", write_nifti(d / "b.nii").read_bytes()[:200]), "of a NIfTI"),
+    "cut short, nrrd": (lambda d: _cut(write_nrrd(d / "a.nrrd", encoding="raw")), "more than the file can hold"),
+    "cut short, nrrd gz": (lambda d: _cut(write_nrrd(d / "a.nrrd")), "cut short"),
+    "nrrd header alone": (lambda d: _put(d / "a.nrrd", b"NRRD0004\ntype: uchar\n"), "no end"),
+    "checksum": (lambda d: _flip(write_nifti(d / "a.nii.gz"), -6), "or are wrong"),
+    "header and data apart": (lambda d: patched(write_nifti(d / "a.nii"), 344, b"ni1\0"), "two files"),
+    "ending of a header": (lambda d: _put(d / "a.nhdr", b"NRRD0004\n\n"), "two files"),
+    "data in another file": (
+        lambda d: _put(d / "a.nrrd", b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n"
+                       b"spacings: 1 1 1\ndata file: /etc/hostname\n\n"), "in another file"),
+    "ascii nrrd": (lambda d: write_nrrd(d / "a.nrrd", encoding="ascii"), "only raw, gzip and bzip2"),
+    "unknown space": (lambda d: write_nrrd(d / "a.nrrd", space="scanner-xyz-time", **{"space directions": np.eye(3)}),
+                      "not known"),
+    "unknown unit": (lambda d: write_nrrd(d / "a.nrrd", **{"space units": ["ell", "ell", "ell"]}), "space units"),
+    "four dimensions": (lambda d: write_nifti(d / "a.nii", np.stack([LABELS] * 2, -1)), "more than one volume"),
+    "two dimensions": (lambda d: write_nifti(d / "a.nii", LABELS[0]), "no volume"),
+    "probabilities": (lambda d: write_nifti(d / "a.nii", LABELS / 3, kind=np.float32), "not whole numbers"),
+    "not finite": (lambda d: write_nifti(d / "a.nii", np.where(LABELS, np.nan, 0), kind=np.float32), "not finite"),
+    "complex": (lambda d: write_nifti(d / "a.nii", kind=np.complex64), "colours or complex"),
+    "zero affine": (lambda d: _placed(d / "a.nii", np.zeros((4, 4))), "singular"),
+    "singular affine": (lambda d: _placed(d / "a.nii", np.diag([1.0, 1, 0, 1])), "singular"),
+    "flat affine": (lambda d: _placed(d / "a.nii", FLAT), "singular"),
+    "NaN affine": (lambda d: _placed(d / "a.nii", _affine_of(np.nan, (1, 3))), "not finite"),
+    "infinite affine": (lambda d: _placed(d / "a.nii", _affine_of(np.inf, (0, 0))), "not finite"),
+    "absurd voxels": (lambda d: _placed(d / "a.nii", np.diag([1e9, 1e9, 1e9, 1])), "voxels of 1e+09"),
+    "huge, gz": (lambda d: _put(d / "a.nii.gz", gzip.compress(_huge(30000))), "over the bound"),
+    "huge": (lambda d: _put(d / "a.nii", _huge(30000)), "over the bound"),
+    "more than it can hold": (lambda d: _put(d / "a.nii.gz", gzip.compress(_huge(1200))), "can hold"),
+    "negative size": (lambda d: patched(write_nifti(d / "a.nii"), 42, struct.pack("<h", -5)), "there are none"),
+    "unknown type": (lambda d: patched(write_nifti(d / "a.nii"), 70, struct.pack("<h", 777)), "damaged"),
+    "NaN offset": (lambda d: patched(write_nifti(d / "a.nii"), 108, struct.pack("<f", np.nan)), "damaged"),
+    "huge offset": (lambda d: patched(write_nifti(d / "a.nii"), 108, struct.pack("<f", 1e18)), "can hold"),
+    "offset in the header": (lambda d: patched(write_nifti(d / "a.nii"), 108, struct.pack("<f", 8)), "within the"),
+    "huge nrrd": (lambda d: _put(d / "a.nrrd", _nrrd_text(99999, b"gzip")), "over the bound"),
+    "nrrd of no size": (lambda d: _put(d / "a.nrrd", _nrrd_text(0, b"raw")), "there are none"),
+    "nrrd of a size beyond all": (lambda d: _put(d / "a.nrrd", _nrrd_text(10**30, b"raw")), "cannot"),
+}  # fmt: skip
+"""What is no sound volume: how it is made, and a part of what is said."""
+
+
+def _put(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+def _cut(path: Path) -> Path:
+    return _put(path, path.read_bytes()[: -max(40, path.stat().st_size // 4)])
+
+
+def _flip(path: Path, at: int) -> Path:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 0xFF
+    return _put(path, bytes(data))
+
+
+def _huge(side: int) -> bytes:
+    header = nib.Nifti1Header()
+    header.set_data_shape((side, side, side))
+    header.set_data_dtype(np.uint8)
+    header["magic"], header["vox_offset"] = b"n+1", 352
+    return header.binaryblock + b"\0" * 4
+
+
+def _nrrd_text(side: int, encoding: bytes) -> bytes:
+    return b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: %d %d %d\nencoding: %s\nspacings: 1 1 1\n\n" % (
+        side, side, side, encoding)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_what_is_no_sound_volume_is_refused_in_one_sentence(kind: str, tmp_path: Path) -> None:
+    make, part = BAD[kind]
+    path = make(tmp_path)
+    with pytest.raises((FileError, InputError)) as caught:
+        read_volume(path)
+    sentence = str(caught.value)
+    assert str(path) in sentence and sentence.endswith(".") and "\n" not in sentence
+    assert part.lower() in sentence.lower()
+    assert ";" in sentence or ", so " in sentence, f"no advice: {sentence}"
+
+
+@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress])
+def test_what_grows_beyond_its_header_takes_no_more_memory_than_declared(pack: Any, tmp_path: Path) -> None:
+    encoding = b"gzip" if pack is gzip.compress else b"bzip2"
+    path = _put(tmp_path / "a.nrrd", _nrrd_text(20, encoding) + pack(bytes(200_000_000)))
+    tracemalloc.start()
+    try:
+        assert read_volume(path).labels.shape == (20, 20, 20)
+        assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(name=st.sampled_from(["a.nii", "a.nii.gz", "a.nrrd"]), data=st.data())
+def test_damage_ends_in_a_volume_or_in_a_sentence(name: str, data: st.DataObject, tmp_path: Path) -> None:
+    path = tmp_path / name
+    write_nrrd(path) if name.endswith(".nrrd") else write_nifti(path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))] if data.draw(st.booleans()) else content)
+    try:
+        volume = read_volume(path)
+    except ShapespaceError as error:
+        assert str(path) in str(error)
+    else:
+        assert np.isfinite(volume.affine).all()
+
+
+def test_the_sentence_says_how_to_get_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shapespace.io.volumes.find_spec", lambda name: None)
+    with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[volumes\]'"):
+        read_volume(write_nifti(tmp_path / "a.nii"))
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("a.nii", "a"), ("a.NII.gz", "a"), ("a.b.nrrd", "a.b"), ("a.seg.nrrd", "a"), ("nii", "nii"), (".nii", ".nii")],
+)
+def test_a_name_is_that_of_the_file_without_its_ending(file: str, name: str) -> None:
+    assert volume_name(Path(file)) == name
+
+
+@pytest.mark.parametrize("affine", [np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)])
+def test_a_volume_needs_an_affine_that_can_be_inverted(affine: Any) -> None:
+    with pytest.raises(InputError, match="affine"):
+        LabelVolume(LABELS, affine)
+
+
+@pytest.mark.parametrize("labels", [LABELS / 2, LABELS[0], LABELS[:0]])
+def test_a_volume_needs_labels_in_three_dimensions(labels: Any) -> None:
+    with pytest.raises(InputError, match="labels must be"):
+        LabelVolume(labels, np.eye(4))
+
+
+def test_a_wrong_format_is_an_error_of_format(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError):
+        read_volume(_put(tmp_path / "a.nii", b"x" * 400))
