@@ -44,7 +44,8 @@ def surfaces(made: Correspondence) -> list[np.ndarray]:
 
 
 def test_the_same_vertex_is_the_same_place_on_all(blobs: list[RawBlob], made: Correspondence) -> None:
-    assert dispersion_mm(blobs, surfaces(made)) < 3.0
+    # Half of what these blobs vary by slides along them and shows nowhere; one turned the wrong way adds 15 mm or more.
+    assert dispersion_mm(blobs, surfaces(made)) < 6.0
 
 
 def test_surfaces_lie_on_their_scans_in_their_own_unit(scans: list[Mesh], made: Correspondence) -> None:
@@ -59,7 +60,7 @@ def test_surfaces_lie_on_their_scans_in_their_own_unit(scans: list[Mesh], made: 
 def test_what_a_scan_does_not_show_is_missing_and_nothing_else(scans: list[Mesh], made: Correspondence) -> None:
     for k, scan in enumerate(made.scans[:8]):
         assert scan.seen == np.isfinite(scan.vertices).all(axis=1).mean()
-        assert (0.85 < scan.seen < 0.99) if k == HOLED else scan.seen > 0.99
+        assert (0.97 < scan.seen < 0.993) if k == HOLED else scan.seen > 0.995
 
 
 def test_another_object_is_set_aside_with_a_reason(made: Correspondence) -> None:
