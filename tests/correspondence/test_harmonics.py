@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from synthetic_shapes import sphere
 
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.types import Mesh
+from synthetic_shapes import sphere
 
 RADIUS = 50.0
 

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
-from synthetic_shapes import sphere
 
 import shapespace as ss
+from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.rounds import Correspondence, CorrespondSettings
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.types import Mesh
+from synthetic_shapes import sphere
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
 SETTINGS = CorrespondSettings(vertices=900, rounds=2, first=QUICK, next=QUICK)
@@ -69,16 +69,10 @@ def test_another_object_is_set_aside_with_a_reason(made: Correspondence) -> None
     assert len(made.meshes()) == 8
 
 
-def test_the_same_scans_give_the_same_result(scans: list[Mesh], made: Correspondence) -> None:
-    again = ss.correspond(scans, SETTINGS)
-    for one, other in zip(made.scans[:8], again.scans[:8], strict=True):
-        np.testing.assert_array_equal(one.vertices, other.vertices)
-
-
 def test_a_template_given_keeps_its_triangles(scans: list[Mesh], blobs: list[RawBlob]) -> None:
     directions, faces = sphere(700, 2.0)
     template = Mesh(directions * np.array([70.0, 100.0, 85.0]), faces, name="egg")
-    made = ss.correspond(scans[:3], SETTINGS, template=template)
+    made = ss.correspond(scans[:2], SETTINGS, template=template)
     np.testing.assert_array_equal(made.template.faces, faces)
     assert made.why == "egg was given as the template."
 

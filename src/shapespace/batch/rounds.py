@@ -196,7 +196,7 @@ def _write(file: Path, placed: Placed) -> None:
 def _read(file: Path, index: int) -> Placed | None:
     """Return what was kept, or None where nothing is or it is damaged."""
     try:
-        with np.load(file, allow_pickle=False) as kept:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as kept:
             count = sum(name.startswith("vertices_") for name in kept.files)
             first, *rivals = [_kept_one(kept, number, index) for number in range(count)]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):

@@ -51,7 +51,7 @@ class ElasticSettings:
     widest: float = 0.6
     narrowest: float = 0.03
     iterations: int = 40
-    points: int = 4000
+    points: int = 2500
     fine: float = 0.15
     normal_cosine: float = 0.3
     inliers: float = 3.0

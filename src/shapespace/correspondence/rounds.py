@@ -340,7 +340,7 @@ class _State:
             squares.append(square)
             self.moves[i].append(float(np.sqrt(square)) / SIZE)
             self.placed[i] = replace(now, vertices=shape, T_scan_template=T)
-        if self.settings.guided:
+        if self.settings.guided and len(order) >= _ENOUGH_TO_SETTLE:
             self.expected = dict(zip(order, told_by_others(shapes, seen, self.settings.noise_share), strict=True))
         self.template = Mesh(mean, self.template.faces, name=self.template.name)
         return float(np.sqrt(np.mean(squares))) / SIZE

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from synthetic_shapes import blob, sphere
 
 from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
 from shapespace.types import FloatArray, Mesh, Similarity
+from synthetic_shapes import blob, sphere
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,85 @@
+"""Rounds of correspondence on disk: nothing is done twice, and it does not matter where it is done."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raw_blobs import raw_blob
+from shapespace.batch.rounds import KeptRounds
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.rounds import CorrespondSettings, correspond
+from shapespace.types import Mesh
+
+QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
+SETTINGS = CorrespondSettings(vertices=400, rounds=2, first=QUICK, next=QUICK)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Mesh]:
+    return [raw_blob(k, points=1200).scan for k in range(3)]
+
+
+@pytest.fixture
+def placed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The scans that were worked on, in order."""
+    done: list[int] = []
+    place: Callable[[Workbench, PlaceTask], Placed] = Workbench.place
+
+    def counted(self: Workbench, task: PlaceTask) -> Placed:
+        done.append(task.index)
+        return place(self, task)
+
+    monkeypatch.setattr(Workbench, "place", counted)
+    return done
+
+
+def kept(folder: Path, jobs: int = 1, on_done: Callable[[], None] = lambda: None) -> KeptRounds:
+    return KeptRounds(folder, jobs, True, on_done)
+
+
+def test_what_was_done_before_an_interruption_is_not_done_again(
+    scans: list[Mesh], placed: list[int], tmp_path: Path
+) -> None:
+    whole = correspond(scans, SETTINGS, run=kept(tmp_path / "whole"))
+    assert placed == [0, 1, 2] * 2
+    placed.clear()
+    left = iter(range(4))
+
+    def stop_at_the_fourth() -> None:
+        if next(left) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        correspond(scans, SETTINGS, run=kept(tmp_path / "cut", on_done=stop_at_the_fourth))
+    again = correspond(scans, SETTINGS, run=kept(tmp_path / "cut"))
+    assert placed == [0, 1, 2] * 2
+    for one, other in zip(whole.scans, again.scans, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_a_damaged_file_is_made_again(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
+    correspond(scans, SETTINGS, run=kept(tmp_path))
+    placed.clear()
+    file = max(tmp_path.glob("*.npz"))
+    file.write_bytes(file.read_bytes()[:500])
+    correspond(scans, SETTINGS, run=kept(tmp_path))
+    assert len(placed) == 1
+
+
+def test_other_settings_find_nothing(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
+    one = CorrespondSettings(vertices=400, rounds=1, first=QUICK)
+    correspond(scans, one, run=kept(tmp_path))
+    placed.clear()
+    other = ElasticSettings(harmonics=60, points=500, iterations=11)
+    correspond(scans, CorrespondSettings(vertices=400, rounds=1, first=other), run=kept(tmp_path))
+    assert placed == [0, 1, 2]
+
+
+def test_processes_give_what_one_process_gives(scans: list[Mesh], tmp_path: Path) -> None:
+    here = correspond(scans, SETTINGS, run=kept(tmp_path / "here"))
+    there = correspond(scans, SETTINGS, run=kept(tmp_path / "there", jobs=2))
+    for one, other in zip(here.scans, there.scans, strict=True):
+        np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-9)

@@ -1,0 +1,70 @@
+"""`correspond` takes a folder of raw scans to a folder that `build` takes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import Run
+from raw_blobs import raw_blob
+from shapespace.cli import main
+from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.model.shape_model import ShapeModel
+
+SCANS = 4
+QUICK = ("--vertices", "500", "--rounds", "1", "--jobs", "1", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("raw")
+    for k in range(SCANS):
+        write_mesh(folder / f"blob{k}.ply", raw_blob(k, points=1500).scan)
+    (folder / "torn.ply").write_bytes((folder / "blob0.ply").read_bytes()[:900])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def same(raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("same")
+    assert main(["correspond", str(raw), "-o", str(folder), *QUICK]) == 1
+    return folder
+
+
+def test_each_scan_has_a_surface_and_a_record_and_a_bad_one_a_reason(same: Path) -> None:
+    summary = json.loads((same / "correspondence.json").read_text("utf-8"))
+    assert summary["corresponding"] == [f"blob{k}" for k in range(SCANS)]
+    assert list(summary["set_aside"]) == ["torn"] and "torn.ply" in summary["set_aside"]["torn"]
+    first = read_mesh(same / "blob0.corresponding.ply")
+    for k in range(SCANS):
+        record = json.loads((same / f"blob{k}.correspond.json").read_text("utf-8"))
+        assert record["status"] == "corresponding" and 0.9 < record["covered_share"] <= 1.0
+        assert 0.5 < record["scale"] < 2.0 and len(record["moved_share"]) == 1
+        surface = read_mesh(same / f"blob{k}.corresponding.ply")
+        np.testing.assert_array_equal(surface.faces, first.faces)
+    assert json.loads((same / "torn.correspond.json").read_text("utf-8"))["status"] == "set aside"
+    assert not (same / "torn.corresponding.ply").exists() and not (same / ".rounds").exists()
+    np.testing.assert_array_equal(read_mesh(same / "template" / "mean.ply").faces, first.faces)
+
+
+def test_build_takes_the_folder_as_it_stands(run: Run, same: Path, tmp_path: Path) -> None:
+    assert run("build", same, "-o", tmp_path / "model.h5").code == 0
+    assert ShapeModel.load(tmp_path / "model.h5").n_training == SCANS
+
+
+def test_the_terminal_says_the_template_and_what_is_next(run: Run, raw: Path, tmp_path: Path) -> None:
+    template = raw / "blob1.ply"
+    outcome = run("correspond", raw / "blob0.ply", raw / "blob2.ply", "-o", tmp_path, "--template", template, *QUICK)
+    assert outcome.code == 0 and outcome.err == ""
+    assert "blob1.ply was given as the template." in outcome.out
+    assert f"next: shapespace build {tmp_path} -o model.h5" in outcome.out
+
+
+def test_bad_input_is_one_sentence(run: Run, raw: Path, tmp_path: Path) -> None:
+    alone = run("correspond", raw / "blob0.ply", "-o", tmp_path / "a", *QUICK)
+    assert alone.code == 2 and "at least 2 scans, not 1" in alone.sentence()
+    twice = run("correspond", raw / "blob0.ply", raw / "blob0.ply", "-o", tmp_path / "b", *QUICK)
+    assert twice.code == 2 and "at least 2 scans, not 1" in twice.sentence()
+    gone = run("correspond", raw, "-o", tmp_path / "c", "--template", tmp_path / "no.ply", *QUICK)
+    assert gone.code == 2 and "no.ply" in gone.sentence()
