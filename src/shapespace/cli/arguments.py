@@ -114,6 +114,9 @@ def _add_build(commands: Any) -> None:
                      help="what the modes move: vertices (default), or control points of a B-spline surface, without "
                           "or with the detail of the mean that it cannot hold")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
+    sub.add_argument("--min-seen", type=_share, metavar="SHARE",
+                     help="take out vertices (nan in the files: missing) that fewer than this share of the meshes show "
+                          "(a half where it is left out)")  # fmt: skip
     sub.add_argument("--additive", type=Path, metavar="LABELS.csv",
                      help="part identity and expression: CSV of file, subject and label (one is neutral); --modes or "
                           "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip

@@ -149,6 +149,7 @@ def build(arguments: argparse.Namespace) -> int:
         unit=arguments.unit,
         representation=arguments.representation,
         control_points=arguments.control_points,
+        min_seen=arguments.min_seen,
         landmarks=arguments.landmarks,
         labels=arguments.additive,
         expression_variance=arguments.expression_variance,
