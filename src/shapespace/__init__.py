@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
     from shapespace.model.additive import AdditiveModel
+    from shapespace.model.quality import ModelQuality, QualitySettings, measure_quality
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
@@ -29,7 +30,9 @@ __all__ = [
     "FitConfig",
     "FitResult",
     "Mesh",
+    "ModelQuality",
     "Paper",
+    "QualitySettings",
     "Robust",
     "ShapeModel",
     "ShapeSpace",
@@ -38,6 +41,7 @@ __all__ = [
     "__version__",
     "fit_scan",
     "load_faces",
+    "measure_quality",
     "read_landmarks",
     "read_mesh",
     "simulate_scan",
@@ -52,7 +56,9 @@ _HOMES = {
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
     "Mesh": "types",
+    "ModelQuality": "model.quality",
     "Paper": "fit.paper_method",
+    "QualitySettings": "model.quality",
     "Robust": "fit.robust_method",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
@@ -60,6 +66,7 @@ _HOMES = {
     "Similarity": "types",
     "fit_scan": "fit.fit",
     "load_faces": "datasets.faces",
+    "measure_quality": "model.quality",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
     "simulate_scan": "datasets.simulated_scan",

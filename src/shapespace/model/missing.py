@@ -27,9 +27,9 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 MIN_SEEN = 0.5
 """Share of the shapes that must show a vertex for it to be in a model, where nobody says how many."""
 _FEWEST = 2
-_ROUNDS = 3
-_POSE_MODES = 8
-"""Of the completions that only poses are taken from."""
+_POSES_BY = (8, 60)
+"""Modes of the completions that poses are taken from, one after the other: with few only, what they cannot tell turns
+into poses, and alignment then takes real modes out."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
 """Modes that probabilistic PCA begins with; it takes the width of those that nothing speaks for."""
 _MEAN_ROUNDS, _STILL = 50, 1e-8
@@ -178,9 +178,9 @@ def complete(
     most = max(1, min(round(_MODES_A_SHAPE * n), _MOST_MODES, n - 2))
     guess = _mean_filled(shapes, shown, names, gauge) if align else _filled(shapes, shown, _mean_of(shapes, shown))
     if align:
-        for _ in range(_ROUNDS):
+        for modes in _POSES_BY:
             posed = _aligned(guess, gauge, alignment_vertices)
-            found = ppca(posed, shown, min(most, _POSE_MODES))
+            found = ppca(posed, shown, min(most, modes))
             guess = _in_own_pose(shapes, shown, posed, found)
         guess = _aligned(guess, gauge, alignment_vertices)
     found = ppca(guess, shown, most)

@@ -65,7 +65,8 @@ class Ppca:
         """Return the variance (M,), mm^2, that each coordinate of a missing vertex has beside that by y."""
         second = np.outer(self.y[shape], self.y[shape]) + self.y_covariance[shape]
         known: FloatArray = np.asarray(np.einsum("pab,ab->p", self.W_covariance, second), dtype=np.float64)
-        beside: FloatArray = known[self.patterns.of_vertex[self.patterns.hidden[shape]]]
+        beside: FloatArray = np.empty(len(self.patterns.hidden[shape]))
+        beside[:] = known[self.patterns.of_vertex[self.patterns.hidden[shape]]]
         beside += self.noise
         return beside
 
@@ -99,7 +100,7 @@ class Patterns:
     @cached_property
     def weight(self) -> FloatArray:
         """(P,) coordinates of each pattern."""
-        return 3.0 * self.count
+        return 3.0 * self.count.astype(np.float64)
 
 
 def ppca(
