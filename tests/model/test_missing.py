@@ -34,10 +34,10 @@ def holed(meshes: tuple[Mesh, ...], shown: BoolArray) -> list[Mesh]:
     ]
 
 
-def noisy(count: int = 40, vertices: int = 300, seed: int = 1) -> tuple[Mesh, ...]:
+def noisy(count: int = 40, vertices: int = 300, seed: int = 1, noise_mm: float = 0.1) -> tuple[Mesh, ...]:
     rng = np.random.default_rng(seed)
     return tuple(
-        m.with_vertices(m.vertices + 0.1 * rng.standard_normal(m.vertices.shape))
+        m.with_vertices(m.vertices + noise_mm * rng.standard_normal(m.vertices.shape))
         for m in training_meshes(count=count, vertices=vertices)
     )
 
@@ -54,6 +54,29 @@ def test_the_bound_never_falls(modes: int) -> None:
     found = ppca(filled_by_the_mean(np.stack([m.vertices for m in meshes]), shown), shown, modes)
     assert len(found.bounds) > 3
     assert np.diff(found.bounds).min() > -1e-9 * abs(found.bounds[-1])
+
+
+def test_known_variances_come_back_where_little_is_shown_and_coefficients_stay_uncertain() -> None:
+    rng = np.random.default_rng(2)
+    n, vertices, stddev = 400, 8, np.array([4.0, 2.0])
+    basis = np.linalg.qr(rng.standard_normal((3 * vertices, 2)))[0]
+    shapes = (stddev * rng.standard_normal((n, 2))) @ basis.T + rng.standard_normal((n, 3 * vertices))
+    shapes = shapes.reshape(n, vertices, 3)
+    shown = rng.random((n, vertices)) > 0.6
+    found = ppca(filled_by_the_mean(shapes, shown), shown, 2)
+    W = found.W[:, :, :2].reshape(-1, 2)
+    variance = np.linalg.eigvalsh(W.T @ W)[::-1]
+    # What is faint beside the noise is told too faint, never too strong.
+    assert np.allclose(variance, stddev**2, rtol=[0.15, 0.35])
+    assert found.noise == pytest.approx(1.0, rel=0.1)
+    plain = principal_components(filled_by_the_mean(shapes, shown).reshape(n, -1), 2).variance
+    assert plain[0] < 0.5 * stddev[0] ** 2
+
+
+def test_the_noise_of_what_is_missing_counts_too() -> None:
+    meshes = noisy(noise_mm=2.0)
+    model = ShapeModel.fit(holed(meshes, patches(meshes, 0.35)), min_seen=0.2)
+    assert model.total_variance == pytest.approx(ShapeModel.fit(meshes).total_variance, rel=0.05)
 
 
 @pytest.mark.parametrize("gauge", ["shape", "form"])

@@ -52,6 +52,8 @@ def test_five_modes_are_told_apart_from_noise(measured: ModelQuality) -> None:
     # The noise of three coordinates is 0.1 * sqrt(8 / pi) mm long in the mean.
     assert held.mean[at_five] == pytest.approx(0.16, abs=0.05)
     assert held.mean[0] > 1.0
+    # What is left out is in no mode: noise of its own is never told, however many there are.
+    assert held.mean[-1] > 0.12
     assert whole.mean[at_five] > 0.98
     assert measured.supported_modes in (4, 5, 6, 7)
     assert f"support {measured.supported_modes} modes" in measured.sentences()[0]
