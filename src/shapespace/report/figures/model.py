@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
@@ -350,6 +351,7 @@ def _draw_sizes(axes: Axes, names: Sequence[str], sizes: Sequence[BySize | None]
             axes.fill_between(size.shapes, size.low, size.high, color=band, alpha=0.5, lw=0)
     axes.set_title(_BY_SHAPES, fontsize=TEXT, color=INK, loc="left")
     axes.set(xlabel="number of training shapes", ylabel="mean error (mm)", ylim=(0, None))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _legend_above(axes)
 
 
@@ -362,7 +364,7 @@ def _legend_above(axes: Axes) -> None:
     count = len(axes.get_legend_handles_labels()[1])
     if count:
         low, high = axes.get_ylim()
-        axes.set_ylim(low, high + (high - low) * (0.16 * -(-count // 2)))
+        axes.set_ylim(low, high + (high - low) * (0.2 * -(-count // 2)))
         legend(axes, loc="upper right", ncols=2)
 
 
