@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from shapespace.io.meshes import read_mesh, write_mesh
     from shapespace.io.volumes import read_volume
     from shapespace.model.additive import AdditiveModel
+    from shapespace.model.quality import ModelQuality, QualitySettings, measure_quality
     from shapespace.model.shape_model import ShapeModel
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
@@ -34,7 +35,9 @@ __all__ = [
     "FitResult",
     "LabelVolume",
     "Mesh",
+    "ModelQuality",
     "Paper",
+    "QualitySettings",
     "Robust",
     "ShapeModel",
     "ShapeSpace",
@@ -45,6 +48,7 @@ __all__ = [
     "correspond",
     "fit_scan",
     "load_faces",
+    "measure_quality",
     "read_landmarks",
     "read_mesh",
     "read_volume",
@@ -63,7 +67,9 @@ _HOMES = {
     "FitResult": "fit.result",
     "LabelVolume": "types",
     "Mesh": "types",
+    "ModelQuality": "model.quality",
     "Paper": "fit.paper_method",
+    "QualitySettings": "model.quality",
     "Robust": "fit.robust_method",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
@@ -73,6 +79,7 @@ _HOMES = {
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
     "load_faces": "datasets.faces",
+    "measure_quality": "model.quality",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
     "read_volume": "io.volumes",

@@ -395,14 +395,40 @@ class Measured(Struct, frozen=True, kw_only=True):
     mean: tuple[float, ...]
     modes: tuple[float, ...] | None = None
     stddev: tuple[float, ...] | None = None
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
+
+
+class BySize(Struct, frozen=True, kw_only=True):
+    """A measure by the number of training shapes, with its 95 % interval."""
+
+    shapes: tuple[int, ...]
+    mean: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
 
 
 class Quality(Struct, frozen=True, kw_only=True):
-    """A quality.json: shares of the variance (0 to 1), and errors in mm, those that were measured."""
+    """A quality.json: shares of the variance (0 to 1), and errors in mm, those that were measured.
 
+    What is not told apart is measured from surface to surface; `..._vertices` from each vertex to its own place.
+    `others` were measured on the same shapes and folds, and each has what it has more than this in `differences`.
+    """
+
+    name: str = ""
     compactness: tuple[float, ...] | Measured | None = None
     generalisation: tuple[float, ...] | Measured | None = None
     specificity: tuple[float, ...] | Measured | None = None
+    generalisation_vertices: Measured | None = None
+    specificity_vertices: Measured | None = None
+    reconstruction: Measured | None = None
+    reconstruction_vertices: Measured | None = None
+    generalisation_by_shapes: BySize | None = None
+    supported_modes: int | None = None
+    sentences: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = {}
+    others: tuple[Quality, ...] = ()
+    differences: Mapping[str, Measured] = {}
 
 
 # recognition.json

@@ -95,15 +95,14 @@ def test_a_vertex_that_nobody_has_and_a_shape_of_which_little_is_there_are_refus
         fill_holes(holed, faces, ["a", "b", "c", "third", *["d"] * 8])
 
 
-def test_holes_are_refused_for_vertices_and_infinite_vertices_for_both() -> None:
-    for value, representations in ((np.nan, ("vertices",)), (np.inf, ("vertices", "bspline"))):
-        given = meshes()
-        x = np.array(given[2].vertices)
-        x[5, 1] = value
-        given[2] = given[2].with_vertices(x)
-        for representation in representations:
-            with pytest.raises(InputError, match=r"sheet_2\.ply holds vertices that are not finite"):
-                ShapeModel.fit(given, representation=representation)
+def test_infinite_vertices_are_refused() -> None:
+    given = meshes()
+    x = np.array(given[2].vertices)
+    x[5, 1] = np.inf
+    given[2] = given[2].with_vertices(x)
+    for representation in ("vertices", "bspline"):
+        with pytest.raises(InputError, match=r"sheet_2\.ply holds vertices that are not finite"):
+            ShapeModel.fit(given, representation=representation)
 
 
 def test_what_cannot_be_had_is_refused_in_one_sentence() -> None:
@@ -216,7 +215,7 @@ def test_build_makes_a_model_of_meshes_with_holes_and_info_tells_it(
         (["--representation", "bspline", "--control-points", "64x64"], "more than the 500 vertices"),
         (["--control-points", "8x8"], "Only B-spline surfaces have control points"),
         (["--representation", "spline"], "invalid choice: 'spline'"),
-        ([], r"sheet_00\.ply holds vertices that are not finite"),
+        (["--representation", "bspline", "--min-seen", "0.5"], "--min-seen is for models of vertices"),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )

@@ -25,6 +25,7 @@ def parser() -> argparse.ArgumentParser:
     _add_check(commands)
     _add_correspond(commands)
     _add_build(commands)
+    _add_quality(commands)
     _add_info(commands)
     _add_fit(commands)
     _add_report(commands)
@@ -149,6 +150,9 @@ def _add_build(commands: Any) -> None:
                      help="what the modes move: vertices (default), or control points of a B-spline surface, without "
                           "or with the detail of the mean that it cannot hold")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
+    sub.add_argument("--min-seen", type=_share, metavar="SHARE",
+                     help="take out vertices (nan in the files: missing) that fewer than this share of the meshes show "
+                          "(a half where it is left out)")  # fmt: skip
     sub.add_argument("--additive", type=Path, metavar="LABELS.csv",
                      help="part identity and expression: CSV of file, subject and label (one is neutral); --modes or "
                           "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip
@@ -162,6 +166,31 @@ def _add_build(commands: Any) -> None:
     sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.build)
+
+
+def _add_quality(commands: Any) -> None:
+    sub = _add(commands, "quality", "how good a shape space is: compactness, generalisation, specificity",
+               "shapespace quality faces -o quality\n"
+               "         shapespace quality registered_a registered_b --scans scans -o quality")  # fmt: skip
+    sub.add_argument("targets", nargs="+", type=Path, metavar="TARGET",
+                     help="a folder of meshes in correspondence or a model; two are compared")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                     help="where to write quality.json and the curves")  # fmt: skip
+    sub.add_argument("--scans", type=Path, metavar="FOLDER",
+                     help="judge surfaces against these scans, named as they are and in their pose")  # fmt: skip
+    sub.add_argument("--unseen", type=Path, metavar="FOLDER",
+                     help="also the error on these shapes in correspondence, which no model saw")  # fmt: skip
+    sub.add_argument("--folds", type=_folds, default=10, metavar="N|loo",
+                     help="in how many parts shapes are left out (default 10); loo: each by itself")  # fmt: skip
+    sub.add_argument("--modes", type=_positive, metavar="K", help="the largest number of modes (default: all)")
+    sub.add_argument("--samples", type=_positive, default=100, metavar="N", help="random shapes (default 100)")
+    sub.add_argument("--gauge", choices=("form", "shape"), default="shape", help="as of build (default shape)")
+    sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
+    sub.add_argument("--representation", nargs="+", choices=("vertices", "bspline", "bspline-detail"),
+                     default=["vertices"], help="as of build; two are compared")  # fmt: skip
+    sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of folds and samples")
+    sub.set_defaults(run=run.quality)
 
 
 def _add_info(commands: Any) -> None:
@@ -299,6 +328,15 @@ def _positive(text: str) -> int:
     value = _natural(text)
     if value == 0:
         raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def _folds(text: str) -> int | None:
+    if text == "loo":
+        return None
+    value = _natural(text)
+    if value < 2:
+        raise argparse.ArgumentTypeError("must be at least 2, or loo")
     return value
 
 

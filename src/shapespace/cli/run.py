@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shapespace.cli.printing import now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
-    from shapespace.schemas import CorrespondenceRecord, CorrespondRecord
+    from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
 
 _LISTED = 10
 """Scans that the terminal lists."""
@@ -214,6 +214,7 @@ def build(arguments: argparse.Namespace) -> int:
         unit=arguments.unit,
         representation=arguments.representation,
         control_points=arguments.control_points,
+        min_seen=arguments.min_seen,
         landmarks=arguments.landmarks,
         labels=arguments.additive,
         expression_variance=arguments.expression_variance,
@@ -237,6 +238,56 @@ def build(arguments: argparse.Namespace) -> int:
             f"gauge {facts['gauge']}"
         )
     return 0
+
+
+def quality(arguments: argparse.Namespace) -> int:
+    """How good a shape space is."""
+    from shapespace.commands.quality import QualityOptions, quality
+    from shapespace.model.quality import QualitySettings
+    from shapespace.schemas import to_json
+
+    settings = QualitySettings(
+        folds=arguments.folds,
+        modes=arguments.modes,
+        samples=arguments.samples,
+        seed=arguments.seed,
+        gauge=arguments.gauge,
+        align=not arguments.no_align,
+        control_points=arguments.control_points,
+    )
+    options = QualityOptions(settings, arguments.representation, arguments.scans, arguments.unseen)
+    found, notes = quality(arguments.targets, arguments.output, options, quiet=arguments.quiet)
+    for note in notes:
+        say(note)
+    if arguments.json:
+        show_json({"folder": str(arguments.output), **to_json(found)})
+        return 0
+    for one in (found, *found.others):
+        for line in quality_lines(one):
+            show(line)
+    for sentence in found.sentences:
+        show(sentence)
+    show(f"All numbers are in {arguments.output / 'quality.json'}")
+    return 0
+
+
+def quality_lines(quality: Quality) -> list[str]:
+    """Return the measures with most modes, in words."""
+    out: list[str] = [quality.name]
+    for key, unit in (
+        ("compactness", "of the variance"),
+        ("generalisation", "mm, surface to surface, on shapes left out"),
+        ("generalisation_vertices", "mm, vertex to vertex, on shapes left out"),
+        ("specificity", "mm, surface to surface, from random shapes to the nearest one"),
+        ("specificity_vertices", "mm, vertex to vertex, from random shapes to the nearest one"),
+        ("reconstruction", "mm, surface to surface, on unseen shapes"),
+        ("reconstruction_vertices", "mm, vertex to vertex, on unseen shapes"),
+    ):
+        told = getattr(quality, key)
+        if told is not None:
+            band = f" (95 %: {told.low[-1]:.3f} to {told.high[-1]:.3f})" if told.low != told.mean else ""
+            out.append(f"  {key.split('_')[0]}, {told.modes[-1]:g} modes: {told.mean[-1]:.3f}{band} {unit}")
+    return out
 
 
 def info(arguments: argparse.Namespace) -> int:

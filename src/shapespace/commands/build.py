@@ -21,10 +21,11 @@ from shapespace.io.folders import mesh_files
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import read_mesh
+from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.scans import NEUTRAL
-from shapespace.types import MM_PER_UNIT, Mesh
+from shapespace.types import MM_PER_UNIT, Mesh, common_faces
 
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
@@ -45,6 +46,7 @@ class BuildSettings:
         unit: of the meshes.
         representation: what the modes move.
         control_points: of a B-spline.
+        min_seen: share of the meshes that must show a vertex of a model of vertices; None for a half.
         landmarks: a file of vertices, or of points on the first mesh; None looks for them.
         labels: a table of subjects and expressions, for a model that parts both; None for a plain one.
         expression_variance: with `labels`, the share that the modes of expression hold.
@@ -64,6 +66,7 @@ class BuildSettings:
     unit: str = "mm"
     representation: str = "vertices"
     control_points: tuple[int, int] | None = None
+    min_seen: float | None = None
     landmarks: Path | None = None
     labels: Path | None = None
     expression_variance: float | None = None
@@ -79,6 +82,8 @@ class BuildSettings:
             raise InputError("--expression-variance belongs to --additive LABELS.csv; give both, or neither.")
         if self.labels is not None and self.representation != "vertices":
             raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
+        if self.min_seen is not None and (self.labels is not None or self.representation != "vertices"):
+            raise InputError("--min-seen is for models of vertices without --additive; leave it out.")
         if self.labels is not None and not self.align:
             raise InputError(
                 "A model that parts identity and expression aligns its faces itself; leave --no-align out."
@@ -112,6 +117,7 @@ def build(
     if settings.modes == "auto" and len(files) < 4:
         settings = replace(settings, modes=None)
         notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+    notes += _missing(loaded, marks, settings)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if settings.labels is not None:
             additive = _additive(files, loaded, settings.labels, settings, marks)
@@ -129,6 +135,7 @@ def build(
             landmarks=marks,
             representation=settings.representation,
             control_points=settings.control_points,
+            min_seen=_min_seen(settings),
             provenance=settings.provenance,
             licence=settings.licence,
             seed=settings.seed,
@@ -184,6 +191,43 @@ def _training_mesh(path: Path) -> Mesh:
     if not len(mesh.vertices):
         raise MeshError(f"{path}: it has no vertices, so no shape model can be made of it; leave it out.")
     return mesh
+
+
+def _min_seen(settings: BuildSettings) -> float:
+    return MIN_SEEN if settings.min_seen is None else settings.min_seen
+
+
+def _missing(meshes: Sequence[Mesh], landmarks: Mapping[str, int], settings: BuildSettings) -> list[str]:
+    """Return how many vertices are missing, and which of them and of the landmarks are not in the model for it.
+
+    Raises:
+        CorrespondenceError: the meshes differ in vertices or triangles.
+        InputError: meshes with missing vertices for a model that parts identity and expression.
+    """
+    common_faces(meshes)
+    holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
+    if not any(holed):
+        return []
+    if settings.labels is not None:
+        raise InputError(
+            f"{meshes[int(np.argmax(holed))].name}: vertices are missing, and a model that parts identity and "
+            "expression needs whole meshes; leave --additive out, or the meshes with holes."
+        )
+    missing, every = sum(holed), len(meshes) * len(meshes[0].vertices)
+    where, share = sum(count > 0 for count in holed), 100 * missing / every
+    told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
+    if settings.representation != "vertices":
+        return told
+    kept = Kept.of(meshes, _min_seen(settings))
+    if out := int((~kept.vertices).sum()):
+        what = "1 vertex is" if out == 1 else f"{out} vertices are"
+        told.append(
+            f"{what} taken out of the model, since fewer than {100 * _min_seen(settings):g} % of the meshes show them; "
+            "--min-seen says how many must."
+        )
+    if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
+        told.append(f"The model has no {', '.join(lost)}, since these landmarks lie on vertices that are taken out.")
+    return told
 
 
 def _landmarks(

@@ -37,7 +37,7 @@ class ModeChoice:
     standard_error_mm: FloatArray
 
 
-def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoice:
+def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: BoolArray | None = None) -> ModeChoice:
     """Choose the number of modes by held-out vertices with the one-standard-error rule.
 
     In each fold the model is made without some shapes; half of the vertices of each are shown, coefficients are
@@ -47,6 +47,7 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoi
         data: (N, 3V) aligned shapes, mm.
         folds: how many, at most N.
         seed: of the split and of the hidden halves.
+        counted: (N, V) False for vertices that were filled in, which are no evidence; None where all are measured.
 
     Raises:
         InputError: fewer than four shapes.
@@ -70,7 +71,7 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0) -> ModeChoi
     for held_out in parts:
         shown = np.zeros(d // 3, dtype=np.bool_)
         shown[rng.permutation(d // 3)[: d // 6]] = True
-        errors[held_out] = _errors_of_hidden(centred, gram, held_out, shown, candidates)
+        errors[held_out] = _errors_of_hidden(centred, gram, held_out, shown, candidates, counted)
     mean = errors.mean(axis=0)
     standard_error = errors.std(axis=0, ddof=1) / np.sqrt(n)
     best = int(mean.argmin())
@@ -87,7 +88,12 @@ def _gram(rows: FloatArray) -> FloatArray:
 
 
 def _errors_of_hidden(
-    centred: FloatArray, gram: FloatArray, held_out: IntArray, shown: BoolArray, candidates: IntArray
+    centred: FloatArray,
+    gram: FloatArray,
+    held_out: IntArray,
+    shown: BoolArray,
+    candidates: IntArray,
+    counted: BoolArray | None,
 ) -> FloatArray:
     """Return the mean error (H, C), mm, of the hidden vertices of the shapes `held_out` (H,), a column a candidate.
 
@@ -99,6 +105,7 @@ def _errors_of_hidden(
         held_out: (H,) indices of the shapes that the model does not know.
         shown: (V,) True where a vertex is shown.
         candidates: (C,) numbers of modes.
+        counted: (N, V) False where a vertex is no evidence; None for all.
     """
     n, d = len(centred), centred[0].size
     known = np.setdiff1d(np.arange(n), held_out)
@@ -118,6 +125,10 @@ def _errors_of_hidden(
     # The sums of each column are zero in all but rounding, so the mean need not be taken off first.
     modes = sums.T @ hidden[known]
     residual = hidden[held_out] - mean
+    weight = None
+    if counted is not None:
+        weight = counted[held_out][:, ~shown].astype(np.float64)
+        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
     errors = np.empty((len(held_out), len(candidates)))
     for column, k in enumerate(candidates):
         kept = min(int(k), len(variance))
@@ -125,7 +136,8 @@ def _errors_of_hidden(
         system = overlap[:kept, :kept] + noise * np.diag(1.0 / variance[:kept])
         b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :kept].T), dtype=np.float64)
         wrong = (residual - b.T @ modes[:kept]).reshape(len(held_out), 3, -1)
-        errors[:, column] = np.sqrt(wrong[:, 0] ** 2 + wrong[:, 1] ** 2 + wrong[:, 2] ** 2).mean(axis=1)
+        distance = np.sqrt(wrong[:, 0] ** 2 + wrong[:, 1] ** 2 + wrong[:, 2] ** 2)
+        errors[:, column] = distance.mean(axis=1) if weight is None else (distance * weight).sum(axis=1)
     return errors
 
 

@@ -71,17 +71,7 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
 
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
-    if isinstance(modes, np.integer):
-        modes = int(modes)
-    if modes is not None and not isinstance(cast(object, modes), (int, float)):
-        raise InputError(
-            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
-        )
-    if isinstance(modes, int) and not 1 <= modes <= n - 1:
-        raise InputError(
-            f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "
-            f"ask for 1 to {n - 1} or add shapes."
-        )
+    modes = checked_modes(modes, n)
     data = np.ascontiguousarray(data)
     gram = _centred_gram(data)
     total = float(gram.trace())
@@ -97,6 +87,34 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
     weights = vectors[:, ::-1][:, : len(variance)] / np.sqrt(variance * (n - 1))
     mean, basis = _mean_and_basis(data, weights)
     return PrincipalComponents(mean, basis, variance.copy(), total / (n - 1), n)
+
+
+def checked_modes(modes: int | float | None, n: int) -> int | float | None:
+    """Return `modes` as asked for of n shapes: a plain number, a share of the variance, or None for all.
+
+    Raises:
+        InputError: it is something else, or more than so many shapes give.
+    """
+    if isinstance(modes, np.integer):
+        modes = int(modes)
+    if modes is not None and not isinstance(cast(object, modes), (int, float)):
+        raise InputError(
+            f"The modes must be a whole number, a share of the variance, or none to keep all, not {modes!r}."
+        )
+    if isinstance(modes, int) and not 1 <= modes <= n - 1:
+        raise InputError(
+            f"{n} training shapes give at most {n - 1} modes, so {modes} cannot be had; "
+            f"ask for 1 to {n - 1} or add shapes."
+        )
+    return modes
+
+
+def fix_signs(rows: FloatArray) -> None:
+    """Give each mode (K, D), in place, the sign that makes the first of its largest entries positive."""
+    for row in rows:
+        size = np.abs(row)
+        if row[np.argmax(size >= _TIED * size.max())] < 0:
+            row *= -1.0
 
 
 def _syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
@@ -146,9 +164,7 @@ def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, 
     column_sums = weights.sum(axis=0)
     for row, column_sum in zip(rows, column_sums, strict=True):
         row -= column_sum * mean
-        size = np.abs(row)
-        if row[np.argmax(size >= _TIED * size.max())] < 0:
-            row *= -1.0
+    fix_signs(rows)
     # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
     overlap = rows @ rows.T
     if np.abs(overlap - np.eye(k)).max() > 1e-12:

@@ -20,6 +20,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.holes import fill_holes
+from shapespace.model.missing import MIN_SEEN, Kept, complete
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
@@ -120,6 +121,7 @@ class ShapeModel:
         landmarks: Mapping[str, int] | None = None,
         representation: str = "vertices",
         control_points: tuple[int, int] | None = None,
+        min_seen: float = MIN_SEEN,
         provenance: str = "",
         licence: str = "",
         seed: int = 0,
@@ -127,8 +129,8 @@ class ShapeModel:
         """Build the shape space of corresponding `meshes` (eqs 1-5), in mm.
 
         Args:
-            meshes: at least two, same vertices in the same order, same triangles. For B-splines, vertices that are
-                not-a-number are missing, and filled.
+            meshes: at least two, same vertices in the same order, same triangles. Vertices that are not-a-number are
+                missing: a model of vertices learns from those that are there, one of B-splines from filled ones.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
                 vertices; None for every mode that varies.
             gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
@@ -138,6 +140,8 @@ class ShapeModel:
             representation: `vertices`; `bspline`, control points of a smooth surface; `bspline-detail`, the same
                 with what the spline cannot hold of the mean added to every shape.
             control_points: along u and v of a B-spline; None for 24 each.
+            min_seen: share of the meshes that must show a vertex; others are taken out of a model of vertices, with
+                their triangles and landmarks. Where nothing is missing it does nothing.
             provenance: what the meshes are, in words.
             licence: of the meshes.
             seed: of the cross-validation.
@@ -150,16 +154,27 @@ class ShapeModel:
         """
         kind = representation_named(representation, control_points)
         faces = common_faces(meshes)
-        shapes = _training_shapes(meshes, faces, fill=kind.takes_holes)
+        if not kind.takes_holes and len(meshes) > 1:
+            kept = Kept.of(meshes, min_seen)
+            meshes, landmarks = kept.meshes, kept.landmarks(landmarks or {})
+            faces, alignment_vertices = meshes[0].faces, kept.indices(alignment_vertices)
+        shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
         rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
         if align:
-            _refuse_without_extent(shapes, [mesh.name for mesh in meshes])
+            _refuse_without_extent(shapes, names)
+        completed = None
+        if np.isnan(shapes).any():
+            completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
+            shapes = completed.shapes
+        elif align:
             align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-        # Where only some vertices carried the alignment, the size of the others is shape.
-        if align and gauge == "shape" and alignment_vertices is None:
-            scale_to_tangent(shapes)
+            # Where only some vertices carried the alignment, the size of the others is shape.
+            if gauge == "shape" and alignment_vertices is None:
+                scale_to_tangent(shapes)
         coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), control_points)
-        if isinstance(coder, Vertices):
+        if completed is not None:
+            pc = completed.components(modes, seed)
+        elif isinstance(coder, Vertices):
             pc = _components(coder.encode(shapes), modes, seed)
         else:
             pc = _components_of_codes(coder, shapes, modes, seed)
@@ -431,7 +446,7 @@ def _training_shapes(meshes: Sequence[Mesh], faces: IntArray | None, *, fill: bo
     if fill and np.isnan(shapes).any():
         _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
         fill_holes(shapes, faces, names)
-    _refuse_not_finite(shapes, names)
+    _refuse_not_finite(np.nan_to_num(shapes, nan=0.0, posinf=np.inf, neginf=-np.inf) if not fill else shapes, names)
     _refuse_equal(shapes)
     return shapes
 
@@ -446,13 +461,14 @@ def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
 
 def _refuse_equal(shapes: FloatArray) -> None:
     """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
-    spread = float(np.ptp(shapes, axis=0).max())
-    if spread <= 64 * np.finfo(float).eps * float(np.abs(shapes).max()):
+    spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
+    if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
         raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
 
 
 def _refuse_without_extent(shapes: FloatArray, names: Sequence[str]) -> None:
-    for shape, name in zip(shapes, names, strict=True):
+    for whole, name in zip(shapes, names, strict=True):
+        shape = whole[~np.isnan(whole).any(axis=1)]
         centred = shape - shape.mean(axis=0)
         extent = np.linalg.eigvalsh(centred.T @ centred)
         if extent[1] <= 1e-9 * extent[2]:

@@ -123,7 +123,8 @@ def quality_part(page: Page, quality: Quality) -> Figure:
     return page.figure(
         figures.quality_figure(quality),
         "Compactness: share of the variance. Generalisation: error on shapes left out. Specificity: distance of random "
-        "shapes from the nearest training shape.",
+        "shapes from the nearest training shape. Bands: 95 % intervals where they were measured. "
+        + " ".join(quality.sentences),
         alt="Compactness, generalisation and specificity by the number of modes, those of them that were measured",
         chart=True,
     )

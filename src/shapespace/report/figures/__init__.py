@@ -31,7 +31,14 @@ from shapespace.report.figures.many import (
     faces_grid,
     portrait_figure,
 )
-from shapespace.report.figures.model import mean_figure, mode_animation, modes_figure, quality_figure, spectrum_figure
+from shapespace.report.figures.model import (
+    mean_figure,
+    mode_animation,
+    modes_figure,
+    quality_figure,
+    save_figure,
+    spectrum_figure,
+)
 from shapespace.report.figures.recognition import (
     calibration_figure,
     confusion_figure,
@@ -72,6 +79,7 @@ __all__ = [
     "portrait_figure",
     "quality_figure",
     "regions_figure",
+    "save_figure",
     "scatter_matrix",
     "signed_maps",
     "spectrum_figure",

@@ -5,17 +5,22 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from shapespace.errors import FileFormatError, InputError
+from shapespace.io.files import write_bytes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.colours import SEQUENTIAL
 from shapespace.report.figures.draw import (
+    BACKWARD,
     FORWARD,
     INK,
     TEXT,
@@ -34,7 +39,7 @@ from shapespace.report.figures.draw import (
 )
 from shapespace.report.render import Camera, Image, Layer, render
 from shapespace.report.staged import nice_ceiling
-from shapespace.schemas import Measured, Quality, read
+from shapespace.schemas import BySize, Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
 
 SHARES = (0.90, 0.95, 0.98, 0.99)
@@ -46,7 +51,11 @@ _QUALITY = {
     "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
     "generalisation": ("Generalisation: error on shapes left out", "mean error (mm)"),
     "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
+    "reconstruction": ("Reconstruction: error on unseen shapes that were given", "mean error (mm)"),
 }
+_LONGEST_NAME = 26
+_BY_SHAPES = "Generalisation with all modes, by the number of training shapes"
+_COLOURS, _BANDS = (FORWARD, BACKWARD), (_BARS, "#f2c6a5")
 
 
 def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
@@ -268,52 +277,120 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
 
 
 def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") -> Figure:
-    """Draw compactness, generalisation and specificity, those of them that are there, over the number of modes.
+    """Draw compactness, generalisation, specificity and more, those that are there, over the number of modes.
 
     Args:
-        quality: from `compactness` (shares of the variance, 0 to 1), `generalisation` and `specificity` (mm) to a list
-            with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`, `mean` and, if known, `stddev`.
+        quality: from `compactness` (shares of the variance, 0 to 1), `generalisation`, `specificity` and
+            `reconstruction` (mm) to a list with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`,
+            `mean` and, if known, `stddev` or `low` and `high`; those of `others` are drawn beside it.
         title: above the figure; by default it says what is drawn.
 
     Raises:
-        InputError: none of the three is there, or one is no such list.
+        InputError: none of them is there, or one is no such list.
     """
     if not isinstance(quality, Quality):
         try:
             quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
         except FileFormatError as error:
             raise InputError(str(error)) from error
-    measures = {key: getattr(quality, key) for key in _QUALITY}
-    parts = {key: _measured(key, value) for key, value in measures.items() if value is not None}
-    if not parts:
+    named = [quality, *quality.others]
+    shown = [key for key in _QUALITY if any(getattr(one, key) is not None for one in named)]
+    sizes = [one.generalisation_by_shapes for one in named]
+    if not shown:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
-    most = int(max(modes.max() for modes, _, _ in parts.values()))
+    drawn = {key: [_of(key, one) for one in named] for key in shown}
+    most = int(max(modes.max() for curves in drawn.values() for lines in curves for modes, *_ in lines.values()))
     by_default = f"How good the shape space is, {'by its number of modes' if most > 1 else 'with its one mode'}"
-    figure, plots = charts(title or by_default, [2.5] * len(parts))
-    for axes, (key, (modes, mean, spread)) in zip(plots, parts.items(), strict=True):
-        scale = 100.0 if key == "compactness" else 1.0
-        dots = "o" if len(modes) < 40 else ""
-        axes.plot(modes, scale * mean, color=FORWARD, lw=2, marker=dots, ms=4)
-        if spread is not None:
-            axes.fill_between(
-                modes, scale * (mean - spread), scale * (mean + spread), color=_BARS, alpha=0.5, lw=0, label="± 1 sd"
-            )
-            legend(axes, loc="best")
+    more = [2.5] if any(sizes) else []
+    figure, plots = charts(title or by_default, [2.5] * len(shown) + more)
+    names = [_short(one.name) for one in named] if len(named) > 1 else [""]
+    for axes, (key, curves) in zip(plots, drawn.items(), strict=False):
+        for name, lines, colour, band in zip(names, curves, _COLOURS, _BANDS, strict=False):
+            _draw_lines(axes, key, name, lines, colour, band)
         heading, unit = _QUALITY[key]
         axes.set_title(heading, fontsize=TEXT, color=INK, loc="left")
         axes.set_ylabel(unit)
         axes.set_ylim(0, 104 if key == "compactness" else None)
         number_axis(axes, most)
-    plots[-1].set_xlabel("number of modes")
+        _legend_above(axes)
+    plots[len(shown) - 1].set_xlabel("number of modes")
+    if more:
+        _draw_sizes(plots[-1], names, sizes)
     return finish(figure, h_pad=1.2)
 
 
-def _measured(key: str, value: Measured | tuple[float, ...]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return numbers of modes, the measure for each, and its standard deviation where it is known, (n,) each."""
+_Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]
+
+
+def _of(key: str, quality: Quality) -> dict[str, _Line]:
+    """Return the curves of a measure that are there: by surface, or without a word, and by vertices."""
+    by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
+    out: dict[str, _Line] = {}
+    if by_surface is not None:
+        out["surface" if by_vertices is not None else ""] = _measured(key, by_surface)
+    if by_vertices is not None:
+        out["vertices"] = _measured(key, by_vertices)
+    return out
+
+
+def _draw_lines(axes: Axes, key: str, name: str, lines: Mapping[str, _Line], colour: str, band: str) -> None:
+    scale = 100.0 if key == "compactness" else 1.0
+    for kind, (modes, mean, low, high) in lines.items():
+        label = ", ".join(part for part in (name, kind) if part)
+        style = "--" if kind == "vertices" else "-"
+        dots = "o" if len(modes) < 40 else ""
+        axes.plot(modes, scale * mean, color=colour, lw=2, ls=style, marker=dots, ms=4, label=label or None)
+        if low is not None and high is not None:
+            axes.fill_between(modes, scale * low, scale * high, color=band, alpha=0.5, lw=0)
+
+
+def _draw_sizes(axes: Axes, names: Sequence[str], sizes: Sequence[BySize | None]) -> None:
+    for name, size, colour, band in zip(names, sizes, _COLOURS, _BANDS, strict=False):
+        if size is not None:
+            axes.plot(size.shapes, size.mean, color=colour, lw=2, ls="--", marker="o", ms=4, label=name or None)
+            axes.fill_between(size.shapes, size.low, size.high, color=band, alpha=0.5, lw=0)
+    axes.set_title(_BY_SHAPES, fontsize=TEXT, color=INK, loc="left")
+    axes.set(xlabel="number of training shapes", ylabel="mean error (mm)", ylim=(0, None))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _legend_above(axes)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else "…" + name[-_LONGEST_NAME:]
+
+
+def _legend_above(axes: Axes) -> None:
+    """Add the legend, where there is one, above all curves of the plot, with room made for it."""
+    count = len(axes.get_legend_handles_labels()[1])
+    if count:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + (high - low) * (0.2 * -(-count // 2)))
+        legend(axes, loc="upper right", ncols=2)
+
+
+def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
+    """Return numbers of modes, the measure for each, and where its band begins and ends if known, (n,) each."""
     measured = value if isinstance(value, Measured) else Measured(mean=value)
     mean = np.array(measured.mean)
-    modes = np.arange(1.0, len(mean) + 1) if measured.modes is None else np.array(measured.modes)
-    spread = None if measured.stddev is None else np.array(measured.stddev)
-    if not len(mean) or modes.shape != mean.shape or (spread is not None and spread.shape != mean.shape):
+    modes = np.arange(1.0, len(mean) + 1) if measured.modes is None else np.array(measured.modes, dtype=np.float64)
+    low, high = (None if band is None else np.array(band) for band in (measured.low, measured.high))
+    if measured.stddev is not None and len(measured.stddev) == len(mean):
+        low, high = mean - np.array(measured.stddev), mean + np.array(measured.stddev)
+    given = (modes, *(band for band in (low, high, measured.stddev) if band is not None))
+    if not len(mean) or any(len(part) != len(mean) for part in given):
         raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
-    return modes, mean, spread
+    return modes, mean, low, high
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG or SVG, by the ending of `path`, whole or not at all.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    stream = io.BytesIO()
+    # Neither date nor random names: the same figure is the same file.
+    with matplotlib.rc_context({"svg.hashsalt": "shapespace", "svg.fonttype": "none"}):
+        kind = path.suffix.removeprefix(".")
+        figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else {})
+    write_bytes(path, stream.getvalue())

@@ -1,0 +1,266 @@
+"""What `quality` does: compactness, generalisation and specificity of a model, a folder in correspondence, or two."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.batch.progress import progress, waiting
+from shapespace.batch.run import naming
+from shapespace.errors import InputError, MeshError
+from shapespace.io.files import make_folder, write_text
+from shapespace.io.folders import mesh_files
+from shapespace.io.meshes import read_mesh
+from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.model.representation import representation_named
+from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import BySize, Measured, Quality, to_json
+from shapespace.types import Mesh
+
+_MODELS = (".h5", ".hdf5")
+_SURFACES = (".dense.ply", ".fitted.ply")
+_MOST_TARGETS = 2
+
+
+@dataclass(frozen=True)
+class QualityOptions:
+    """What to measure, and against what.
+
+    Args:
+        settings: folds, modes, samples, seed and gauge.
+        representations: one for all targets, or one for each; two for one target compare it with itself.
+        scans: a folder of the scans that surfaces were made from, named as they are; None for the surfaces themselves.
+        unseen: a folder of shapes in correspondence that no model saw.
+
+    Raises:
+        InputError: representations that there are not.
+    """
+
+    settings: QualitySettings = field(default_factory=QualitySettings)
+    representations: Sequence[str] = ("vertices",)
+    scans: Path | None = None
+    unseen: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.representations:
+            representation_named(name, None)
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A model or meshes in correspondence, by a name that tells it from the other."""
+
+    name: str
+    what: ShapeModel | Sequence[Mesh]
+    settings: QualitySettings
+
+    @property
+    def names(self) -> list[str]:
+        """Names of its meshes, without endings."""
+        return [] if isinstance(self.what, ShapeModel) else [_stem(Path(mesh.name)) for mesh in self.what]
+
+
+def quality(
+    targets: Sequence[Path], output: Path, options: QualityOptions, *, quiet: bool
+) -> tuple[Quality, list[str]]:
+    """Measure one target or two, write `quality.json` and the curves, and return what was found and what to know.
+
+    Raises:
+        FileError: something cannot be read or written.
+        CorrespondenceError: meshes of one target differ in vertices or triangles.
+        InputError: targets that there are not, too few meshes, or two that have not the same shapes.
+    """
+    notes: list[str] = []
+    found = _targets(targets, options, notes, quiet=quiet)
+    make_folder(output)
+    measured = [_measure(target, options, quiet=quiet) for target in found]
+    parts = [_as_quality(t, m, options) for t, m in zip(found, measured, strict=True)]
+    result = parts[0]
+    if len(parts) > 1:
+        differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
+        told = _told_apart(found, measured[0].differences(measured[1]))
+        result = replace_quality(
+            result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *told)
+        )
+    for target in found:
+        if isinstance(target.what, ShapeModel):
+            notes.append(
+                f"{target.name} is a model file, which does not keep its training shapes: compactness is told, "
+                "generalisation and specificity only of a folder"
+                + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
+            )
+    write_text(output / "quality.json", json.dumps(to_json(result), indent=1, allow_nan=False) + "\n")
+    with waiting("drawing the curves", quiet=quiet):
+        _draw(result, output, notes)
+    return result, notes
+
+
+def replace_quality(quality: Quality, **changes: object) -> Quality:
+    """Return `quality` with other fields."""
+    import msgspec
+
+    return msgspec.structs.replace(quality, **changes)
+
+
+def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *, quiet: bool) -> list[_Target]:
+    names = list(options.representations)
+    if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
+        raise InputError("At most two targets or representations are compared; give one or two.")
+    loaded = [ShapeModel.load(p) if p.suffix.lower() in _MODELS else _meshes(p, notes, quiet=quiet) for p in paths]
+    pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]
+    if len(paths) == 1 and len(names) == _MOST_TARGETS:
+        pairs = [(0, name) for name in names]
+    several = len({name for _, name in pairs}) > 1
+    out: list[_Target] = []
+    for k, name in pairs:
+        called = f"{paths[k]}, {name}" if several else str(paths[k])
+        out.append(_Target(called, loaded[k], _of_representation(options.settings, name, names)))
+    if len(out) == _MOST_TARGETS and not any(isinstance(target.what, ShapeModel) for target in out):
+        _refuse_unlike(out)
+    return out
+
+
+def _of_representation(settings: QualitySettings, name: str, names: Sequence[str]) -> QualitySettings:
+    """Return the settings of one representation; control points belong to B-splines, where one is among them."""
+    splines = name != "vertices" or set(names) == {"vertices"}
+    return replace(settings, representation=name, control_points=settings.control_points if splines else None)
+
+
+def _refuse_unlike(targets: Sequence[_Target]) -> None:
+    first, second = (target.names for target in targets)
+    if len(first) != len(second) or (first != second and set(first) & set(second)):
+        lacking = sorted(set(first) ^ set(second))
+        shown = f" ({', '.join(lacking[:3])})" if lacking else ""
+        raise InputError(
+            f"{targets[0].name} has {len(first)} shapes and {targets[1].name} {len(second)}, and they are compared "
+            f"shape by shape; give the same ones in both{shown}."
+        )
+
+
+def _meshes(folder: Path, notes: list[str], *, quiet: bool) -> list[Mesh]:
+    found = mesh_files([folder])
+    notes += found.left_out
+    files = list(found.files)
+    for ending in _SURFACES:
+        if surfaces := [file for file in files if file.name.endswith(ending)]:
+            if len(surfaces) < len(files):
+                notes.append(f"{folder}: of {len(files)} meshes the {len(surfaces)} that end in {ending} are taken.")
+            files = surfaces
+            break
+    out: list[Mesh] = []
+    with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
+        for file in files:
+            try:
+                mesh = read_mesh(file)
+            except MeshError as error:
+                raise MeshError(naming(file, str(error))) from error
+            if not len(mesh.vertices):
+                raise MeshError(f"{file}: it has no vertices; leave it out.")
+            out.append(replace(mesh, name=file.name))
+            bar.update()
+    return out
+
+
+def _stem(path: Path) -> str:
+    for ending in _SURFACES:
+        if path.name.endswith(ending):
+            return path.name.removesuffix(ending)
+    return path.stem
+
+
+def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
+    """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
+    if folder is None or isinstance(target.what, ShapeModel):
+        return None
+    by_name = {_stem(file): file for file in mesh_files([folder]).files}
+    lacking = [name for name in target.names if name not in by_name]
+    if lacking:
+        raise InputError(f"{folder} has no scan of {', '.join(lacking[:3])}; scans are named as the surfaces are.")
+    with progress(len(target.names), "reading", "scan", quiet=quiet) as bar:
+        out: list[Mesh] = []
+        for name in target.names:
+            out.append(replace(read_mesh(by_name[name]), name=by_name[name].name))
+            bar.update()
+    for scan in out:
+        if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
+            raise MeshError(f"{scan.name}: its vertices are missing or not finite, so nothing can be judged by it.")
+    return out
+
+
+def _measure(target: _Target, options: QualityOptions, *, quiet: bool) -> ModelQuality:
+    unseen = [] if options.unseen is None else _meshes(options.unseen, [], quiet=quiet)
+    scans = _scans(target, options.scans, quiet=quiet)
+    with progress(None, f"measuring {target.name}, in", "step", quiet=quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step)
+
+
+def _measured(curve: Curve) -> Measured:
+    low, high = tuple(curve.low.tolist()), tuple(curve.high.tolist())
+    return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.at.tolist()), low=low, high=high)
+
+
+def _as_quality(target: _Target, found: ModelQuality, options: QualityOptions) -> Quality:
+    def told(curve: Curve | None) -> Measured | None:
+        return None if curve is None else _measured(curve)
+
+    size = found.by_shapes
+    by_shapes = None
+    if size is not None:
+        lists = (tuple(values.tolist()) for values in (size.mean, size.low, size.high))
+        mean, low, high = lists
+        by_shapes = BySize(shapes=tuple(size.at.tolist()), mean=mean, low=low, high=high)
+    return Quality(
+        name=target.name,
+        compactness=told(found.compactness),
+        generalisation=told(found.generalisation),
+        specificity=told(found.specificity),
+        generalisation_vertices=told(found.generalisation_vertices),
+        specificity_vertices=told(found.specificity_vertices),
+        reconstruction=told(found.reconstruction),
+        reconstruction_vertices=told(found.reconstruction_vertices),
+        generalisation_by_shapes=by_shapes,
+        supported_modes=found.supported_modes,
+        sentences=found.sentences(),
+        settings={
+            **asdict(target.settings),
+            "folds": found.folds,
+            "shapes": found.shapes,
+            "points": found.points,
+            "scans": None if options.scans is None else str(options.scans),
+            "unseen": None if options.unseen is None else str(options.unseen),
+        },
+    )
+
+
+def _told_apart(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
+    """Return in a sentence which of two generalises better, with all modes."""
+    curve = differences.get("generalisation", differences.get("reconstruction"))
+    if curve is None:
+        return []
+    off, low, high = (float(values[-1]) for values in (curve.mean, curve.low, curve.high))
+    said = f"the surfaces of {targets[1].name} are off by {off:+.3f} mm (95 %: {low:+.3f} to {high:+.3f}) against "
+    said += f"{targets[0].name}"
+    verdict = "no difference shows" if low <= 0 <= high else f"{targets[0 if off > 0 else 1].name} is better"
+    return [f"On unseen shapes with {curve.at[-1]} modes {said}: {verdict}."]
+
+
+def _draw(result: Quality, output: Path, notes: list[str]) -> None:
+    """Write the curves as PNG and SVG, where the extra `report` is there."""
+    if importlib.util.find_spec("matplotlib") is None or importlib.util.find_spec("PIL") is None:
+        notes.append('The curves are not drawn; pip install "shapespace[report]" adds what draws them.')
+        return
+    from shapespace.report import figures
+
+    figure = figures.quality_figure(result)
+    for ending in ("png", "svg"):
+        figures.save_figure(figure, output / f"quality.{ending}")

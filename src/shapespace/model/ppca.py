@@ -1,0 +1,226 @@
+"""Probabilistic principal components of shapes of which vertices are missing, by expectation and maximisation.
+
+A shape is mean + W y + e, with y normal of unit variance and e normal of variance `noise` in every coordinate. Each
+round takes the distribution of y given what a shape shows, mean and covariance (E), and then the distributions of the
+mean and W and the likeliest noise (M): each vertex from the shapes that show it. As the covariances count, what is
+missing does not narrow the variances. Roweis, NIPS 10, 1998; Tipping and Bishop, JRSS B 61(3), 1999.
+
+There are far more coordinates than shapes, so that the likeliest W alone follows the noise of what few shapes show, and
+fills worse than the mean does. So W has a normal prior, a width a mode, and its covariance counts too (variational
+Bayes: Bishop, ICANN 1999; Ilin and Raiko, JMLR 11, 2010); modes for which nothing speaks lose their width by
+themselves. Nothing of 3V x 3V is ever made: a round costs one K x K system a shape, and one a pattern of missing
+vertices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+_LEAST_NOISE = 1e-9
+"""Of the variance of a coordinate: shapes without noise have none that could be told."""
+_FIRST_NOISE = 1e-3
+"""Of the variance, at least: without noise nothing would move."""
+_STILL = 1e-5
+"""Nats a coordinate that is shown."""
+_MOST_ROUNDS = 60
+_BLOCK = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Ppca:
+    """What probabilistic PCA found of N shapes with V vertices, K modes and P patterns of missing vertices.
+
+    Args:
+        W: (V, 3, K + 1) mm, how each vertex moves with each of y, and last the mean.
+        W_covariance: (P, K + 1, K + 1) of each coordinate of the vertices of a pattern.
+        noise: variance of a coordinate that the modes leave over, mm^2.
+        y: (N, K + 1) means of the latent coefficients of each shape, in standard deviations, and last a one.
+        y_covariance: (N, K + 1, K + 1) of the same.
+        width: (K,) variance of a coordinate of each mode, mm^2.
+        patterns: which vertices are missing where.
+        bounds: (rounds,) of the log probability of what is shown, nats, up to a constant; they never fall.
+    """
+
+    W: FloatArray
+    W_covariance: FloatArray
+    noise: float
+    y: FloatArray
+    y_covariance: FloatArray
+    width: FloatArray
+    patterns: Patterns
+    bounds: FloatArray
+
+    def place(self, shape: int) -> FloatArray:
+        """Return where the missing vertices of a shape are expected, (M, 3) mm."""
+        return np.asarray(self.W[self.patterns.hidden[shape]] @ self.y[shape], dtype=np.float64)
+
+    def apart(self, shape: int) -> FloatArray:
+        """Return the variance (M,), mm^2, that each coordinate of a missing vertex has beside that by y."""
+        second = np.outer(self.y[shape], self.y[shape]) + self.y_covariance[shape]
+        known: FloatArray = np.asarray(np.einsum("pab,ab->p", self.W_covariance, second), dtype=np.float64)
+        beside: FloatArray = np.empty(len(self.patterns.hidden[shape]))
+        beside[:] = known[self.patterns.of_vertex[self.patterns.hidden[shape]]]
+        beside += self.noise
+        return beside
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """Which vertices are missing in which shapes, those of one pattern taken together.
+
+    Args:
+        missing: (P, N) True where the vertices of a pattern are missing in a shape.
+        of_vertex: (V,) the pattern of each.
+        count: (P,) how many vertices have it.
+        hidden: the missing vertices of each of the N shapes.
+    """
+
+    missing: BoolArray
+    of_vertex: IntArray
+    count: IntArray
+    hidden: tuple[IntArray, ...]
+
+    @staticmethod
+    def of(shown: BoolArray) -> Patterns:
+        """Return those of shapes of which the vertices `shown` (N, V) are there."""
+        packed, of_vertex, count = np.unique(
+            np.packbits(~shown, axis=0).T, axis=0, return_inverse=True, return_counts=True
+        )
+        missing = np.unpackbits(packed, axis=1, count=len(shown)).astype(np.bool_)
+        hidden = tuple(np.flatnonzero(~there).astype(np.int32) for there in shown)
+        return Patterns(missing, of_vertex.reshape(-1).astype(np.int32), count.astype(np.int32), hidden)
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """(P,) coordinates of each pattern."""
+        return 3.0 * self.count.astype(np.float64)
+
+
+def ppca(
+    shapes: FloatArray,
+    shown: BoolArray,
+    modes: int,
+    on_round: Callable[[int, float], None] | None = None,
+) -> Ppca:
+    """Return the probabilistic principal components of aligned `shapes`.
+
+    Args:
+        shapes: (N, V, 3) mm, with a guess of what is not shown, such as the mean; it is no more than where to begin.
+        shown: (N, V), each vertex in at least one shape.
+        modes: K, below N; those for which nothing speaks vanish.
+        on_round: called with the round and the bound of the log probability.
+    """
+    patterns, n_shown = Patterns.of(shown), 3 * int(shown.sum())
+    about = shapes.mean(axis=0)
+    centred = np.where(shown[:, :, None], shapes - about, 0.0)
+    size = float((centred**2).sum())
+    W, noise = _from_complete(shapes, modes)
+    width = np.maximum((W[:, :, :modes] ** 2).mean(axis=(0, 1)), _LEAST_NOISE * size / n_shown)
+    W_covariance = np.zeros((len(patterns.count), modes + 1, modes + 1))
+    bounds: list[float] = []
+    while True:
+        y, y_covariance, of_y = _expect(centred, patterns, W, W_covariance, noise)
+        ridge = np.append(noise / width, 0.0)
+        W, W_covariance, left, of_W = _maximise(centred, patterns, y, y_covariance, ridge, noise)
+        noise = max((size - left) / n_shown, _LEAST_NOISE * size / n_shown)
+        spread = np.einsum("pkk,p->k", W_covariance[:, :modes, :modes], patterns.weight)
+        width = ((W[:, :, :modes] ** 2).sum(axis=(0, 1)) + spread) / (3 * len(about))
+        bounds.append(of_y + of_W - 0.5 * (n_shown * np.log(noise) + 3 * len(about) * float(np.log(width).sum())))
+        if on_round is not None:
+            on_round(len(bounds), bounds[-1])
+        if len(bounds) == _MOST_ROUNDS or (len(bounds) > 1 and bounds[-1] - bounds[-2] <= _STILL * n_shown):
+            W[:, :, modes] += about
+            return Ppca(W, W_covariance, noise, y, y_covariance, width, patterns, np.array(bounds))
+
+
+def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
+    """Return W (V, 3, K + 1), with a mean of zero last, and the noise: the likeliest of complete shapes."""
+    n, vertices = shapes.shape[:2]
+    flat = (shapes - shapes.mean(axis=0)).reshape(n, -1)
+    values, vectors = np.linalg.eigh(flat @ flat.T)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    noise = max(float(values[modes:].sum()), _FIRST_NOISE * float(values.sum())) / (n * (flat.shape[1] - modes))
+    kept = np.maximum(values[:modes], 2 * n * noise)
+    W = (flat.T @ vectors[:, :modes]) * np.sqrt((kept / n - noise) / kept)
+    return np.column_stack([W, np.zeros(len(W))]).reshape(vertices, 3, modes + 1), noise
+
+
+def _expect(
+    centred: FloatArray,
+    patterns: Patterns,
+    W: FloatArray,
+    W_covariance: FloatArray,
+    noise: float,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return mean (N, K + 1) and covariance of y given what each shape shows, and its part of the bound.
+
+    With P Lambda^1/2 for W these are the systems (P_o^T P_o + noise Lambda^-1) b = P_o^T (x_o - mean_o), with the
+    covariance of W added to its square.
+    """
+    n, k = len(centred), W.shape[-1] - 1
+    flat = W.reshape(-1, k + 1)
+    weighted = W_covariance.reshape(len(patterns.count), -1) * patterns.weight[:, None]
+    whole = flat.T @ flat + weighted.sum(axis=0).reshape(k + 1, k + 1)
+    unseen = (patterns.missing.T.astype(np.float64) @ weighted).reshape(n, k + 1, k + 1)
+    y, covariance, bound = np.ones((n, k + 1)), np.zeros((n, k + 1, k + 1)), 0.0
+    for i in range(n):
+        hidden = W[patterns.hidden[i]].reshape(-1, k + 1)
+        square = whole - hidden.T @ hidden - unseen[i]
+        root: FloatArray = np.asarray(np.linalg.cholesky(square[:k, :k] + noise * np.eye(k)), dtype=np.float64)
+        half = np.asarray(solve_triangular(root, np.eye(k), lower=True), dtype=np.float64)
+        inverse = half.T @ half
+        y[i, :k] = inverse @ (flat[:, :k].T @ centred[i].reshape(-1) - square[:k, k])
+        covariance[i, :k, :k] = noise * inverse
+        bound += 0.5 * k * np.log(noise) - float(np.log(root.diagonal()).sum())
+        bound -= 0.5 * float(y[i, :k] @ y[i, :k] + covariance[i].trace())
+    return y, covariance, bound
+
+
+def _maximise(
+    centred: FloatArray,
+    patterns: Patterns,
+    y: FloatArray,
+    y_covariance: FloatArray,
+    ridge: FloatArray,
+    noise: float,
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return W (V, 3, K + 1) and its covariance by pattern, what it explains, and its part of the bound.
+
+    A vertex has its own normal equations, over the shapes that show it; they differ by the pattern of missing ones.
+
+    Args:
+        centred: (N, V, 3), zero where nothing is shown.
+        patterns: which vertices are missing where.
+        y: (N, K + 1).
+        y_covariance: (N, K + 1, K + 1).
+        ridge: (K + 1,) noise over the width of the prior.
+        noise: mm^2.
+    """
+    n, k1 = y.shape
+    products = (y[:, :, None] * y[:, None, :] + y_covariance).reshape(n, -1)
+    total = products.sum(axis=0) + np.diag(ridge).reshape(-1)
+    right = (y.T @ centred.reshape(n, -1)).T.reshape(-1, 3, k1)
+    W, covariance = np.empty_like(right), np.empty((len(patterns.count), k1, k1))
+    left, bound = 0.0, 0.0
+    for start in range(0, len(patterns.count), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        systems = (total - patterns.missing[part].astype(np.float64) @ products).reshape(-1, k1, k1)
+        inverse: FloatArray = np.asarray(np.linalg.inv(systems), dtype=np.float64)
+        covariance[part] = noise * inverse
+        weight = patterns.weight[part]
+        # Of these coordinates the trace of W's covariance times the products of y.
+        left -= noise * float(weight @ (k1 - np.einsum("pkk,k->p", inverse, ridge)))
+        bound += 0.5 * float(weight @ (k1 * np.log(noise) - np.linalg.slogdet(systems)[1]))
+    for start in range(0, len(W), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        W[part] = right[part] @ (covariance[patterns.of_vertex[part]] / noise)
+    # What the likeliest plane explains, with the pull of the prior taken off again.
+    left += float((W * right).sum() + (W**2 @ ridge).sum())
+    return W, covariance, left, bound

@@ -1,0 +1,492 @@
+"""How good a shape space is: compactness, generalisation and specificity over the number of modes, with intervals.
+
+Compactness is the share of the variance that the first modes hold. Generalisation is the error on shapes that the model
+did not see: in each fold poses, mean and modes are found anew without them, and each is told by the first modes in its
+best pose. Specificity is the distance of random shapes of the model from the nearest training shape. Davies, Twining,
+Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are told twice and never mixed:
+`vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point of the other
+surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson, 2007), the
+second does not see it at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.errors import CorrespondenceError, InputError
+from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
+from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import boundary_vertices
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
+
+_FEWEST = 3
+_FEWEST_TO_CHOOSE = 4
+_MOST_COUNTS, _MOST_SPECIFIC = 12, 6
+"""Numbers of modes that are tried; specificity takes longest."""
+_POINTS = 1000
+"""Vertices that distances between surfaces are measured at, spread evenly over their numbers."""
+_POSE_ROUNDS = 3
+_NEAREST = 2
+"""Training shapes nearest by vertices, of which the nearest by surface is taken."""
+_RESAMPLES = 2000
+_PARTS = (0.25, 0.5, 0.75, 1.0)
+_FAR = 0.05
+"""Of the size of a surface: what lies farther from its scan is no surface of it."""
+
+
+OnStep: TypeAlias = Callable[[int, int], None]
+"""Called with what is done and what there is to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A measure by the number of modes, or of training shapes.
+
+    Args:
+        at: (n,) numbers of modes or shapes.
+        mean: (n,) mm, or a share.
+        low: (n,) where its 95 % interval begins.
+        high: (n,) where it ends.
+        each: (S, n) of each shape or sample, where the mean is over them.
+    """
+
+    at: IntArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+    each: FloatArray | None = None
+
+    @staticmethod
+    def over(each: FloatArray, at: Sequence[int] | IntArray, seed: int) -> Curve:
+        """Return the mean over the rows of `each` (S, n) with its interval by bootstrap over rows (percentiles)."""
+        draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
+        weights = np.stack([np.bincount(draw, minlength=len(each)) for draw in draws]) / len(each)
+        low, high = np.percentile(weights @ each, [2.5, 97.5], axis=0)
+        return Curve(np.asarray(at, dtype=np.int32), each.mean(axis=0), np.asarray(low), np.asarray(high), each)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelQuality:
+    """What was measured of a shape space; None where the shapes or the model do not tell.
+
+    Args:
+        compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.
+        generalisation: mm, surface to surface, over shapes left out.
+        generalisation_vertices: the same, vertex to vertex.
+        specificity: mm, surface to surface, over random shapes.
+        specificity_vertices: the same, vertex to vertex.
+        reconstruction: mm, surface to surface, over unseen shapes that were given.
+        reconstruction_vertices: the same, vertex to vertex.
+        by_shapes: generalisation (vertices) with all modes by the number of training shapes.
+        supported_modes: the number that `build --modes auto` keeps.
+        shapes: how many there were.
+        folds: in how many parts they were left out.
+        points: at how many vertices distances between surfaces were measured.
+        seed: of all that is drawn.
+    """
+
+    compactness: Curve
+    generalisation: Curve | None = None
+    generalisation_vertices: Curve | None = None
+    specificity: Curve | None = None
+    specificity_vertices: Curve | None = None
+    reconstruction: Curve | None = None
+    reconstruction_vertices: Curve | None = None
+    by_shapes: Curve | None = None
+    supported_modes: int | None = None
+    shapes: int = 0
+    folds: int = 0
+    points: int = 0
+    seed: int = 0
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return how many modes the shapes support, and whether more shapes would help."""
+        told: list[str] = []
+        if self.supported_modes is not None:
+            what = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
+            told.append(
+                f"These {self.shapes} shapes support {what}: with more, hidden vertices of unseen shapes are foretold "
+                "no better."
+            )
+        if self.by_shapes is not None and len(self.by_shapes.at) > 1:
+            told.append(_more_shapes(self.by_shapes, self.seed))
+        return tuple(told)
+
+    def differences(self, other: ModelQuality) -> dict[str, Curve]:
+        """Return what `other` has less what this has, shape by shape, by the names of the measures.
+
+        Raises:
+            InputError: they are not of the same shapes in the same folds.
+        """
+        whole = self.shapes and other.shapes
+        if whole and (self.shapes, self.folds, self.seed) != (other.shapes, other.folds, other.seed):
+            raise InputError(
+                f"Only what was measured on the same shapes in the same folds can be compared, not {self.shapes} "
+                f"shapes in {self.folds} folds with {other.shapes} in {other.folds}."
+            )
+        out: dict[str, Curve] = {}
+        for name in ("generalisation", "generalisation_vertices", "reconstruction", "reconstruction_vertices"):
+            a, b = getattr(self, name), getattr(other, name)
+            if isinstance(a, Curve) and isinstance(b, Curve) and a.each is not None and b.each is not None:
+                at, own, others = np.intersect1d(a.at, b.at, return_indices=True)
+                if len(a.each) == len(b.each) and len(at):
+                    out[name] = Curve.over(b.each[:, others] - a.each[:, own], at.astype(np.int32), self.seed)
+        return out
+
+
+@dataclass(frozen=True)
+class QualitySettings:
+    """How quality is measured.
+
+    Args:
+        folds: in how many parts shapes are left out, at most one each; None for each by itself.
+        modes: the largest number; None for as many as the folds give.
+        samples: random shapes for the specificity.
+        seed: of folds and samples.
+        gauge: as of `ShapeModel.fit`.
+        align: whether to align the shapes.
+        representation: as of `ShapeModel.fit`.
+        control_points: as of `ShapeModel.fit`.
+
+    Raises:
+        InputError: numbers that cannot be.
+    """
+
+    folds: int | None = 10
+    modes: int | None = None
+    samples: int = 100
+    seed: int = 0
+    gauge: Gauge = "shape"
+    align: bool = True
+    representation: str = "vertices"
+    control_points: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.folds is not None and self.folds < 2:
+            raise InputError(f"Shapes are left out in at least two folds, not in {self.folds}.")
+        if self.samples < 2 or (self.modes is not None and self.modes < 1):
+            raise InputError("Quality needs at least two samples, and at least one mode.")
+
+    def model(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> ShapeModel:
+        """Return the shape space of `meshes`."""
+        return ShapeModel.fit(
+            meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
+            control_points=self.control_points, seed=self.seed,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A shape in correspondence, and the surface that it is judged against: its own, or the scan it was made from."""
+
+    shape: Mesh
+    surface: Mesh
+    engine: ClosestPointEngine
+    is_scan: bool
+
+    @staticmethod
+    def of(shape: Mesh, scan: Mesh | None) -> _Target:
+        surface = shape if scan is None else scan
+        engine = build_engine(surface)
+        if scan is not None:
+            far = float(np.median(engine.query(shape.vertices[_spread(len(shape.vertices))]).distance))
+            if far > _FAR * float(np.linalg.norm(np.ptp(shape.vertices, axis=0))):
+                raise InputError(
+                    f"{shape.name} lies {far:.1f} mm from its scan {scan.name}, so it is no surface of it; give the "
+                    "scans in the pose and unit of the surfaces."
+                )
+        return _Target(shape, surface, engine, scan is not None)
+
+
+@dataclass
+class _Steps:
+    """Counts what is done for whoever waits."""
+
+    total: int
+    on_step: OnStep | None
+    done: int = field(default=0)
+
+    def step(self) -> None:
+        self.done += 1
+        if self.on_step is not None:
+            self.on_step(self.done, self.total)
+
+
+def measure_quality(
+    target: Sequence[Mesh] | ShapeModel,
+    settings: QualitySettings | None = None,
+    *,
+    scans: Sequence[Mesh] | None = None,
+    unseen: Sequence[Mesh] = (),
+    on_step: OnStep | None = None,
+) -> ModelQuality:
+    """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
+
+    Args:
+        target: at least three meshes, mm; or a model, of which only compactness and what is measured on `unseen` can
+            be told, as it does not keep its training shapes.
+        settings: folds, modes, samples, seed, and what model to make; None for the usual ones.
+        scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
+        unseen: meshes in correspondence that no model saw.
+        on_step: called with what is done and what there is to do.
+
+    Raises:
+        CorrespondenceError: meshes differ in vertices or triangles.
+        InputError: too few meshes, all equal, missing vertices, or scans that are not theirs.
+    """
+    settings = settings or QualitySettings()
+    if isinstance(target, ShapeModel):
+        model, meshes = target, ()
+    else:
+        meshes = _checked(target)
+        model = settings.model(meshes)
+    if scans is not None and len(scans) != len(meshes):
+        raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
+    for mesh in unseen:
+        _refuse_other(mesh, model)
+    return (
+        _of_model(model, unseen, settings, on_step)
+        if not meshes
+        else _of_meshes(model, meshes, scans, unseen, settings, on_step)
+    )
+
+
+def _of_model(
+    model: ShapeModel, unseen: Sequence[Mesh], settings: QualitySettings, on_step: OnStep | None
+) -> ModelQuality:
+    counts = _counts(min(settings.modes or model.n_modes, model.n_modes))
+    share = model.cumulative_variance[counts - 1]
+    told = _unseen(model, unseen, counts, settings, _Steps(len(unseen), on_step))
+    return ModelQuality(
+        Curve(counts, share, share, share),
+        reconstruction=told[0],
+        reconstruction_vertices=told[1],
+        points=_points(model.n_vertices),
+        seed=settings.seed,
+    )
+
+
+def _of_meshes(
+    model: ShapeModel,
+    meshes: Sequence[Mesh],
+    scans: Sequence[Mesh] | None,
+    unseen: Sequence[Mesh],
+    settings: QualitySettings,
+    on_step: OnStep | None,
+) -> ModelQuality:
+    parts = _parts(len(meshes), settings)
+    most = len(meshes) - max(len(part) for part in parts) - 1
+    counts = _counts(min(settings.modes or most, most))
+    few = counts[np.unique(np.linspace(0, len(counts) - 1, min(len(counts), _MOST_SPECIFIC)).round().astype(int))]
+    steps = _Steps(len(meshes) * 2 + len(unseen) + settings.samples, on_step)
+    targets = [_Target.of(m, None if scans is None else scans[i]) for i, m in enumerate(meshes)]
+    errors, by_shapes = _left_out(targets, parts, counts, settings, steps)
+    general = _curves(errors, counts, settings.seed)
+    specific = _curves(_specificity(model, meshes, few, settings, steps), few, settings.seed)
+    told = _unseen(model, unseen, counts, settings, steps)
+    return ModelQuality(
+        _compactness(model, meshes, counts, settings),
+        generalisation=general[0],
+        generalisation_vertices=general[1],
+        specificity=specific[0],
+        specificity_vertices=specific[1],
+        reconstruction=told[0],
+        reconstruction_vertices=told[1],
+        by_shapes=by_shapes,
+        supported_modes=settings.model(meshes, "auto").n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
+        shapes=len(meshes),
+        folds=len(parts),
+        points=_points(model.n_vertices),
+        seed=settings.seed,
+    )
+
+
+def _checked(meshes: Sequence[Mesh]) -> Sequence[Mesh]:
+    if len(meshes) < _FEWEST:
+        raise InputError(
+            f"Quality is measured on shapes left out, which takes at least three meshes, not {len(meshes)}."
+        )
+    common_faces(meshes)
+    for mesh in meshes:
+        if not np.isfinite(mesh.vertices).all():
+            raise InputError(
+                f"{mesh.name}: vertices are missing or not finite, and quality is measured on whole meshes; fill or "
+                "cut it, or leave it out."
+            )
+    return meshes
+
+
+def _refuse_other(mesh: Mesh, model: ShapeModel) -> None:
+    if len(mesh.vertices) != model.n_vertices:
+        raise CorrespondenceError(
+            f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {model.n_vertices}; unseen shapes must "
+            "be in correspondence with it."
+        )
+
+
+def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Curve]:
+    """Return the curves of errors (S, n, 2): of surfaces, and of vertices."""
+    return Curve.over(errors[:, :, 1], counts, seed), Curve.over(errors[:, :, 0], counts, seed)
+
+
+def _unseen(
+    model: ShapeModel, unseen: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+) -> tuple[Curve, Curve] | tuple[None, None]:
+    if not unseen:
+        return None, None
+    errors = _over_shapes(model, [_Target.of(m, None) for m in unseen], counts, steps)
+    return _curves(errors, counts, settings.seed)
+
+
+def _counts(most: int) -> IntArray:
+    """Return numbers of modes from 1 to `most`, a few and closer at the start."""
+    spaced = {round(most ** (step / max(_MOST_COUNTS - 1, 1))) for step in range(_MOST_COUNTS)}
+    return np.array(sorted(spaced), dtype=np.int32)
+
+
+def _parts(n: int, settings: QualitySettings) -> list[IntArray]:
+    folds = n if settings.folds is None else min(settings.folds, n)
+    order = np.random.default_rng(settings.seed).permutation(n).astype(np.int32)
+    return [np.asarray(part, dtype=np.int32) for part in np.array_split(order, folds)]
+
+
+def _points(vertices: int) -> int:
+    return min(vertices, _POINTS)
+
+
+def _spread(vertices: int) -> IntArray:
+    return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
+
+
+def _left_out(
+    targets: Sequence[_Target], parts: Sequence[IntArray], counts: IntArray, settings: QualitySettings, steps: _Steps
+) -> tuple[FloatArray, Curve]:
+    """Return the errors of shapes left out (N, n, 2), and of their vertices by the number of training shapes."""
+    n = len(targets)
+    errors, rng = np.zeros((n, len(counts), 2)), np.random.default_rng(settings.seed + 1)
+    least = n - max(len(part) for part in parts)
+    sizes = sorted({max(2, round(share * least)) for share in _PARTS})
+    by_size = np.zeros((n, len(sizes)))
+    for part in parts:
+        order = [int(i) for i in rng.permutation(n) if i not in part]
+        held: list[_Target] = [targets[int(i)] for i in part]
+        model = settings.model([targets[i].shape for i in sorted(order)])
+        errors[part] = _over_shapes(model, held, counts, steps)
+        for column, size in enumerate(sizes):
+            fewer = settings.model([targets[i].shape for i in sorted(order[:size])])
+            k = min(settings.modes or size - 1, size - 1)
+            only = np.array([k], dtype=np.int32)
+            by_size[part, column] = [_told(fewer, one, only, surface=False)[0, 0] for one in held]
+        for _ in held:
+            steps.step()
+    return errors, Curve.over(by_size, sizes, settings.seed)
+
+
+def _over_shapes(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
+    out = np.zeros((len(targets), len(counts), 2))
+    for row, target in enumerate(targets):
+        out[row] = _told(model, target, counts)
+        steps.step()
+    return out
+
+
+def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
+    """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
+    shape, mean = target.shape.vertices, model.mean_vertices
+    modes = np.ascontiguousarray(model.vertex_basis.T)
+    T_model_shape = fit_similarity(shape, mean, with_scale=model.gauge == "shape")
+    out = np.zeros((len(counts), 2))
+    for column, k in enumerate(counts):
+        first, told = modes[:k], mean
+        for _ in range(_POSE_ROUNDS):
+            told = mean + ((first @ (T_model_shape.apply(shape) - mean).reshape(-1)) @ first).reshape(-1, 3)
+            T_model_shape = fit_similarity(shape, told, with_scale=model.gauge == "shape")
+        fitted = T_model_shape.inverse().apply(told)
+        out[column, 0] = np.linalg.norm(fitted - shape, axis=1).mean()
+        if surface:
+            out[column, 1] = _apart(target.shape.with_vertices(fitted), target)
+    return out
+
+
+def _apart(fitted: Mesh, target: _Target) -> float:
+    """Return the mean of both mean distances between two surfaces, mm, each at points spread over it."""
+    there = target.engine.query(fitted.vertices[_spread(len(fitted.vertices))]).distance.mean()
+    back = build_engine(fitted).query(target.surface.vertices[_spread(len(target.surface.vertices))])
+    counted: BoolArray = np.ones(len(back.distance), dtype=np.bool_)
+    if target.is_scan:
+        # A scan may show more than the surface covers.
+        counted = ~on_boundary(back, fitted, boundary_vertices(fitted))
+    return float(0.5 * (there + (back.distance[counted].mean() if counted.any() else there)))
+
+
+def _specificity(
+    model: ShapeModel, meshes: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+) -> FloatArray:
+    """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
+    mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
+    scaled = model.gauge == "shape"
+    posed = [
+        m.with_vertices(fit_similarity(m.vertices, mean, with_scale=scaled).apply(m.vertices)) if settings.align else m
+        for m in meshes
+    ]
+    trained = [_Target.of(m, None) for m in posed]
+    picked = _spread(model.n_vertices)
+    vertices = np.stack([m.vertices[picked] for m in posed])
+    out = np.zeros((settings.samples, len(counts), 2))
+    for row, b in enumerate(model.sample(settings.samples, np.random.default_rng(settings.seed + 2))):
+        for column, k in enumerate(counts):
+            shape = mean + (b[:k] @ modes[:k]).reshape(-1, 3)
+            off = np.linalg.norm(vertices - shape[picked], axis=2).mean(axis=1)
+            drawn, nearest = posed[0].with_vertices(shape), [int(i) for i in np.argsort(off, kind="stable")[:_NEAREST]]
+            out[row, column, 0] = off.min()
+            out[row, column, 1] = min(_apart(drawn, trained[i]) for i in nearest)
+        steps.step()
+    return out
+
+
+def _compactness(model: ShapeModel, meshes: Sequence[Mesh], counts: IntArray, settings: QualitySettings) -> Curve:
+    """Return the share of the variance that the first modes hold, its interval by jackknife over shapes."""
+    modes, mean = model.vertex_basis, model.mean_vertices
+    T = [fit_similarity(m.vertices, mean, with_scale=model.gauge == "shape") for m in meshes]
+    posed = [t.apply(m.vertices) if settings.align else m.vertices for t, m in zip(T, meshes, strict=True)]
+    flat = np.stack(posed).reshape(len(meshes), -1) - mean.reshape(-1)
+    gram = flat @ flat.T
+    share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
+    n, kept = len(meshes), min(modes.shape[1], model.n_modes)
+    rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
+    without = np.stack([_shares(gram[np.ix_(some, some)], counts, kept) for some in rest])
+    spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    return Curve(counts, share, np.maximum(share - spread, 0.0), np.minimum(share + spread, 1.0))
+
+
+def _shares(gram: FloatArray, counts: IntArray, kept: int) -> FloatArray:
+    centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
+    values = np.maximum(np.linalg.eigvalsh(centred)[::-1], 0.0)
+    return np.cumsum(values)[np.minimum(counts, min(kept, len(values))) - 1] / values.sum()
+
+
+def _more_shapes(by_shapes: Curve, seed: int) -> str:
+    """Return in a sentence what more training shapes did to the error, and so would do."""
+    each, at = by_shapes.each, by_shapes.at
+    if each is None:
+        return ""
+    few = int(np.argmin(np.abs(at - at[-1] / 2)))
+    few = min(few, len(at) - 2)
+    draws = np.random.default_rng(seed).integers(len(each), size=(_RESAMPLES, len(each)))
+    fell = 1 - each[draws, -1].mean(axis=1) / each[draws, few].mean(axis=1)
+    now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
+    low, high = 100 * np.percentile(fell, [2.5, 97.5])
+    changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
+    said = f"From {at[few]} to {at[-1]} training shapes the error on unseen ones {changed} "
+    said += f"(95 %: {low:.0f} to {high:.0f} %), "
+    if low > 0 and now >= 5:
+        return said + "so more shapes would help."
+    return said + (
+        "so more shapes would help little." if high < 10 else "so these shapes do not tell whether more would help."
+    )
