@@ -68,3 +68,13 @@ def test_bad_input_is_one_sentence(run: Run, raw: Path, tmp_path: Path) -> None:
     assert twice.code == 2 and "at least 2 scans, not 1" in twice.sentence()
     gone = run("correspond", raw, "-o", tmp_path / "c", "--template", tmp_path / "no.ply", *QUICK)
     assert gone.code == 2 and "no.ply" in gone.sentence()
+
+
+def test_a_later_run_leaves_no_surface_of_another_template(run: Run, raw: Path, tmp_path: Path) -> None:
+    scans = [raw / f"blob{k}.ply" for k in range(3)]
+    assert run("correspond", *scans, "-o", tmp_path, *QUICK).code == 0
+    again = run("correspond", *scans[1:], "-o", tmp_path, *QUICK)
+    assert again.code == 0 and "Results of 1 scans that are not among those given were removed" in again.err
+    assert not list(tmp_path.glob("blob0*"))
+    mixed = run("correspond", tmp_path, *scans[:2], "-o", tmp_path, *QUICK)
+    assert mixed.code == 0 and "2 surfaces of an earlier correspondence are not taken for scans" in mixed.err

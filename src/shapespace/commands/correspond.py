@@ -72,6 +72,8 @@ def correspond_files(
     for sentence in found.left_out:
         say(sentence)
     paths = list(dict.fromkeys(path for path in found.files if not path.name.endswith(SURFACE)))
+    if len(paths) < len(set(found.files)):
+        say(f"{len(set(found.files)) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
     names = names_for(paths, None)
     make_folder(folder)
     scans, unread = _read_all(paths, names, quiet=quiet)
@@ -81,6 +83,7 @@ def correspond_files(
         first = first_template(list(scans.values()), template, settings)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
     records = _records(made, list(scans), names, paths, unread, folder)
+    _forget_others({record.name for record in records}, folder, say)
     _write(made, records, list(scans), folder)
     summary = CorrespondenceRecord(
         template=made.why,
@@ -168,6 +171,16 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         write_text(folder / f"{record.name}{RECORD}", _json(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
+
+
+def _forget_others(names: set[str], folder: Path, say: Callable[[str], None]) -> None:
+    """Remove surfaces of an earlier run of scans that are not in this one: they are on another template."""
+    old = [file for file in sorted(folder.glob(f"*{RECORD}")) if file.name.removesuffix(RECORD) not in names]
+    for file in old:
+        remove_file(folder / (file.name.removesuffix(RECORD) + SURFACE))
+        remove_file(file)
+    if old:
+        say(f"Results of {len(old)} scans that are not among those given were removed from {folder}.")
 
 
 def _json(record: CorrespondRecord | CorrespondenceRecord) -> str:
