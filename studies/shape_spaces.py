@@ -28,6 +28,7 @@ from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.surface import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.model.floor import floor_mm
+from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import BSplineSurface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
@@ -256,7 +257,10 @@ def _surface_mm(vertices: FloatArray, truth: Mesh) -> float:
 def _trained_on(
     compared: ShapeSpaces, training: Sequence[Mesh], others: Sequence[Mesh], kind: str, noise_mm: float, missing: float
 ) -> float | None:
-    """Return the floor for others, mm, of a model of damaged meshes; None where it cannot be made."""
+    """Return the floor for others, mm, of a model of damaged meshes; None where it cannot be made.
+
+    A model of vertices leaves out those that hardly any of the meshes show; they do not count in its floor.
+    """
     rng = np.random.default_rng(11)
     damaged: list[Mesh] = []
     for mesh in training:
@@ -268,7 +272,9 @@ def _trained_on(
         model = compared.model(damaged, kind, align=False)
     except InputError:
         return None
-    return float(np.mean([floor_mm(model, mesh.vertices) for mesh in others]))
+    kept = Kept.of(damaged, MIN_SEEN).vertices
+    shown = kept if model.n_vertices == kept.sum() else np.ones(len(kept), dtype=np.bool_)
+    return float(np.mean([floor_mm(model, mesh.vertices[shown]) for mesh in others]))
 
 
 # The second comparison: expressions from one PCA in each shape space

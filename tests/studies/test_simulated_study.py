@@ -163,7 +163,7 @@ def test_shape_spaces_are_compared_in_tables_of_the_report_and_go_on(
     names = ["vertices", "bspline 8x8", "bspline-detail 8x8"]
     assert [row[0] for row in tables_of["Vertices and control points at 4 modes"]["rows"]] == names
     damaged = {row[0]: row[1:] for row in tables_of["The same models made of damaged meshes"]["rows"]}
-    assert damaged["vertices"][2] is None and damaged["bspline 8x8"][2] > 0 and damaged["vertices"][1] > 0
+    assert all(floor > 0 for floor in damaged["vertices"]) and damaged["bspline 8x8"][2] > 0
     assert len(tables_of["Expressions told in each shape space"]["rows"]) == 2
     overlap = {tuple(row[:2]): row[3] for row in tables_of["What lies double when a face is laid out flat"]["rows"]}
     assert overlap["ICT-FaceKit", "cylinder"] > 0.02 and overlap["ICT-FaceKit", "disc"] < 1e-6
