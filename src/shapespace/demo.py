@@ -6,7 +6,6 @@ is written as plain files, and the report reads nothing but those.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -47,7 +46,7 @@ from shapespace.schemas import (
     FitRecord,
     ManyPeople,
     VertexErrors,
-    to_json,
+    json_text,
 )
 from shapespace.types import FloatArray, Mesh, Similarity
 from shapespace.version import __version__
@@ -136,7 +135,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
             experiment2=second,
             paper_table=tuple(_paper_table(folder, first, second)),
         )
-        write_text(folder / "demo.json", json.dumps(to_json(demo), indent=1, allow_nan=False) + "\n")
+        write_text(folder / "demo.json", json_text(demo))
         clock.step("report")
         return write_report(folder)
 

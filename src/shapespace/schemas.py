@@ -7,6 +7,7 @@ wrong with it. Keys that a version does not know are passed over, so that what l
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, TypeVar, cast, get_args
@@ -46,6 +47,11 @@ def to_json(content: object) -> Any:
     Numbers that are not finite become null, and numbers of numpy plain ones.
     """
     return _finite(msgspec.to_builtins(content, enc_hook=lambda value: value.item()))
+
+
+def json_text(content: object) -> str:
+    """Return what `to_json` gives as the text of a file."""
+    return json.dumps(to_json(content), indent=1, allow_nan=False) + "\n"
 
 
 def _finite(value: Any) -> Any:

@@ -8,9 +8,11 @@ import pytest
 
 from raw_blobs import raw_blob
 from shapespace.batch.rounds import KeptRounds
+from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.rounds import CorrespondSettings, correspond
+from shapespace.correspondence.template import Glance, resampled
 from shapespace.types import Mesh
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
@@ -83,3 +85,12 @@ def test_processes_give_what_one_process_gives(scans: list[Mesh], tmp_path: Path
     there = correspond(scans, SETTINGS, run=kept(tmp_path / "there", jobs=2))
     for one, other in zip(here.scans, there.scans, strict=True):
         np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-9)
+
+
+def test_what_poses_are_found_with_is_part_of_a_task(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
+    mesh = resampled(scans[0], 400)
+    harmonics, task = Harmonics.of(mesh, 60), PlaceTask(0, scans[1], None, None, QUICK)
+    alone, taught = Glance.of(mesh), Glance.of(mesh, np.stack([mesh.vertices, 1.1 * mesh.vertices**2 / 100.0]))
+    for glance in (alone, taught, alone):
+        list(kept(tmp_path)(Workbench(mesh, harmonics, (glance,), 0), [task]))
+    assert placed == [0, 0]

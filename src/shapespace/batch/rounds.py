@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed, wait
 from dataclasses import asdict, dataclass, replace
@@ -22,6 +21,7 @@ from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FitError
 from shapespace.io.files import atomic_path, make_folder
+from shapespace.io.hdf5 import content_hash
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
 from shapespace.version import __version__
@@ -53,12 +53,10 @@ class KeptRounds:
             FitError: a worker was stopped from outside.
         """
         make_folder(self.folder)
-        shared = _hash_of(
-            {"vertices": np.array(bench.mesh.vertices), "faces": np.array(bench.mesh.faces)}, str(bench.seed)
-        )
+        shared = [_shared_hash(bench, glance) for glance in bench.glances]
         left: list[tuple[PlaceTask, Path]] = []
         for task in tasks:
-            file = self.folder / f"{_key(task, shared[task.glance], bench)}.npz"
+            file = self.folder / f"{_key(task, shared[task.glance])}.npz"
             placed = _read(file, task.index)
             if placed is None:
                 left.append((task, file))
@@ -167,17 +165,14 @@ def _pose_of(arrays: Mapping[str, npt.NDArray[Any]]) -> Similarity:
     return Similarity(float(arrays["scale"]), arrays["rotation"], arrays["translation"])
 
 
-def _key(task: PlaceTask, shared: str, bench: Workbench) -> str:
-    arrays = _task_arrays(task) | {"template": np.array(bench.mesh.vertices), "triangles": np.array(bench.mesh.faces)}
-    return _hash_of(arrays, f"{shared} {task.settings} {__version__}")
+def _shared_hash(bench: Workbench, glance: Glance) -> str:
+    """Return the hash of what the tasks that look through `glance` share."""
+    template = {"template": np.array(bench.mesh.vertices), "triangles": np.array(bench.mesh.faces)}
+    return content_hash(_glance_arrays(glance) | template, {"seed": bench.seed})
 
 
-def _hash_of(arrays: Arrays, more: str) -> str:
-    told = hashlib.sha256(more.encode())
-    for name, array in sorted(arrays.items()):
-        told.update(f"{name} {array.shape} {array.dtype}".encode())
-        told.update(np.ascontiguousarray(array).tobytes())
-    return told.hexdigest()[:32]
+def _key(task: PlaceTask, shared: str) -> str:
+    return content_hash(_task_arrays(task), {"shared": shared, "settings": str(task.settings), "version": __version__})
 
 
 def _write(file: Path, placed: Placed) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -27,7 +26,7 @@ from shapespace.errors import ShapespaceError
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh, write_mesh
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, to_json
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
@@ -94,7 +93,7 @@ def correspond_files(
         settings=asdict(settings),
         version=__version__,
     )
-    write_text(folder / SUMMARY, _json(summary))
+    write_text(folder / SUMMARY, json_text(summary))
     shutil.rmtree(folder / _KEPT, ignore_errors=True)
     return summary, records
 
@@ -168,7 +167,7 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
             remove_file(surface)
         else:
             write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name))
-        write_text(folder / f"{record.name}{RECORD}", _json(record))
+        write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
 
@@ -181,7 +180,3 @@ def _forget_others(names: set[str], folder: Path, say: Callable[[str], None]) ->
         remove_file(file)
     if old:
         say(f"Results of {len(old)} scans that are not among those given were removed from {folder}.")
-
-
-def _json(record: CorrespondRecord | CorrespondenceRecord) -> str:
-    return json.dumps(to_json(record), indent=1, allow_nan=False) + "\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from shapespace.io.meshes import read_mesh
 from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import BySize, Measured, Quality, to_json
+from shapespace.schemas import BySize, Measured, Quality, json_text
 from shapespace.types import Mesh
 
 _MODELS = (".h5", ".hdf5")
@@ -94,7 +93,7 @@ def quality(
                 "generalisation and specificity only of a folder"
                 + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
             )
-    write_text(output / "quality.json", json.dumps(to_json(result), indent=1, allow_nan=False) + "\n")
+    write_text(output / "quality.json", json_text(result))
     with waiting("drawing the curves", quiet=quiet):
         _draw(result, output, notes)
     return result, notes

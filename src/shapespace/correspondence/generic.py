@@ -29,9 +29,8 @@ def generic_model(mesh: Mesh, harmonics: Harmonics, known: FloatArray | None = N
             variance.
     """
     size = rms_size(mesh.vertices)
-    count, vertices = min(MODES, harmonics.functions.shape[1]), len(mesh.vertices)
-    stddev = np.exp(-0.5 * harmonics.squared_frequency[:count] * (RANGE_SHARE * size) ** 2)
-    columns = np.kron(harmonics.functions[:, :count] * stddev, np.eye(3))
+    slow, vertices = harmonics.slowest(MODES), len(mesh.vertices)
+    columns = np.kron(slow.functions * slow.kept(RANGE_SHARE * size), np.eye(3))
     columns *= AMPLITUDE_SHARE * size * np.sqrt(vertices / float((columns**2).sum()))
     if known is not None:
         seen = (known - known.mean(axis=0)).reshape(len(known), -1).T / np.sqrt(max(len(known) - 1, 1))

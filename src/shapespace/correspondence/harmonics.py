@@ -56,7 +56,10 @@ class Harmonics:
         """Return (K, C) of the functions in `field` (V, C)."""
         return self.functions.T @ (self.area[:, None] * field)
 
+    def kept(self, range_mm: float) -> FloatArray:
+        """Return (K,) what is left of each function after heat has spread by `range_mm`."""
+        return np.exp(-0.5 * self.squared_frequency * range_mm**2)
+
     def diffused(self, field: FloatArray, range_mm: float) -> FloatArray:
         """Return `field` (V, C) after heat has spread by `range_mm`, the standard deviation of a peak."""
-        kept = np.exp(-0.5 * self.squared_frequency * range_mm**2)
-        return self.functions @ (kept[:, None] * self.coefficients(field))
+        return self.functions @ (self.kept(range_mm)[:, None] * self.coefficients(field))

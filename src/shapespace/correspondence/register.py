@@ -195,7 +195,7 @@ def _averaged(
     """Return (V, 3) the average (1) of forces at the vertices `own`, everywhere."""
     functions, area = harmonics.functions[own], harmonics.area[own]
     area = area * (harmonics.area.sum() / area.sum())
-    kept = np.exp(-0.5 * harmonics.squared_frequency * range_mm**2)[:, None]
+    kept = harmonics.kept(range_mm)[:, None]
     weighed = np.column_stack([weight[:, None] * force, weight])
     spread = harmonics.functions @ (kept * (functions.T @ (area[:, None] * weighed)))
     return spread[:, :3] / np.maximum(spread[:, 3:], floor)

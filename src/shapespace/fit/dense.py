@@ -27,14 +27,13 @@ from shapespace.fit.moving_model import MovingSurface, Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.weights import spread
-from shapespace.geometry.surface import face_vectors, rms_size, vertex_areas
+from shapespace.geometry.laplacian import half_cotangents, owned_areas
+from shapespace.geometry.surface import face_vectors, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _FEWEST_MATCHES = 30
 _FEWEST_PAIRS = 100
-_WELL_SHAPED = 0.05
-"""Vertices own at least this share of the median area: slivers would be infinitely stiff."""
 _HALVINGS = 8
 _SEEN = 0.1
 """Matches that together weigh as much show a vertex; a good one weighs 1."""
@@ -253,17 +252,12 @@ def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
     off = np.zeros(len(keys))
     for k in range(3):
         i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        u, v = x[i] - x[o], x[j] - x[o]
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        # Obtuse triangles have negative weights, and slivers huge ones.
-        half = 0.5 * np.clip(np.einsum("fd,fd->f", u, v) / np.maximum(sine, 1e-12), 0.02, 50.0)
+        half = half_cotangents(x, i, j, o)
         for a, b in ((i, j), (j, i)):
             off -= np.bincount(np.searchsorted(keys, a * count + b), half, len(keys))
     rows = np.repeat(np.arange(count), np.diff(topology.ring_start))
     diagonal: FloatArray = np.asarray(-np.bincount(rows, off, count), dtype=np.float64)
-    area = vertex_areas(Mesh(x, topology.faces))
-    area = np.maximum(area, _WELL_SHAPED * np.median(area[topology.used]))
-    return _Laplacian(off, diagonal, area)
+    return _Laplacian(off, diagonal, owned_areas(Mesh(x, topology.faces)))
 
 
 def unfolded(

@@ -27,15 +27,19 @@ def cotangent_laplacian(mesh: Mesh) -> tuple[Any, FloatArray]:
     corners = [(faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]) for k in range(3)]
     rows = np.concatenate([np.concatenate([i, j, i, j]) for i, j, _ in corners])
     columns = np.concatenate([np.concatenate([j, i, i, j]) for i, j, _ in corners])
-    weights = [_half_cotangents(x, *corner) for corner in corners]
+    weights = [half_cotangents(x, *corner) for corner in corners]
     values = np.concatenate([np.concatenate([-half, -half, half, half]) for half in weights])
     laplacian = cast(Any, sparse).coo_array((values, (rows, columns)), shape=(count, count)).tocsr()
+    return laplacian, owned_areas(mesh)
+
+
+def owned_areas(mesh: Mesh) -> FloatArray:
+    """Return the area (V,) of each vertex, which for slivers is taken for larger than it is."""
     area = vertex_areas(mesh)
-    used = area[np.unique(faces)]
-    return laplacian, np.maximum(area, WELL_SHAPED * float(np.median(used)))
+    return np.maximum(area, WELL_SHAPED * np.median(area[np.unique(faces_of(mesh))]))
 
 
-def _half_cotangents(
+def half_cotangents(
     x: FloatArray, i: npt.NDArray[np.int64], j: npt.NDArray[np.int64], o: npt.NDArray[np.int64]
 ) -> FloatArray:
     """Return half the cotangent of the angle at the corners `o` (F,), opposite the edges from `i` to `j`."""
