@@ -34,7 +34,7 @@ _OTHERS_SAY = 0.95
 """A pose that the other shapes make likelier than all others is tried beside the one there is."""
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
-"""Share of their length by which the normals of a sheet point away from its middle when it is clear which way it bulges."""
+"""How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
 _FEW_HARMONICS = 4
 _MEASURED = 20_000
 _FAR = (np.inf, np.inf, np.inf, np.inf)
@@ -150,7 +150,9 @@ class Workbench:
 
     def _from(self, task: PlaceTask, T: Similarity) -> Placed:
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
-        target = ScanTarget(_facing(scan, self.mesh if task.expected is None else self.mesh.with_vertices(task.expected)))
+        target = ScanTarget(
+            _facing(scan, self.mesh if task.expected is None else self.mesh.with_vertices(task.expected))
+        )
         found = register(
             self.template, target, Similarity.identity(), task.settings, expected=task.expected, seed=self.seed
         )
@@ -192,7 +194,7 @@ class Workbench:
 
 
 def _facing(scan: Mesh, surface: Mesh) -> Mesh:
-    """Return `scan`, turned where it looks against `surface`, on which it lies; only an open sheet is, as much bowl as cap.
+    """Return `scan`, turned where it looks against `surface`, on which it lies; only sheets as much bowl as cap are.
 
     The normals of others tell which side is outside, and so which of two poses is right.
     """

@@ -18,6 +18,7 @@ from shapespace.correspondence.guide import Others, aligned, told_by_others
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
+from shapespace.correspondence.scans import copies
 from shapespace.correspondence.template import Glance, choose, clean, given, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
@@ -215,8 +216,7 @@ def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
 
 
 def _refuse_equal(scans: Sequence[Mesh]) -> None:
-    first = scans[0].vertices
-    if all(scan.vertices.shape == first.shape and np.array_equal(scan.vertices, first) for scan in scans[1:]):
+    if len(copies(scans)) == len(scans) - 1:
         raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different ones.")
 
 

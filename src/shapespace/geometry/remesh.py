@@ -50,7 +50,7 @@ def collapse(
     asked = _asked(vertices, faces, name)
     coarse, left, _, origin = _igl().decimate(*asked, triangles)
     if not len(left):
-        raise MeshError(f"{name} cannot be re-triangulated, since borders of it touch each other; clean the mesh first.")
+        raise MeshError(f"{name} cannot be re-triangulated, since borders of it touch; clean the mesh first.")
     return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64), np.asarray(origin, dtype=np.int64)
 
 
