@@ -65,7 +65,9 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def check_format(content: object, kind: type[FitRecord] | type[Recognition], where: str, again: str) -> None:
+def check_format(
+    content: object, kind: type[FitRecord] | type[CorrespondenceRecord] | type[Recognition], where: str, again: str
+) -> None:
     """Refuse what is not a file of the format of `kind` and its version; a file without a version is of the first.
 
     Raises:

@@ -49,7 +49,7 @@ class SurfaceFiles:
     def _others(self) -> str:
         named = ", ".join(path.name for path in list(self.unit_ratios)[:_NAMED])
         named += ", ..." if len(self.unit_ratios) > _NAMED else ""
-        of = "mesh is" if len(self.unit_ratios) == 1 else "meshes are"
+        of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
         return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({named})"
 
 
