@@ -158,13 +158,20 @@ class Workbench:
         )
         start = found.T_scan_template.apply(found.vertices)
         dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
-        covered, distance = self._judged(dense.vertices_scan_mm, dense.seen, target)
+        seen = dense.seen & self._reached(dense.vertices_scan_mm, target)
+        covered, distance = self._judged(dense.vertices_scan_mm, seen, target)
         back = found.T_scan_template.inverse()
         mean, p95, p99, largest = (back.scale * length for length in distance)
         return Placed(
-            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, dense.seen, covered,
+            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, seen, covered,
             (mean, p95, p99, largest), 0.0,
         )  # fmt: skip
+
+    def _reached(self, vertices: FloatArray, target: ScanTarget) -> BoolArray:
+        """Return (V,) which vertices lie on the scan; what is seen on a rim goes on for a little beyond it."""
+        if target.mesh.faces is None:
+            return np.ones(len(vertices), dtype=np.bool_)
+        return target.engine.query(vertices).distance < REACHED * self.template.size_mm
 
     def _judged(
         self, vertices: FloatArray, seen: BoolArray, target: ScanTarget
