@@ -1,4 +1,4 @@
-"""A correspondence that is stopped, or meets a full disk or other scans, leaves whole files and goes on where it was."""
+"""A correspondence that is stopped, or meets a full disk or other scans, leaves whole files and goes on from there."""
 
 import errno
 import shutil

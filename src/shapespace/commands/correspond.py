@@ -188,9 +188,10 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, template: M
         say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
     if others := [record for record in records if record.unit_ratio != 1.0]:
         named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
+        what = "scans is" if len(others) == 1 else "scans are"
         say(
-            f"{len(others)} of {len(records)} scans are in another unit than most, as sizes tell ({named}); their "
-            "surfaces are in that unit too, and build brings them to that of most."
+            f"{len(others)} of {len(records)} {what} in another unit than most, as sizes tell ({named}); so are the "
+            "surfaces, and build brings them to that of most."
         )
 
 
