@@ -19,6 +19,7 @@ from shapespace.errors import FileFormatError
 
 Status = Literal["converged", "max_iterations", "doubtful", "failed"]
 FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
+CORRESPOND_AGAIN = "run shapespace correspond again"
 _T = TypeVar("_T")
 
 
@@ -64,7 +65,9 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def check_format(content: object, kind: type[FitRecord] | type[Recognition], where: str, again: str) -> None:
+def check_format(
+    content: object, kind: type[FitRecord] | type[CorrespondenceRecord] | type[Recognition], where: str, again: str
+) -> None:
     """Refuse what is not a file of the format of `kind` and its version; a file without a version is of the first.
 
     Raises:
@@ -337,7 +340,10 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         seen_share: share of the template's vertices that it shows; the others are not-a-number.
         covered_share: share of its points that the template reaches.
         distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
-        scale: of the scan beside the template.
+        scale: its size beside the usual one, units told apart.
+        unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
+            among millimetres.
+        notes: sentences on what should be known.
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
     """
@@ -358,6 +364,8 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     distance_p99: float | None = None
     distance_max: float | None = None
     scale: float | None = None
+    unit_ratio: float = 1.0
+    notes: list[str] = []
     moved_share: list[float] = []
     cpu_s: list[float] = []
     format: str = FORMAT
@@ -373,6 +381,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         rounds: RMS by which vertices moved in each, as a share of the size.
         corresponding: NAMEs in correspondence.
         set_aside: NAME to reason of the others.
+        other_units: NAME to `unit_ratio` of those that are in another unit than most.
         settings: of the run.
         version: of shapespace.
     """
@@ -388,8 +397,19 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     set_aside: dict[str, str]
     settings: dict[str, Any]
     version: str
+    other_units: dict[str, float] = {}
     format: str = FORMAT
     format_version: int = VERSION
+
+    @staticmethod
+    def from_json(content: object, where: str = "correspondence.json") -> CorrespondenceRecord:
+        """Return what a run says of itself, checked.
+
+        Raises:
+            FileFormatError: it is no correspondence, of another version, or damaged.
+        """
+        check_format(content, CorrespondenceRecord, where, CORRESPOND_AGAIN)
+        return read(CorrespondenceRecord, content, where, CORRESPOND_AGAIN)
 
 
 # quality.json

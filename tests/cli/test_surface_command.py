@@ -100,6 +100,16 @@ def test_a_volume_that_is_no_mask_is_refused_in_a_sentence(voxels: Any, said: st
     assert outcome.out == "" and not list((tmp_path / "out").iterdir())
 
 
+def test_labels_with_the_rounding_of_a_slope_are_whole(run: Run, tmp_path: Path) -> None:
+    stored = nib.Nifti1Image(labels(), AFFINE)
+    stored.header.set_slope_inter(np.float32(1 + 3e-6), 0)
+    nib.save(stored, tmp_path / "slope.nii.gz")
+    nifti(tmp_path / "float.nii.gz", labels() * np.float32(1 + 3e-6))
+    assert run("surface", nifti(tmp_path / "whole.nii.gz"), *tmp_path.glob("[sf]*.nii.gz"), "-o", tmp_path).code == 0
+    for name in ("slope", "float"):
+        assert (tmp_path / f"{name}.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
 def test_labels_pieces_and_smoothing_are_as_asked(run: Run, tmp_path: Path) -> None:
     path = nifti(tmp_path / "a.nii.gz", labels(5.0) + 4 * np.roll(labels(3.0), 10, axis=0))
 

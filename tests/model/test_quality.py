@@ -152,13 +152,54 @@ def test_three_meshes_are_enough_and_other_input_is_refused() -> None:
         measure_quality(same, FEW)
     with pytest.raises(CorrespondenceError):
         measure_quality([*blobs(3), blobs(1, vertices=150)[0]], FEW)
-    hole = np.array(blobs(1)[0].vertices)
-    hole[3] = np.nan
-    with pytest.raises(InputError, match="vertices are missing or not finite"):
-        measure_quality([*blobs(4)[1:], blobs(1)[0].with_vertices(hole)], FEW)
+    torn = np.array(blobs(1)[0].vertices)
+    torn[3] = np.inf
+    with pytest.raises(InputError, match="infinite"):
+        measure_quality([*blobs(4)[1:], blobs(1)[0].with_vertices(torn)], FEW)
     for wrong in ({"folds": 1}, {"samples": 1}, {"modes": 0}):
         with pytest.raises(InputError):
             QualitySettings(**wrong)
+
+
+def holed(mesh: Mesh, share: float, seed: int) -> Mesh:
+    """Return `mesh` with the vertices nearest to one of them missing."""
+    x = mesh.vertices
+    apart = np.linalg.norm(x - x[np.random.default_rng(seed).integers(len(x))], axis=1)
+    return mesh.with_vertices(np.where((apart < np.quantile(apart, share))[:, None], np.nan, x))
+
+
+def test_missing_vertices_leave_the_measures_what_they_are(measured: ModelQuality) -> None:
+    found = measure_quality([holed(m, 0.15, k) for k, m in enumerate(blobs(30, noise_mm=0.1))], FEW)
+    assert found.missing_share == pytest.approx(0.15, abs=0.01) and found.left_out_vertices == 0
+    whole, held = curve(measured.generalisation_vertices), curve(found.generalisation_vertices)
+    at_five = int(np.searchsorted(held.at, 5))
+    np.testing.assert_allclose(held.mean[: at_five + 1], whole.mean[: at_five + 1], rtol=0.3)
+    specific = curve(found.specificity).mean / curve(measured.specificity).mean
+    assert ((specific > 0.8) & (specific < 1.2)).all()
+    assert curve(found.compactness).mean[at_five] == pytest.approx(curve(measured.compactness).mean[at_five], abs=0.03)
+    assert found.supported_modes in (4, 5, 6, 7)
+
+
+def test_nothing_is_measured_where_a_shape_shows_nothing() -> None:
+    d, faces = sphere(200)
+    model = ShapeModel.fit([Mesh(x.vertices, faces) for x in blobs(12)], modes=5)
+    whole, bent = blobs(13)[-1], np.array(blobs(13)[-1].vertices)
+    patch = np.linalg.norm(d - d[0], axis=1) < 0.5
+    bent[patch] += 20.0
+    hidden = whole.with_vertices(np.where(patch[:, None], np.nan, bent))
+    told = curve(measure_quality(model, unseen=[hidden]).reconstruction_vertices).mean[-1]
+    assert told < 0.01 and curve(measure_quality(model, unseen=[whole.with_vertices(bent)]).reconstruction).mean[-1] > 1
+
+
+def test_vertices_that_hardly_any_shape_shows_are_left_out_and_counted() -> None:
+    shapes = blobs(10)
+    for k in range(8):
+        x = np.array(shapes[k].vertices)
+        x[:7] = np.nan
+        shapes[k] = shapes[k].with_vertices(x)
+    found = measure_quality(shapes, FEW, unseen=[blobs(11)[-1]])
+    assert found.left_out_vertices == 7 and found.missing_share == 0.0
+    assert curve(found.reconstruction_vertices).mean[-1] < 1.0
 
 
 def test_the_command_writes_what_the_report_reads_and_curves(

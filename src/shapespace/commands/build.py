@@ -14,10 +14,10 @@ from shapespace.batch.progress import progress, waiting
 from shapespace.batch.results import read_record
 from shapespace.batch.run import naming
 from shapespace.commands.about import ABOUT, read_about
+from shapespace.commands.corresponding import surface_files
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder
-from shapespace.io.folders import mesh_files
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
 from shapespace.io.meshes import read_mesh
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3
+_LEAST_MM, _MOST_MM = 1.0, 3000.0
+"""Beyond this the largest extent of an object is likelier told in another unit."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,15 @@ def build(
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
-    found = mesh_files(meshes, recursive=settings.recursive)
-    notes = list(found.left_out)
+    found = surface_files(meshes, recursive=settings.recursive)
+    notes = list(found.notes)
+    if settings.gauge == "form" or not settings.align:
+        found.refuse_mixed_units()
     files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
     make_folder(output.absolute().parent)
-    loaded = _read(files, settings.unit, quiet=quiet)
+    loaded = _read(files, settings.unit, found.unit_ratios, quiet=quiet)
+    if found.unit_ratios:
+        notes.append(found.told_units(settings.unit))
     marks = _landmarks(files, records, loaded[0], settings, notes)
     settings = _with_origin(files, settings, notes)
     if settings.modes == "auto" and len(files) < 4:
@@ -141,6 +147,7 @@ def build(
             seed=settings.seed,
         )
         model.save(output)
+    notes += _odd_size(model, settings.unit)
     if model.left_out:
         what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
         notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
@@ -173,14 +180,24 @@ def _trusted(
     return left, {file: records[file] for file in left if file in records}
 
 
-def _read(files: Sequence[Path], unit: str, *, quiet: bool) -> list[Mesh]:
+def _read(files: Sequence[Path], unit: str, unit_ratios: Mapping[Path, float], *, quiet: bool) -> list[Mesh]:
+    """Return the meshes in mm; those with a `unit_ratios` are in other units than most, of which `unit` is told."""
     loaded: list[Mesh] = []
     with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
         for file in files:
-            mesh = _training_mesh(file)
-            loaded.append(mesh if unit == "mm" else mesh.with_vertices(mesh.vertices * MM_PER_UNIT[unit]))
+            mesh, mm = _training_mesh(file), MM_PER_UNIT[unit] / unit_ratios.get(file, 1.0)
+            loaded.append(mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm))
             bar.update()
     return loaded
+
+
+def _odd_size(model: ShapeModel, unit: str) -> list[str]:
+    """Return that the mean is of a size that tells of another unit, where nobody said which one it is."""
+    extent = np.ptp(model.mean_vertices, axis=0)
+    if unit != "mm" or _LEAST_MM < float(extent.max()) < _MOST_MM:
+        return []
+    size = " x ".join(f"{length:.3g}" for length in extent)
+    return [f"The mean is {size} mm large, which is odd for mm; --unit says in which unit the meshes are."]
 
 
 def _training_mesh(path: Path) -> Mesh:

@@ -6,14 +6,16 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeAlias
 
-import numpy as np
+from msgspec import structs
 
 from shapespace.batch.folder import names_for
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.batch.workers import cores
+from shapespace.commands.corresponding import MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.rounds import (
     Correspondence,
@@ -22,7 +24,9 @@ from shapespace.correspondence.rounds import (
     correspond,
     first_template,
 )
-from shapespace.errors import ShapespaceError
+from shapespace.correspondence.scans import copies, unit_ratios
+from shapespace.errors import MeshError, ShapespaceError
+from shapespace.geometry.doctor import repair
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh, write_mesh
@@ -30,8 +34,11 @@ from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
-SURFACE, RECORD, SUMMARY, MEAN = ".corresponding.ply", ".correspond.json", "correspondence.json", "template/mean.ply"
 _KEPT = ".rounds"
+_LISTED = 10
+_ENOUGH_TO_JUDGE, _ANOTHER_SHAPE = 6, 0.25
+"""With so many scans the rounds find other objects themselves; the mean change of one, as a share of its size."""
+_Say: TypeAlias = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def correspond_files(
     settings: CorrespondSettings,
     *,
     quiet: bool,
-    say: Callable[[str], None],
+    say: _Say,
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     """Bring scans from files into correspondence and write what came of each into `folder`.
 
@@ -75,13 +82,19 @@ def correspond_files(
         say(f"{len(set(found.files)) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
     names = names_for(paths, None)
     make_folder(folder)
-    scans, unread = _read_all(paths, names, quiet=quiet)
+    scans, unread, notes = _read_all(paths, names, quiet=quiet)
     template = None if files.template is None else read_mesh(files.template)
     rounds = _Rounds(folder / _KEPT, files.jobs or cores(), quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
-    records = _records(made, list(scans), names, paths, unread, folder)
+    _note_copies(scans, notes)
+    if template is None or made.moved[0] < _ANOTHER_SHAPE:
+        _note_other_objects(made, notes)
+    records = _records(made, notes, names, paths, unread, folder)
+    _tell(records, made, template, say)
+    # Until all is written the folder is none that build takes.
+    remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
     _write(made, records, list(scans), folder)
     summary = CorrespondenceRecord(
@@ -92,6 +105,7 @@ def correspond_files(
         set_aside={record.name: record.reason for record in records if record.reason},
         settings=asdict(settings),
         version=__version__,
+        other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
     )
     write_text(folder / SUMMARY, json_text(summary))
     shutil.rmtree(folder / _KEPT, ignore_errors=True)
@@ -114,47 +128,109 @@ class _Rounds:
             return list(KeptRounds(self._folder, self._jobs, self._quiet, one_more)(bench, tasks))
 
 
-def _read_all(paths: Sequence[Path], names: Sequence[str], *, quiet: bool) -> tuple[dict[str, Mesh], dict[str, str]]:
+def _read_all(
+    paths: Sequence[Path], names: Sequence[str], *, quiet: bool
+) -> tuple[dict[str, Mesh], dict[str, str], dict[str, list[str]]]:
+    """Return the scans by name, why others cannot be read, and what is to be known of each scan."""
     scans: dict[str, Mesh] = {}
     unread: dict[str, str] = {}
+    notes: dict[str, list[str]] = {}
     with progress(len(paths), "reading", "scan", quiet=quiet) as bar:
         for path, name in zip(paths, names, strict=True):
             try:
                 mesh = read_mesh(path)
-                scans[name] = Mesh(mesh.vertices, mesh.faces, name=name)
             except ShapespaceError as error:
                 unread[name] = f"broken: {error}"
+            else:
+                scans[name], notes[name] = _looked_at(Mesh(mesh.vertices, mesh.faces, name=name))
             bar.update()
-    return scans, unread
+    return scans, unread, notes
+
+
+def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
+    try:
+        mesh, findings = repair(scan)
+    except MeshError:
+        return scan, []  # it is set aside with that reason
+    return mesh, [f"{one.what} {one.action}" for one in findings if one.level == "note"]
+
+
+def _note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
+    names = list(scans)
+    for copy, first in copies(list(scans.values())).items():
+        notes[names[copy]].append(f"It is {names[first]} again; leave one of them out.")
+
+
+def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> None:
+    """Where too few scans are there to tell an object of another kind, say which one is quite another shape."""
+    there = [scan for scan in made.scans if not scan.reason]
+    if len(there) >= _ENOUGH_TO_JUDGE:
+        return
+    for scan in there:
+        if scan.moved and scan.moved[0] > _ANOTHER_SHAPE:
+            notes[scan.name].append(
+                f"It differs from the others by {100 * scan.moved[0]:.0f} % of its size, and so few scans do not tell "
+                "whether it is another object; look at it."
+            )
+
+
+def _tell(records: Sequence[CorrespondRecord], made: Correspondence, template: Mesh | None, say: _Say) -> None:
+    """Say what should be known before the results are used."""
+    if template is not None and made.moved[0] >= _ANOTHER_SHAPE:
+        say(
+            f"{template.name} had to change by {100 * made.moved[0]:.0f} % of its size to become these scans, so it is "
+            "hardly an object of their kind; look at the surfaces, or leave --template out."
+        )
+    noted = [record for record in records if record.notes]
+    for record in noted[:_LISTED]:
+        say(f"{record.name}: {' '.join(record.notes)}")
+    if len(noted) > _LISTED:
+        say(f"Notes on {len(noted) - _LISTED} more scans are in their records.")
+    if others := [record for record in records if record.unit_ratio != 1.0]:
+        named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
+        what = "scans is" if len(others) == 1 else "scans are"
+        say(
+            f"{len(others)} of {len(records)} {what} in another unit than most, as sizes tell ({named}); so are the "
+            "surfaces, and build brings them to that of most."
+        )
 
 
 def _records(
     made: Correspondence,
-    read: Sequence[str],
+    notes: dict[str, list[str]],
     names: Sequence[str],
     paths: Sequence[Path],
     unread: dict[str, str],
     folder: Path,
 ) -> list[CorrespondRecord]:
-    came = dict(zip(read, made.scans, strict=True))
-    size = float(np.median([s.T_scan_template.scale for s in made.scans if s.T_scan_template is not None]))
+    came = {scan.name: scan for scan in made.scans}
+    scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
+    sizes = dict(zip(scaled, zip(*unit_ratios(list(scaled.values())), strict=True), strict=True))
     records: list[CorrespondRecord] = []
     for name, path in zip(names, paths, strict=True):
         source = Source.at(path, sha256_of_file(path) if name in came else "", folder)
-        records.append(_record(name, source, came.get(name), unread.get(name, ""), size))
+        record = _record(name, source, came.get(name), unread.get(name, ""), notes.get(name, []))
+        if name in sizes:
+            scale, ratio = sizes[name]
+            record = structs.replace(record, scale=float(scale), unit_ratio=float(ratio))
+        records.append(record)
     return records
 
 
-def _record(name: str, source: Source, one: Corresponding | None, unread: str, size: float) -> CorrespondRecord:
+def _record(
+    name: str, source: Source, one: Corresponding | None, unread: str, notes: Sequence[str]
+) -> CorrespondRecord:
     path = source.path or source.name
-    if one is None or one.vertices is None or one.T_scan_template is None:
+    if one is None or one.vertices is None:
         reason = unread if one is None else one.reason
-        return CorrespondRecord(name=name, path=path, hash=source.content_hash, status="set aside", reason=reason)
+        return CorrespondRecord(
+            name=name, path=path, hash=source.content_hash, status="set aside", reason=reason, notes=list(notes)
+        )
     mean, p95, p99, largest = one.distance
     return CorrespondRecord(
         name=name, path=path, hash=source.content_hash, status="corresponding", seen_share=one.seen,
         covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
-        scale=one.T_scan_template.scale / size, moved_share=list(one.moved), cpu_s=list(one.seconds),
+        notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
     )  # fmt: skip
 
 
@@ -172,7 +248,7 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
     write_mesh(folder / MEAN, made.template)
 
 
-def _forget_others(names: set[str], folder: Path, say: Callable[[str], None]) -> None:
+def _forget_others(names: set[str], folder: Path, say: _Say) -> None:
     """Remove surfaces of an earlier run of scans that are not in this one: they are on another template."""
     old = [file for file in sorted(folder.glob(f"*{RECORD}")) if file.name.removesuffix(RECORD) not in names]
     for file in old:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +11,9 @@ import numpy as np
 
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.run import naming
+from shapespace.commands.corresponding import SURFACE, surface_files
 from shapespace.errors import InputError, MeshError
+from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
@@ -22,7 +24,7 @@ from shapespace.schemas import BySize, Measured, Quality, json_text
 from shapespace.types import Mesh
 
 _MODELS = (".h5", ".hdf5")
-_SURFACES = (".dense.ply", ".fitted.ply")
+_SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
 _MOST_TARGETS = 2
 
 
@@ -57,6 +59,8 @@ class _Target:
     name: str
     what: ShapeModel | Sequence[Mesh]
     settings: QualitySettings
+    unit_ratios: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Of meshes by their names without endings, as of `CorrespondRecord`."""
 
     @property
     def names(self) -> list[str]:
@@ -79,6 +83,7 @@ def quality(
     make_folder(output)
     measured = [_measure(target, options, quiet=quiet) for target in found]
     parts = [_as_quality(t, m, options) for t, m in zip(found, measured, strict=True)]
+    notes += [_missing(t, m) for t, m in zip(found, measured, strict=True) if m.missing_share or m.left_out_vertices]
     result = parts[0]
     if len(parts) > 1:
         differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
@@ -110,7 +115,11 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     names = list(options.representations)
     if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
-    loaded = [ShapeModel.load(p) if p.suffix.lower() in _MODELS else _meshes(p, notes, quiet=quiet) for p in paths]
+    gauge = options.settings.gauge if options.settings.align else "form"
+    loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
+        (ShapeModel.load(p), {}) if p.suffix.lower() in _MODELS else _meshes(p, notes, gauge, quiet=quiet)
+        for p in paths
+    ]
     pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]
     if len(paths) == 1 and len(names) == _MOST_TARGETS:
         pairs = [(0, name) for name in names]
@@ -118,7 +127,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
     out: list[_Target] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k], _of_representation(options.settings, name, names)))
+        out.append(_Target(called, loaded[k][0], _of_representation(options.settings, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.what, ShapeModel) for target in out):
         _refuse_unlike(out)
     return out
@@ -141,9 +150,14 @@ def _refuse_unlike(targets: Sequence[_Target]) -> None:
         )
 
 
-def _meshes(folder: Path, notes: list[str], *, quiet: bool) -> list[Mesh]:
-    found = mesh_files([folder])
-    notes += found.left_out
+def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tuple[list[Mesh], dict[str, float]]:
+    """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
+    found = surface_files([folder])
+    notes += found.notes
+    if gauge == "form":
+        found.refuse_mixed_units()
+    if found.unit_ratios:
+        notes.append(found.told_units("mm"))
     files = list(found.files)
     for ending in _SURFACES:
         if surfaces := [file for file in files if file.name.endswith(ending)]:
@@ -160,9 +174,14 @@ def _meshes(folder: Path, notes: list[str], *, quiet: bool) -> list[Mesh]:
                 raise MeshError(naming(file, str(error))) from error
             if not len(mesh.vertices):
                 raise MeshError(f"{file}: it has no vertices; leave it out.")
-            out.append(replace(mesh, name=file.name))
+            out.append(_scaled(replace(mesh, name=file.name), found.unit_ratios.get(file, 1.0)))
             bar.update()
-    return out
+    return out, {_stem(file): ratio for file, ratio in found.unit_ratios.items()}
+
+
+def _scaled(mesh: Mesh, ratio: float) -> Mesh:
+    """Return `mesh` in the unit of most."""
+    return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
 
 
 def _stem(path: Path) -> str:
@@ -183,7 +202,8 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
     with progress(len(target.names), "reading", "scan", quiet=quiet) as bar:
         out: list[Mesh] = []
         for name in target.names:
-            out.append(replace(read_mesh(by_name[name]), name=by_name[name].name))
+            scan = replace(read_mesh(by_name[name]), name=by_name[name].name)
+            out.append(_scaled(scan, target.unit_ratios.get(name, 1.0)))
             bar.update()
     for scan in out:
         if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
@@ -192,7 +212,7 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
 
 
 def _measure(target: _Target, options: QualityOptions, *, quiet: bool) -> ModelQuality:
-    unseen = [] if options.unseen is None else _meshes(options.unseen, [], quiet=quiet)
+    unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with progress(None, f"measuring {target.name}, in", "step", quiet=quiet) as bar:
 
@@ -201,6 +221,16 @@ def _measure(target: _Target, options: QualityOptions, *, quiet: bool) -> ModelQ
             bar.update(done - bar.n)
 
         return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step)
+
+
+def _missing(target: _Target, found: ModelQuality) -> str:
+    said = (
+        f"{target.name}: {100 * found.missing_share:.1f} % of the vertices are missing, and nothing is measured there"
+    )
+    if not found.left_out_vertices:
+        return f"{said}."
+    what = "1 vertex" if found.left_out_vertices == 1 else f"{found.left_out_vertices} vertices"
+    return f"{said}; {what} that fewer than half of the meshes show {'is' if what[:2] == '1 ' else 'are'} left out."
 
 
 def _measured(curve: Curve) -> Measured:
@@ -235,6 +265,8 @@ def _as_quality(target: _Target, found: ModelQuality, options: QualityOptions) -
             "folds": found.folds,
             "shapes": found.shapes,
             "points": found.points,
+            "missing_share": found.missing_share,
+            "left_out_vertices": found.left_out_vertices,
             "scans": None if options.scans is None else str(options.scans),
             "unseen": None if options.unseen is None else str(options.unseen),
         },

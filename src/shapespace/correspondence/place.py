@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
@@ -19,7 +20,7 @@ from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start
 from shapespace.geometry.closest import build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices
+from shapespace.geometry.surface import boundary_edges, boundary_vertices, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
@@ -32,6 +33,8 @@ _LEFT_OVER = 0.05
 _OTHERS_SAY = 0.95
 """A pose that the other shapes make likelier than all others is tried beside the one there is."""
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
+_BULGING = 0.2
+"""How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
 _FEW_HARMONICS = 4
 _MEASURED = 20_000
 _FAR = (np.inf, np.inf, np.inf, np.inf)
@@ -147,19 +150,28 @@ class Workbench:
 
     def _from(self, task: PlaceTask, T: Similarity) -> Placed:
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
-        target = ScanTarget(scan)
+        target = ScanTarget(
+            _facing(scan, self.mesh if task.expected is None else self.mesh.with_vertices(task.expected))
+        )
         found = register(
             self.template, target, Similarity.identity(), task.settings, expected=task.expected, seed=self.seed
         )
         start = found.T_scan_template.apply(found.vertices)
         dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
-        covered, distance = self._judged(dense.vertices_scan_mm, dense.seen, target)
+        seen = dense.seen & self._reached(dense.vertices_scan_mm, target)
+        covered, distance = self._judged(dense.vertices_scan_mm, seen, target)
         back = found.T_scan_template.inverse()
         mean, p95, p99, largest = (back.scale * length for length in distance)
         return Placed(
-            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, dense.seen, covered,
+            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, seen, covered,
             (mean, p95, p99, largest), 0.0,
         )  # fmt: skip
+
+    def _reached(self, vertices: FloatArray, target: ScanTarget) -> BoolArray:
+        """Return (V,) which vertices lie on the scan; what is seen on a rim goes on for a little beyond it."""
+        if target.mesh.faces is None:
+            return np.ones(len(vertices), dtype=np.bool_)
+        return target.engine.query(vertices).distance < REACHED * self.template.size_mm
 
     def _judged(
         self, vertices: FloatArray, seen: BoolArray, target: ScanTarget
@@ -186,6 +198,21 @@ class Workbench:
         return Placed(
             task.index, vertices, Similarity.identity(), np.zeros(len(vertices), np.bool_), 0.0, _FAR, 0.0, reason
         )  # fmt: skip
+
+
+def _facing(scan: Mesh, surface: Mesh) -> Mesh:
+    """Return `scan`, turned where it looks against `surface`, on which it lies; only sheets as much bowl as cap are.
+
+    The normals of others tell which side is outside, and so which of two poses is right.
+    """
+    if scan.faces is None or not len(boundary_edges(scan.faces)):
+        return scan
+    normals, arms = vertex_normals(scan), scan.vertices - scan.vertices.mean(axis=0)
+    if abs(float((normals * arms).sum())) > _BULGING * float(np.linalg.norm(arms, axis=1).sum()):
+        return scan
+    near = cKDTree(surface.vertices).query(scan.vertices)[1]
+    agree = np.einsum("vd,vd->v", normals, vertex_normals(surface)[near])
+    return scan if np.median(agree) >= 0 else Mesh(scan.vertices, scan.faces[:, ::-1], name=scan.name)
 
 
 def _is_same_turn(one: Similarity, other: Similarity) -> bool:

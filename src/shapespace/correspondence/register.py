@@ -149,14 +149,15 @@ def _forces(
 ) -> tuple[FloatArray, FloatArray]:
     """Return forces (M, 3), mm, on the vertices `own` (M,), and their weights (M,): 1 for each side that is sure."""
     at, up, count = x[own], normals[own], len(own)
+    bare = not side.any()  # points without triangles have no normals
     turn = settings.turn * template.size_mm
-    here, there = np.hstack([at, turn * up]), np.hstack([y, turn * side])
+    here, there = (at, y) if bare else (np.hstack([at, turn * up]), np.hstack([y, turn * side]))
     near, share = _weighted(there, here)
     pull = np.einsum("mk,mkd->md", share, y[near]) - at
-    allowed = np.einsum("md,mkd,mk->m", up, side[near], share) > settings.normal_cosine
+    allowed = bare | (np.einsum("md,mkd,mk->m", up, side[near], share) > settings.normal_cosine)
     back, back_share = _weighted(here, there)
     push = y - np.einsum("mk,mkd->md", back_share, at[back])
-    heard = np.einsum("md,mkd,mk->m", side, up[back], back_share) > settings.normal_cosine
+    heard = bare | (np.einsum("md,mkd,mk->m", side, up[back], back_share) > settings.normal_cosine)
     if not settings.borders:
         allowed &= ~rim[near].any(axis=1)
         heard &= ~template.topology.rim[own][back].any(axis=1)

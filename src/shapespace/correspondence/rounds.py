@@ -18,11 +18,12 @@ from shapespace.correspondence.guide import Others, aligned, told_by_others
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.template import Glance, choose, clean, resampled
+from shapespace.correspondence.scans import copies
+from shapespace.correspondence.template import Glance, choose, clean, given, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import faces_of, rms_size
+from shapespace.geometry.surface import rms_size
 from shapespace.types import FloatArray, Mesh, Similarity
 
 SIZE = 100.0
@@ -158,8 +159,7 @@ def first_template(scans: Sequence[Mesh], template: Mesh | None, settings: Corre
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     _refuse_equal(list(good.values()))
     if template is not None:
-        mesh, why = repair(template)[0], f"{template.name} was given as the template."
-        faces_of(mesh)
+        mesh, why = given(template), f"{template.name} was given as the template."
     else:
         numbers = list(good)
         choice = choose(list(good.values()), settings.seed)
@@ -216,8 +216,7 @@ def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
 
 
 def _refuse_equal(scans: Sequence[Mesh]) -> None:
-    first = scans[0].vertices
-    if all(scan.vertices.shape == first.shape and np.array_equal(scan.vertices, first) for scan in scans[1:]):
+    if len(copies(scans)) == len(scans) - 1:
         raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different ones.")
 
 

@@ -22,6 +22,8 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 _GLANCE_VERTICES = 1500
 _GLANCE_HARMONICS = 40
 _CANDIDATES, _OTHERS = 6, 6
+_FEWEST = 100
+"""Vertices: fewer do not tell an object's shape."""
 _SMALL_HOLE = 0.05
 """Holes with a border shorter than this share of the longest border, or of the surface's size, are closed."""
 
@@ -43,8 +45,10 @@ class Glance:
         Raises:
             MeshError: it is no sheet.
         """
-        wanted = round(len(faces_of(mesh)) * min(1.0, _GLANCE_VERTICES / len(mesh.vertices)))
-        _, faces, origin = remesh.collapse(mesh.vertices, faces_of(mesh), wanted, mesh.name)
+        parts, own = remesh.parted(faces_of(mesh))
+        wanted = round(len(parts) * min(1.0, _GLANCE_VERTICES / len(own)))
+        _, faces, origin = remesh.collapse(mesh.vertices[own], parts, wanted, mesh.name)
+        origin = own[origin]
         coarse = Mesh(mesh.vertices[origin], faces.astype(np.int32), name=mesh.name)
         harmonics = Harmonics.of(coarse, _GLANCE_HARMONICS)
         return Glance(generic_model(coarse, harmonics, None if known is None else known[:, origin]))
@@ -90,6 +94,7 @@ def choose(scans: Sequence[Mesh], seed: int) -> Choice:
     rng = np.random.default_rng(seed)
     whole = np.array([_wholeness(scan) for scan in scans])
     candidates = np.argsort(whole, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
+    candidates = candidates[np.isfinite(whole[candidates])]
     candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))
     others = np.sort(rng.choice(len(scans), min(_OTHERS, len(scans)), replace=False))
     nearness = np.full(len(scans), np.nan)
@@ -103,9 +108,27 @@ def choose(scans: Sequence[Mesh], seed: int) -> Choice:
         nearness[i] = float(np.median(apart)) if apart else 0.0
     if not np.isfinite(nearness).any():
         raise MeshError(
-            "None of the scans can be a template, since none is a sheet of triangles in one piece; give --template."
+            f"None of the scans can be a template, since none is a sheet of triangles with {_FEWEST} vertices or more; "
+            "give --template MESH."
         )
     return Choice(int(np.nanargmin(nearness)), tuple(float(share) for share in nearness))
+
+
+def given(template: Mesh) -> Mesh:
+    """Return a template that somebody gives, repaired.
+
+    Raises:
+        MeshError: it has no triangles, cannot be repaired, or has too few vertices to follow a scan.
+    """
+    if template.faces is None:
+        raise MeshError(f"{template.name} is a point cloud, and a template needs triangles; give a mesh.")
+    mesh = repair(template)[0]
+    if len(mesh.vertices) < _FEWEST:
+        raise MeshError(
+            f"{template.name} has {len(mesh.vertices)} vertices, and a template needs {_FEWEST} at least; give a finer "
+            "mesh."
+        )
+    return mesh
 
 
 def clean(scan: Mesh) -> Mesh:
@@ -116,8 +139,8 @@ def clean(scan: Mesh) -> Mesh:
     """
     mesh = repair(scan)[0]
     vertices, faces = _largest_piece(mesh.vertices, faces_of(mesh))
-    faces = _without_branches(faces)
-    vertices, faces = _largest_piece(vertices, faces)
+    faces, origin = remesh.parted(_without_branches(faces))
+    vertices, faces = _largest_piece(vertices[origin], faces.astype(np.int32))
     for hole in _small_holes(vertices, faces):
         fan = np.column_stack([np.roll(hole, -1), hole, np.full(len(hole), len(vertices), dtype=np.int32)])
         vertices = np.concatenate([vertices, vertices[hole].mean(axis=0, keepdims=True)])
@@ -140,8 +163,8 @@ def resampled(mesh: Mesh, vertices: int) -> Mesh:
 
 
 def _wholeness(scan: Mesh) -> float:
-    """Return a number that grows with the border of `scan`; infinite for points."""
-    if scan.faces is None:
+    """Return a number that grows with the border of `scan`; infinite for what can be no template."""
+    if scan.faces is None or len(scan.vertices) < _FEWEST:
         return np.inf
     ends = scan.vertices[boundary_edges(scan.faces)]
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum()) / max(rms_size(scan.vertices), 1e-12)

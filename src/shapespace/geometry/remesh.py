@@ -45,11 +45,23 @@ def collapse(
     more triangles are left.
 
     Raises:
-        MeshError: `faces` are no sheet, as `is_sheet` has it; `name` says whose.
+        MeshError: `faces` are no sheet, as `is_sheet` has it, or borders of it touch; `name` says whose.
     """
     asked = _asked(vertices, faces, name)
     coarse, left, _, origin = _igl().decimate(*asked, triangles)
+    if not len(left):
+        raise MeshError(f"{name} cannot be re-triangulated, since borders of it touch; clean the mesh first.")
     return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64), np.asarray(origin, dtype=np.int64)
+
+
+def parted(faces: npt.NDArray[np.integer]) -> tuple[LongArray, LongArray]:
+    """Return `faces` (F, 3) in numbers of new vertices, and (W,) which vertex each of those is.
+
+    Where more than two triangles share an edge, or parts of a surface touch at a vertex alone, each part has its own
+    vertices; nothing else changes.
+    """
+    new, origin = _igl().split_nonmanifold(np.ascontiguousarray(faces, dtype=np.int64))
+    return np.asarray(new, dtype=np.int64), np.asarray(origin, dtype=np.int64)
 
 
 def onto(points: FloatArray, vertices: FloatArray, faces: npt.NDArray[np.integer]) -> FloatArray:

@@ -101,8 +101,8 @@ def surface_of_volume(
     part = _Part.of(mask, keep_pieces=keep_pieces)
     if part.voxels < _FEWEST:
         raise InputError(
-            f"{volume.name}: {_named(chosen)} has only {part.voxels} {'voxel' if part.voxels == 1 else 'voxels'} "
-            f"that hang together; a surface needs {_FEWEST}."
+            f"{volume.name}: {_named(chosen)} has only {part.voxels} "
+            f"{'voxel' if part.voxels == 1 else 'voxels that hang together'}; a surface needs {_FEWEST}."
         )
     at_border = _at_border(part.mask, corner, inside.shape)
     field, share = _smoothed(part, volume.voxel_mm, sigma)

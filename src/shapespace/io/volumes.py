@@ -58,6 +58,8 @@ _UNORIENTED = "Its header does not say how it lies in the patient, so that left 
 _LEAST_MM, _MOST_MM = 1e-4, 1e3
 _FLAT = 1e-4
 _APART_MM = 0.1
+_ROUNDING = 1e-4
+"""Labels that were stored with a slope, or as float32, come back whole but for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,12 +361,12 @@ def _whole(values: npt.NDArray[Any], path: Path) -> npt.NDArray[np.integer[Any]]
     low, high = float(values.min()), float(values.max())
     if not math.isfinite(low) or not math.isfinite(high):
         raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
-    if not (values == np.rint(values)).all() or max(-low, high) >= 2**31:
+    if max(-low, high) >= 2**31 or float(np.abs(values - np.rint(values)).max()) > _ROUNDING:
         raise InputError(
             f"{path} has values between {low:.4g} and {high:.4g} that are not whole numbers, such as probabilities; "
             "make labels of them first, by a threshold say."
         )
-    return values.astype(np.int32)
+    return np.rint(values).astype(np.int32)
 
 
 def _sound(affine: FloatArray, path: Path) -> FloatArray:

@@ -21,9 +21,11 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_vertices
+from shapespace.geometry.surface import boundary_vertices, without_vertices
+from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces
 
 _FEWEST = 3
 _FEWEST_TO_CHOOSE = 4
@@ -36,6 +38,10 @@ _NEAREST = 2
 """Training shapes nearest by vertices, of which the nearest by surface is taken."""
 _RESAMPLES = 2000
 _PARTS = (0.25, 0.5, 0.75, 1.0)
+_ANY = 1e-9
+"""Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
+_LEAST_NOISE = 1e-6
+"""Share of the variance that is noise where the modes hold all of it."""
 _FAR = 0.05
 """Of the size of a surface: what lies farther from its scan is no surface of it."""
 
@@ -89,6 +95,8 @@ class ModelQuality:
         folds: in how many parts they were left out.
         points: at how many vertices distances between surfaces were measured.
         seed: of all that is drawn.
+        missing_share: of the vertices, over all shapes; nothing is measured there.
+        left_out_vertices: that less than half of the shapes show, so that nothing is measured of them at all.
     """
 
     compactness: Curve
@@ -104,6 +112,8 @@ class ModelQuality:
     folds: int = 0
     points: int = 0
     seed: int = 0
+    missing_share: float = 0.0
+    left_out_vertices: int = 0
 
     def sentences(self) -> tuple[str, ...]:
         """Return how many modes the shapes support, and whether more shapes would help."""
@@ -173,35 +183,84 @@ class QualitySettings:
         if self.samples < 2 or (self.modes is not None and self.modes < 1):
             raise InputError("Quality needs at least two samples, and at least one mode.")
 
-    def model(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> ShapeModel:
-        """Return the shape space of `meshes`."""
-        return ShapeModel.fit(
+    def space(self, meshes: Sequence[Mesh], modes: Literal["auto"] | None = None) -> _Space:
+        """Return the shape space of `meshes`, of the vertices that at least two of them show."""
+        kept = np.ones(len(meshes[0].vertices), dtype=np.bool_)
+        if not representation_named(self.representation, self.control_points).takes_holes:
+            kept = Kept.of(meshes, _ANY).vertices
+        model = ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
-            control_points=self.control_points, seed=self.seed,
+            control_points=self.control_points, min_seen=_ANY, seed=self.seed,
         )  # fmt: skip
+        return _Space(model, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class _Space:
+    """A model, and which vertices (V,) of the shapes it has: those that its training shapes show."""
+
+    model: ShapeModel
+    kept: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A shape in correspondence, and the surface that it is judged against: its own, or the scan it was made from."""
+    """A shape in correspondence, and the surface that it is judged against: its own, or the scan it was made from.
+
+    Args:
+        shape: with not-a-number where vertices are missing.
+        seen: the numbers of the vertices that are there.
+        surface: what of the shape is there, or its scan.
+        engine: of the surface.
+        is_scan: whether that is a scan, which may show more than the shape covers.
+    """
 
     shape: Mesh
+    seen: IntArray
     surface: Mesh
     engine: ClosestPointEngine
     is_scan: bool
 
     @staticmethod
     def of(shape: Mesh, scan: Mesh | None) -> _Target:
-        surface = shape if scan is None else scan
+        seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
+        surface = scan if scan is not None else _shown(shape, seen)
         engine = build_engine(surface)
         if scan is not None:
-            far = float(np.median(engine.query(shape.vertices[_spread(len(shape.vertices))]).distance))
-            if far > _FAR * float(np.linalg.norm(np.ptp(shape.vertices, axis=0))):
+            there = shape.vertices[seen]
+            far = float(np.median(engine.query(there[_spread(len(there))]).distance))
+            if far > _FAR * float(np.linalg.norm(np.ptp(there, axis=0))):
                 raise InputError(
                     f"{shape.name} lies {far:.1f} mm from its scan {scan.name}, so it is no surface of it; give the "
                     "scans in the pose and unit of the surfaces."
                 )
-        return _Target(shape, surface, engine, scan is not None)
+        return _Target(shape, seen, surface, engine, scan is not None)
+
+    def cut_to(self, kept: BoolArray) -> _Target:
+        """Return the same of the vertices `kept` (V,) alone."""
+        if kept.all():
+            return self
+        shape = _cut(self.shape, kept)
+        seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
+        if self.is_scan:
+            return _Target(shape, seen, self.surface, self.engine, True)
+        surface = _shown(shape, seen)
+        return _Target(shape, seen, surface, build_engine(surface), False)
+
+
+def _shown(shape: Mesh, seen: IntArray) -> Mesh:
+    """Return what of a shape is there."""
+    if len(seen) == len(shape.vertices):
+        return shape
+    kept = np.zeros(len(shape.vertices), dtype=np.bool_)
+    kept[seen] = True
+    return _cut(shape, kept)
+
+
+def _cut(shape: Mesh, kept: BoolArray) -> Mesh:
+    if shape.faces is None:
+        return Mesh(shape.vertices[kept], None, name=shape.name)
+    return Mesh(*without_vertices(shape.vertices, shape.faces, kept), name=shape.name)
 
 
 @dataclass
@@ -238,23 +297,22 @@ def measure_quality(
 
     Raises:
         CorrespondenceError: meshes differ in vertices or triangles.
-        InputError: too few meshes, all equal, missing vertices, or scans that are not theirs.
+        InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
     """
     settings = settings or QualitySettings()
-    if isinstance(target, ShapeModel):
-        model, meshes = target, ()
-    else:
-        meshes = _checked(target)
-        model = settings.model(meshes)
+    meshes: Sequence[Mesh] = [] if isinstance(target, ShapeModel) else _checked(target)
+    vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
     if scans is not None and len(scans) != len(meshes):
         raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
     for mesh in unseen:
-        _refuse_other(mesh, model)
-    return (
-        _of_model(model, unseen, settings, on_step)
-        if not meshes
-        else _of_meshes(model, meshes, scans, unseen, settings, on_step)
-    )
+        _refuse_other(mesh, vertices)
+    if isinstance(target, ShapeModel):
+        return _of_model(target, unseen, settings, on_step)
+    whole = representation_named(settings.representation, settings.control_points).takes_holes
+    kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
+    if not kept.all():
+        meshes, unseen = [_cut(mesh, kept) for mesh in meshes], [_cut(mesh, kept) for mesh in unseen]
+    return _of_meshes(meshes, scans, unseen, settings, on_step, left_out=int((~kept).sum()))
 
 
 def _of_model(
@@ -262,7 +320,8 @@ def _of_model(
 ) -> ModelQuality:
     counts = _counts(min(settings.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
-    told = _unseen(model, unseen, counts, settings, _Steps(len(unseen), on_step))
+    space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
+    told = _unseen(space, unseen, counts, settings, _Steps(len(unseen), on_step))
     return ModelQuality(
         Curve(counts, share, share, share),
         reconstruction=told[0],
@@ -273,13 +332,15 @@ def _of_model(
 
 
 def _of_meshes(
-    model: ShapeModel,
     meshes: Sequence[Mesh],
     scans: Sequence[Mesh] | None,
     unseen: Sequence[Mesh],
     settings: QualitySettings,
     on_step: OnStep | None,
+    *,
+    left_out: int,
 ) -> ModelQuality:
+    space = settings.space(meshes)
     parts = _parts(len(meshes), settings)
     most = len(meshes) - max(len(part) for part in parts) - 1
     counts = _counts(min(settings.modes or most, most))
@@ -288,10 +349,12 @@ def _of_meshes(
     targets = [_Target.of(m, None if scans is None else scans[i]) for i, m in enumerate(meshes)]
     errors, by_shapes = _left_out(targets, parts, counts, settings, steps)
     general = _curves(errors, counts, settings.seed)
-    specific = _curves(_specificity(model, meshes, few, settings, steps), few, settings.seed)
-    told = _unseen(model, unseen, counts, settings, steps)
+    trained = [target.cut_to(space.kept) for target in targets]
+    specific = _curves(_specificity(space.model, trained, few, settings, steps), few, settings.seed)
+    told = _unseen(space, unseen, counts, settings, steps)
+    there = np.mean([len(target.seen) for target in targets]) / len(meshes[0].vertices)
     return ModelQuality(
-        _compactness(model, meshes, counts, settings),
+        _compactness(space.model, trained, counts, settings),
         generalisation=general[0],
         generalisation_vertices=general[1],
         specificity=specific[0],
@@ -299,11 +362,13 @@ def _of_meshes(
         reconstruction=told[0],
         reconstruction_vertices=told[1],
         by_shapes=by_shapes,
-        supported_modes=settings.model(meshes, "auto").n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
+        supported_modes=settings.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
         shapes=len(meshes),
         folds=len(parts),
-        points=_points(model.n_vertices),
+        points=_points(space.model.n_vertices),
         seed=settings.seed,
+        missing_share=1.0 - float(there),
+        left_out_vertices=left_out,
     )
 
 
@@ -314,19 +379,16 @@ def _checked(meshes: Sequence[Mesh]) -> Sequence[Mesh]:
         )
     common_faces(meshes)
     for mesh in meshes:
-        if not np.isfinite(mesh.vertices).all():
-            raise InputError(
-                f"{mesh.name}: vertices are missing or not finite, and quality is measured on whole meshes; fill or "
-                "cut it, or leave it out."
-            )
+        if np.isinf(mesh.vertices).any():
+            raise InputError(f"{mesh.name}: it has vertices that are infinite; mark them as missing, or leave it out.")
     return meshes
 
 
-def _refuse_other(mesh: Mesh, model: ShapeModel) -> None:
-    if len(mesh.vertices) != model.n_vertices:
+def _refuse_other(mesh: Mesh, vertices: int) -> None:
+    if len(mesh.vertices) != vertices:
         raise CorrespondenceError(
-            f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {model.n_vertices}; unseen shapes must "
-            "be in correspondence with it."
+            f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {vertices}; unseen shapes must be in "
+            "correspondence with it."
         )
 
 
@@ -336,11 +398,11 @@ def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Cur
 
 
 def _unseen(
-    model: ShapeModel, unseen: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+    space: _Space, unseen: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
         return None, None
-    errors = _over_shapes(model, [_Target.of(m, None) for m in unseen], counts, steps)
+    errors = _over_shapes(space, [_Target.of(m, None) for m in unseen], counts, steps)
     return _curves(errors, counts, settings.seed)
 
 
@@ -376,47 +438,73 @@ def _left_out(
     for part in parts:
         order = [int(i) for i in rng.permutation(n) if i not in part]
         held: list[_Target] = [targets[int(i)] for i in part]
-        model = settings.model([targets[i].shape for i in sorted(order)])
-        errors[part] = _over_shapes(model, held, counts, steps)
+        space = settings.space([targets[i].shape for i in sorted(order)])
+        errors[part] = _over_shapes(space, held, counts, steps)
         for column, size in enumerate(sizes):
-            fewer = settings.model([targets[i].shape for i in sorted(order[:size])])
+            fewer = settings.space([targets[i].shape for i in sorted(order[:size])])
             k = min(settings.modes or size - 1, size - 1)
             only = np.array([k], dtype=np.int32)
-            by_size[part, column] = [_told(fewer, one, only, surface=False)[0, 0] for one in held]
+            by_size[part, column] = [
+                _told(fewer.model, one.cut_to(fewer.kept), only, surface=False)[0, 0] for one in held
+            ]
         for _ in held:
             steps.step()
     return errors, Curve.over(by_size, sizes, settings.seed)
 
 
-def _over_shapes(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
+def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
     out = np.zeros((len(targets), len(counts), 2))
     for row, target in enumerate(targets):
-        out[row] = _told(model, target, counts)
+        out[row] = _told(space.model, target.cut_to(space.kept), counts)
         steps.step()
     return out
 
 
 def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
     """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
-    shape, mean = target.shape.vertices, model.mean_vertices
-    modes = np.ascontiguousarray(model.vertex_basis.T)
-    T_model_shape = fit_similarity(shape, mean, with_scale=model.gauge == "shape")
-    out = np.zeros((len(counts), 2))
+    there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
+    T_model_shape = _onto_mean(model, target)
     for column, k in enumerate(counts):
-        first, told = modes[:k], mean
-        for _ in range(_POSE_ROUNDS):
-            told = mean + ((first @ (T_model_shape.apply(shape) - mean).reshape(-1)) @ first).reshape(-1, 3)
-            T_model_shape = fit_similarity(shape, told, with_scale=model.gauge == "shape")
+        told, T_model_shape = _in_best_pose(model, target, int(k), T_model_shape)
         fitted = T_model_shape.inverse().apply(told)
-        out[column, 0] = np.linalg.norm(fitted - shape, axis=1).mean()
+        out[column, 0] = np.linalg.norm(fitted[target.seen] - there, axis=1).mean()
         if surface:
             out[column, 1] = _apart(target.shape.with_vertices(fitted), target)
     return out
 
 
+def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
+    seen, scaled = target.seen, model.gauge == "shape"
+    return fit_similarity(target.shape.vertices[seen], model.mean_vertices[seen], with_scale=scaled)
+
+
+def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
+    """Return the shape (V, 3) that the first `k` modes tell by what is seen, and T_model_target, from `T` on.
+
+    Where all is seen that is the nearest one; else the likeliest, b = (P^T P + s / variance)^-1 P^T y, with the noise
+    s that the modes leave over, as what they do to unseen vertices alone could be anything.
+    """
+    seen, mean, modes = target.seen, model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)[:k]
+    there, heard, precision = target.shape.vertices[seen], modes, None
+    if len(seen) < len(mean):
+        heard = modes.reshape(len(modes), -1, 3)[:, seen].reshape(len(modes), -1)
+        variance = model.stddev[:k] ** 2
+        left = max(model.total_variance - float(variance.sum()), _LEAST_NOISE * model.total_variance)
+        precision = heard @ heard.T + np.diag(left / (3 * len(mean)) / variance)
+    told = mean
+    for _ in range(_POSE_ROUNDS):
+        b = heard @ (T.apply(there) - mean[seen]).reshape(-1)
+        if precision is not None:
+            b = np.asarray(np.linalg.solve(precision, b))
+        told = mean + (b @ modes).reshape(-1, 3)
+        T = fit_similarity(there, told[seen], with_scale=model.gauge == "shape")
+    return told, T
+
+
 def _apart(fitted: Mesh, target: _Target) -> float:
-    """Return the mean of both mean distances between two surfaces, mm, each at points spread over it."""
-    there = target.engine.query(fitted.vertices[_spread(len(fitted.vertices))]).distance.mean()
+    """Return the mean of both mean distances between two surfaces, mm, each at points spread over what is seen."""
+    seen = target.seen[_spread(len(target.seen))]
+    there = target.engine.query(fitted.vertices[seen]).distance.mean()
     back = build_engine(fitted).query(target.surface.vertices[_spread(len(target.surface.vertices))])
     counted: BoolArray = np.ones(len(back.distance), dtype=np.bool_)
     if target.is_scan:
@@ -426,23 +514,20 @@ def _apart(fitted: Mesh, target: _Target) -> float:
 
 
 def _specificity(
-    model: ShapeModel, meshes: Sequence[Mesh], counts: IntArray, settings: QualitySettings, steps: _Steps
+    model: ShapeModel, targets: Sequence[_Target], counts: IntArray, settings: QualitySettings, steps: _Steps
 ) -> FloatArray:
     """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
     mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
-    scaled = model.gauge == "shape"
-    posed = [
-        m.with_vertices(fit_similarity(m.vertices, mean, with_scale=scaled).apply(m.vertices)) if settings.align else m
-        for m in meshes
-    ]
+    posed = _posed(model, targets, settings)
     trained = [_Target.of(m, None) for m in posed]
     picked = _spread(model.n_vertices)
     vertices = np.stack([m.vertices[picked] for m in posed])
+    mean_of = np.nanmean if np.isnan(vertices).any() else np.mean
     out = np.zeros((settings.samples, len(counts), 2))
     for row, b in enumerate(model.sample(settings.samples, np.random.default_rng(settings.seed + 2))):
         for column, k in enumerate(counts):
             shape = mean + (b[:k] @ modes[:k]).reshape(-1, 3)
-            off = np.linalg.norm(vertices - shape[picked], axis=2).mean(axis=1)
+            off = mean_of(np.linalg.norm(vertices - shape[picked], axis=2), axis=1)
             drawn, nearest = posed[0].with_vertices(shape), [int(i) for i in np.argsort(off, kind="stable")[:_NEAREST]]
             out[row, column, 0] = off.min()
             out[row, column, 1] = min(_apart(drawn, trained[i]) for i in nearest)
@@ -450,15 +535,28 @@ def _specificity(
     return out
 
 
-def _compactness(model: ShapeModel, meshes: Sequence[Mesh], counts: IntArray, settings: QualitySettings) -> Curve:
+def _posed(model: ShapeModel, targets: Sequence[_Target], settings: QualitySettings) -> list[Mesh]:
+    """Return the shapes in the pose and size of the model, by what is seen of them."""
+    out: list[Mesh] = []
+    for target in targets:
+        shape = target.shape
+        if settings.align:
+            shape = shape.with_vertices(_onto_mean(model, target).apply(shape.vertices))
+        out.append(shape)
+    return out
+
+
+def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, settings: QualitySettings) -> Curve:
     """Return the share of the variance that the first modes hold, its interval by jackknife over shapes."""
-    modes, mean = model.vertex_basis, model.mean_vertices
-    T = [fit_similarity(m.vertices, mean, with_scale=model.gauge == "shape") for m in meshes]
-    posed = [t.apply(m.vertices) if settings.align else m.vertices for t, m in zip(T, meshes, strict=True)]
-    flat = np.stack(posed).reshape(len(meshes), -1) - mean.reshape(-1)
+    posed = [mesh.vertices for mesh in _posed(model, targets, settings)]
+    for i, target in enumerate(targets):
+        if len(target.seen) < model.n_vertices:
+            told = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
+            posed[i] = np.where(np.isnan(posed[i]), told, posed[i])
+    flat = np.stack(posed).reshape(len(targets), -1) - model.mean_vertices.reshape(-1)
     gram = flat @ flat.T
     share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
-    n, kept = len(meshes), min(modes.shape[1], model.n_modes)
+    n, kept = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
     rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
     without = np.stack([_shares(gram[np.ix_(some, some)], counts, kept) for some in rest])
     spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))

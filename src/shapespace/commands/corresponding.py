@@ -1,0 +1,110 @@
+"""Folders that `correspond` wrote: which surfaces are in them, and in which unit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.files import read_bytes
+from shapespace.io.folders import mesh_files
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord
+
+SURFACE, RECORD, SUMMARY, MEAN = ".corresponding.ply", ".correspond.json", "correspondence.json", "template/mean.ply"
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class SurfaceFiles:
+    """Meshes in correspondence.
+
+    Args:
+        files: in the order given.
+        unit_ratios: of files in another unit than most of their folder, as of `CorrespondRecord`.
+        notes: what the user should know.
+    """
+
+    files: tuple[Path, ...]
+    unit_ratios: Mapping[Path, float]
+    notes: tuple[str, ...]
+
+    def told_units(self, unit: str) -> str:
+        """Return in a sentence which files are in another unit, and that they are brought to that of most."""
+        return f"{self._others()}; they are brought to that of most, which is taken for {unit}."
+
+    def refuse_mixed_units(self) -> None:
+        """Check that sizes can be compared.
+
+        Raises:
+            InputError: files in several units.
+        """
+        if self.unit_ratios:
+            raise InputError(
+                f"{self._others()}, so that their sizes cannot be compared; bring the scans to one unit, or use "
+                "--gauge shape."
+            )
+
+    def _others(self) -> str:
+        named = ", ".join(path.name for path in list(self.unit_ratios)[:_NAMED])
+        named += ", ..." if len(self.unit_ratios) > _NAMED else ""
+        of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
+        return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({named})"
+
+
+def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceFiles:
+    """Return `paths` with each folder replaced by the meshes in it; of a correspondence by its surfaces alone.
+
+    Raises:
+        InputError: a folder without meshes, or a correspondence that is not finished.
+        FileError: something cannot be read.
+        FileFormatError: a correspondence.json that is none.
+    """
+    files: list[Path] = []
+    notes: list[str] = []
+    for path in paths:
+        summary = _summary_of(path)
+        if summary is None:
+            found = mesh_files([path], recursive=recursive)
+            files += found.files
+            notes += found.left_out
+        else:
+            files += _surfaces(path, summary)
+            if summary.set_aside:
+                notes.append(f"{path}: without {len(summary.set_aside)} scans that were set aside ({_names(summary)}).")
+    ratios: dict[Path, float] = {}
+    for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
+        if (summary := _summary_of(folder)) is not None:
+            other = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
+            ratios |= {file: other[file] for file in files if file in other}
+    return SurfaceFiles(tuple(files), ratios, tuple(notes))
+
+
+def _summary_of(folder: Path) -> CorrespondenceRecord | None:
+    """Return what the correspondence in `folder` says of itself, or None where there is none."""
+    file = folder / SUMMARY
+    if not file.is_file():
+        if folder.is_dir() and any(folder.glob(f"*{RECORD}")):
+            raise InputError(f"{folder}: the correspondence in it is not finished; {CORRESPOND_AGAIN}.")
+        return None
+    try:
+        content = json.loads(read_bytes(file))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{file} is not JSON, or it is cut short; {CORRESPOND_AGAIN}.") from error
+    return CorrespondenceRecord.from_json(content, str(file))
+
+
+def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:
+    files = [folder / f"{name}{SURFACE}" for name in summary.corresponding]
+    gone = [file.name for file in files if not file.is_file()]
+    if gone or not files:
+        raise InputError(
+            f"{folder}: {', '.join(gone[:_NAMED]) or 'every surface'} is no longer in it; {CORRESPOND_AGAIN}."
+        )
+    return files
+
+
+def _names(summary: CorrespondenceRecord) -> str:
+    names = list(summary.set_aside)
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
