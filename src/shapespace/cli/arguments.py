@@ -64,8 +64,8 @@ def _add_demo(commands: Any) -> None:
 
 
 def _add_data(commands: Any) -> None:
-    sub = commands.add_parser("data", help="open data sets and simulated faces").add_subparsers(
-        required=True, metavar="list|get|faces"
+    sub = commands.add_parser("data", help="open data sets, simulated faces and organs").add_subparsers(
+        required=True, metavar="list|get|faces|organs"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
     listing.set_defaults(run=run.data_list)
@@ -89,6 +89,13 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--wide", action="store_true",
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
+    organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
+                  "shapespace data organs -o organs --count 40")  # fmt: skip
+    organs.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    organs.add_argument("--count", type=_positive, default=40, metavar="N")
+    organs.add_argument("--seed", type=_natural, default=0, metavar="S")
+    organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
+    organs.set_defaults(run=run.data_organs)
 
 
 def _add_surface(commands: Any) -> None:

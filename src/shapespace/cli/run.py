@@ -103,6 +103,19 @@ def data_faces(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def data_organs(arguments: argparse.Namespace) -> int:
+    """Write simulated organs."""
+    from shapespace.commands.data import write_simulated_organs
+
+    out, count = arguments.output, arguments.count
+    write_simulated_organs(out, count=count, seed=arguments.seed, volumes=arguments.volumes, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"folder": str(out), "organs": count})
+    else:
+        show(f"{count} {'organ' if count == 1 else 'organs'} in {out}")
+    return 0
+
+
 def surface(arguments: argparse.Namespace) -> int:
     """Surfaces of labels in volumes."""
     from shapespace.commands.surface import write_surfaces
