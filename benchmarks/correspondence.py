@@ -1,12 +1,16 @@
 """How well do raw scans come into correspondence, with no model, template or landmarks?
 
-    python benchmarks/correspondence.py                        24 faces, 24 femora, 12 spleens
+    python benchmarks/correspondence.py                            all cases, hours
     python benchmarks/correspondence.py faces --scans 48 --seed 7
-    python benchmarks/correspondence.py femora --vertices 5000
+    python benchmarks/correspondence.py femora --vertices 5000 --jobs 2
+    python benchmarks/correspondence.py faces damaged expressions --people bundled
+    python benchmarks/correspondence.py faces --given              template: the first one's true mesh
+    python benchmarks/correspondence.py templates                  from two templates: how far apart
 
-Faces (ICT-FaceKit) and femora (samples of the open femur model) are known, so dispersion can be told: each vertex is
-carried to the true surface of every scan, from there to the mean, and its distance from the median over scans is what
-counts; 0 is perfect. Spleens are real, and only distances to their surfaces can be told, as shares of the diagonal.
+Faces (ICT-FaceKit, or the bundled ones) and femora (samples of the open femur model) are known, so dispersion can be
+told: each vertex is carried to the true surface of every scan, from there to the mean; its distance from the median
+over scans is what counts; 0 is perfect. Spleens are real, and only distances to their surfaces can be told, as shares of
+the diagonal.
 """
 
 from __future__ import annotations
@@ -14,23 +18,31 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from reliability import Femora
 
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond
-from shapespace.datasets.ict import LANDMARK_VERTICES, load_ict
-from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
+from shapespace.batch.rounds import KeptRounds
+from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
+from shapespace.datasets.faces import load_faces
+from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
+from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.surface import vertex_normals
 from shapespace.io.meshes import read_mesh
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 FACE_MM = 95.0
 """Of faces, what lies this near to the tip of the nose counts."""
+SPIKES, SPIKE_MM = 0.05, 1.0
+"""Share of the points of a damaged scan that are thrown off the surface, and by how much (standard deviation)."""
+MISSING, METRE = 0.2, 1e-3
+EXPRESSION_NAMES = ("neutral", "anger", "disgust", "fear", "smile", "surprise")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,23 +60,57 @@ class Known:
     T_scan_model: Similarity
 
 
-def raw(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str) -> Known:
+@dataclass(frozen=True, eq=False)
+class Set:
+    """Scans whose truth is known.
+
+    Args:
+        known: the scans.
+        mean: in mm; its vertices are those of every truth.
+        counted: (V,) which of them count.
+        length_mm: of the object.
+    """
+
+    known: list[Known]
+    mean: Mesh
+    counted: BoolArray
+    length_mm: float
+
+
+def raw(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, cut: Sequence[Cut] = ()) -> Known:
     """Return `mesh` as a scanner would give it, in any pose."""
     T = random_similarity(rng, 180.0)
-    made = simulate_scan(mesh, rng, triangles=triangles, noise_mm=0.2, T_scan_model=T, name=name)
+    made = simulate_scan(mesh, rng, triangles=triangles, noise_mm=0.2, T_scan_model=T, name=name, crop=cut)
     return Known(made.scan, made.truth_vertices, T)
 
 
-def dispersion(made: Correspondence, known: list[Known], mean: Mesh, counted: BoolArray) -> dict[str, float]:
-    """Return dispersion in mm on `mean`, over the vertices that lie near those `counted`, and to the true surface."""
+def damaged(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, middle: FloatArray) -> Known:
+    """Return `mesh` with a fifth missing in three holes about `middle`, spikes, every other scan in metres."""
+    T = random_similarity(rng, 180.0)
+    if int(name[-1]) % 2:
+        T = Similarity(T.scale * METRE, T.rotation, T.translation * METRE)
+    centres = mesh.vertices[rng.choice(np.flatnonzero(np.linalg.norm(mesh.vertices - middle, axis=1) < FACE_MM), 3)]
+    # The radius that leaves out the share wanted of the vertices.
+    near = np.linalg.norm(mesh.vertices[:, None] - centres, axis=2).min(axis=1)
+    inside = np.linalg.norm(mesh.vertices - middle, axis=1) < FACE_MM
+    radius = float(np.quantile(near[inside], MISSING))
+    holes = [Hole(radius, centre) for centre in centres]
+    made = simulate_scan(mesh, rng, triangles=triangles, noise_mm=0.2, T_scan_model=T, name=name, holes=holes)
+    vertices, thrown = np.array(made.scan.vertices), rng.random(len(made.scan.vertices)) < SPIKES
+    off = (thrown * rng.standard_normal(len(thrown)) * SPIKE_MM * T.scale)[:, None] * vertex_normals(made.scan)
+    return Known(made.scan.with_vertices(vertices + off), made.truth_vertices, T)
+
+
+def dispersion(made: Correspondence, of: Set) -> dict[str, float]:
+    """Return dispersion in mm on the mean, over the vertices that lie near those counted, and to the true surface."""
     places, gaps = [], []
-    for one, truth in zip(made.scans, known, strict=True):
+    for one, truth in zip(made.scans, of.known, strict=True):
         if one.vertices is None:
             continue
         there = np.isfinite(one.vertices).all(axis=1)
-        near = build_engine(Mesh(truth.truth, mean.faces)).query(np.ascontiguousarray(one.vertices[there]))
+        near = build_engine(Mesh(truth.truth, of.mean.faces)).query(np.ascontiguousarray(one.vertices[there]))
         place, gap = np.full(one.vertices.shape, np.nan), np.full(len(there), np.nan)
-        place[there] = np.einsum("mc,mcd->md", near.barycentric, mean.vertices[mean.faces[near.triangle]])
+        place[there] = np.einsum("mc,mcd->md", near.barycentric, of.mean.vertices[of.mean.faces[near.triangle]])
         gap[there] = near.distance / truth.T_scan_model.scale
         places.append(place)
         gaps.append(gap)
@@ -72,7 +118,7 @@ def dispersion(made: Correspondence, known: list[Known], mean: Mesh, counted: Bo
     shown = np.isfinite(place[:, :, 0]).any(axis=0)
     place, gap = place[:, shown], gap[:, shown]
     middle = np.nanmedian(place, axis=0)
-    inside = counted[build_engine(mean).query(middle).vertex]
+    inside = of.counted[build_engine(of.mean).query(middle).vertex]
     apart = np.linalg.norm(place - middle, axis=2)[:, inside]
     return {
         "mean_mm": float(np.nanmean(apart)),
@@ -81,39 +127,79 @@ def dispersion(made: Correspondence, known: list[Known], mean: Mesh, counted: Bo
         "worst_scan_mm": float(np.nanmean(apart, axis=1).max()),
         "to_true_surface_mm": float(np.nanmean(gap[:, inside])),
         "seen": float(np.isfinite(place[:, :, 0]).mean()),
+        "mean_share_of_length": float(np.nanmean(apart)) / of.length_mm,
     }
 
 
-def faces(scans: int, seed: int, settings: CorrespondSettings) -> tuple[Correspondence, dict[str, float]]:
+def people(source: str, scans: int, seed: int, expressions: Sequence[str]) -> tuple[list[Mesh], Mesh, int]:
+    """Return true faces, each person with each of `expressions`, their mean and the vertex at the tip of its nose."""
+    rng, each = np.random.default_rng(77 + seed), len(expressions)
+    count = -(-scans // each)
+    if source == "ict":
+        ict = load_ict()
+        recipes = [EXPRESSIONS.get(name) for name in expressions]
+        meshes = [ict.mesh(w, recipe) for w in ict.draw_people(count, 77 + seed) for recipe in recipes]
+        return meshes[:scans], ict.mesh(), LANDMARK_VERTICES["nose_3"]
+    heads = load_faces()
+    drawn = [heads.draw_person(rng) for _ in range(count)]
+    meshes = [
+        heads.face(person, heads.draw_expression(name, rng, 1.0) if name != "neutral" else None)
+        for person in drawn
+        for name in expressions
+    ]
+    mean = Mesh(np.mean([mesh.vertices for mesh in meshes], axis=0), meshes[0].faces)
+    return meshes[:scans], mean, heads.landmarks["pronasale"]
+
+
+def faces(scans: int, seed: int, source: str = "ict", *, harm: bool = False, expressive: bool = False) -> Set:
     """Simulated people, heads and necks, 30,000 triangles."""
-    ict, rng = load_ict(), np.random.default_rng(seed)
-    people = enumerate(ict.draw_people(scans, 77 + seed))
-    known = [raw(ict.mesh(weights), rng, 30_000, f"person{k}") for k, weights in people]
-    mean = ict.mesh()
-    counted = np.linalg.norm(mean.vertices - mean.vertices[LANDMARK_VERTICES["nose_3"]], axis=1) < FACE_MM
-    made = correspond([one.scan for one in known], settings)
-    return made, dispersion(made, known, mean, counted)
+    rng = np.random.default_rng(seed)
+    meshes, mean, nose = people(source, scans, seed, EXPRESSION_NAMES if expressive else ("neutral",))
+    middle = mean.vertices[nose]
+    known = [
+        damaged(mesh, rng, 30_000, f"person{k}", mesh.vertices[nose]) if harm else raw(mesh, rng, 30_000, f"person{k}")
+        for k, mesh in enumerate(meshes)
+    ]
+    counted = np.linalg.norm(mean.vertices - middle, axis=1) < FACE_MM
+    return Set(known, mean, counted, float(np.ptp(mean.vertices, axis=0).max()))
 
 
-def femora(scans: int, seed: int, settings: CorrespondSettings) -> tuple[Correspondence, dict[str, float]]:
-    """Samples of the femur model, 12,000 triangles."""
+def femora(scans: int, seed: int, _source: str = "", *, cut_every: int = 0) -> Set:
+    """Samples of the femur model, 12,000 triangles; of every so many, 30 % of the length is cut off at one end."""
     femur, rng = Femora(), np.random.default_rng(seed)
     drawn = [femur.draw(rng) for _ in range(scans)]
-    known = [raw(mesh, rng, 12_000, f"femur{k}") for k, mesh in enumerate(drawn)]
     mean = Mesh(femur._model[0], drawn[0].faces)
-    made = correspond([one.scan for one in known], settings)
-    told = dispersion(made, known, mean, np.ones(len(mean.vertices), dtype=np.bool_))
-    return made, told | {"mean_share_of_length": told["mean_mm"] / float(np.ptp(mean.vertices, axis=0).max())}
+    along = int(np.ptp(mean.vertices, axis=0).argmax())
+    known = []
+    for k, mesh in enumerate(drawn):
+        low, high = mesh.vertices[:, along].min(), mesh.vertices[:, along].max()
+        end = 1.0 if (k // max(cut_every, 1)) % 2 else -1.0
+        point, normal = mesh.vertices.mean(axis=0).copy(), np.zeros(3)
+        point[along], normal[along] = (high - 0.3 * (high - low) if end > 0 else low + 0.3 * (high - low)), end
+        cut = [Cut(point, normal)] if cut_every and k % cut_every == 0 else []
+        known.append(raw(mesh, rng, 12_000, f"femur{k}", cut))
+    whole = np.ones(len(mean.vertices), dtype=np.bool_)
+    return Set(known, mean, whole, float(np.ptp(mean.vertices, axis=0).max()))
 
 
-def spleens(scans: int, seed: int, settings: CorrespondSettings) -> tuple[Correspondence, dict[str, float]]:
+SETS: dict[str, tuple[Callable[..., Set], dict[str, object], int]] = {
+    "faces": (faces, {}, 24),
+    "damaged": (faces, {"harm": True}, 24),
+    "expressions": (faces, {"expressive": True}, 60),
+    "femora": (femora, {}, 40),
+    "cut-femora": (femora, {"cut_every": 4}, 40),
+}
+OTHERS = ("templates", "spleens")
+
+
+def spleens(scans: int, seed: int, run: Callable[[list[Mesh], Mesh | None], Correspondence]) -> dict[str, object]:
     """Real spleens, from `spleens/` of the folder that SHAPESPACE_DATA names."""
     files = sorted((Path(os.environ.get("SHAPESPACE_DATA", ".")) / "spleens").glob("*.ply"))
     if not files:
         raise SystemExit("The spleens are not here; set SHAPESPACE_DATA to the folder that holds spleens/.")
     chosen = np.sort(np.random.default_rng(seed).permutation(len(files))[:scans])
     meshes = [read_mesh(files[k]) for k in chosen]
-    made = correspond(meshes, settings)
+    made = run(meshes, None)
     diagonal = [float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) for mesh in meshes]
     shares = [
         np.array(one.distance) / length
@@ -121,37 +207,88 @@ def spleens(scans: int, seed: int, settings: CorrespondSettings) -> tuple[Corres
         if one.vertices is not None
     ]
     mean, p95, p99, largest = np.mean(shares, axis=0)
-    return made, {"mean_share": mean, "p95_share": p95, "p99_share": p99, "largest_share": largest}
+    told = {"mean_share": mean, "p95_share": p95, "p99_share": p99, "largest_share": largest}
+    return told | said(made)
 
 
-CASES: dict[str, tuple[Callable[..., tuple[Correspondence, dict[str, float]]], int]] = {
-    "faces": (faces, 24),
-    "femora": (femora, 24),
-    "spleens": (spleens, 12),
-}
+def templates(of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence], vertices: int) -> dict[str, object]:
+    """From the first scan and from the second as the template: how far apart the two correspondences carry a point.
+
+    A point of each scan is carried to another one by both; its two places there are compared, mm.
+    """
+    from shapespace.correspondence.template import clean, resampled
+
+    scans = [one.scan for one in of.known]
+    made = [run(scans, resampled(clean(scans[k]), vertices)) for k in (0, 1)]
+    rng, apart = np.random.default_rng(0), []
+    for i in range(len(scans)):
+        j = (i + 1) % len(scans)
+        ends = [(one.scans[i].vertices, one.scans[j].vertices) for one in made]
+        if any(a is None or b is None for a, b in ends):
+            continue
+        points = of.known[i].truth[rng.choice(np.flatnonzero(of.counted), 500)]
+        carried = []
+        for one, (a, b) in zip(made, ends, strict=True):
+            assert a is not None and b is not None
+            good = (np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))[one.template.faces].all(axis=1)
+            near = build_engine(Mesh(np.nan_to_num(a), one.template.faces[good])).query(points)
+            place = np.einsum("mc,mcd->md", near.barycentric, b[one.template.faces[good][near.triangle]])
+            carried.append(place / of.known[j].T_scan_model.scale)
+        apart.append(np.linalg.norm(carried[0] - carried[1], axis=1))
+    whole = np.concatenate(apart)
+    return {
+        "apart_mean_mm": float(whole.mean()), "apart_median_mm": float(np.median(whole)),
+        "apart_p95_mm": float(np.quantile(whole, 0.95)), "set_aside": [said(one)["set_aside"] for one in made],
+    }  # fmt: skip
+
+
+def said(made: Correspondence) -> dict[str, object]:
+    """Return what a correspondence says of itself."""
+    return {
+        "cpu_s_a_scan_and_round": float(np.mean([second for one in made.scans for second in one.seconds])),
+        "moved": [round(share, 4) for share in made.moved],
+        "set_aside": {one.name: one.reason for one in made.scans if one.reason},
+    }
 
 
 def main() -> None:
     """Run the cases that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", nargs="*", choices=[*CASES, []], default=[])
+    parser.add_argument("cases", nargs="*", choices=[*SETS, *OTHERS, []], default=[])
     parser.add_argument("--scans", type=int)
     parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--people", choices=["ict", "bundled"], default="ict")
+    parser.add_argument("--given", action="store_true", help="the template is the first one's true mesh")
     parser.add_argument("--vertices", type=int, default=CorrespondSettings.vertices)
     parser.add_argument("--rounds", type=int, default=CorrespondSettings.rounds)
+    parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
-    for name in arguments.cases or CASES:
-        case, usual = CASES[name]
-        settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds)
+    settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds)
+
+    def run(scans: list[Mesh], template: Mesh | None) -> Correspondence:
+        if arguments.jobs < 2:
+            return correspond(scans, settings, template=template, run=run_here)
+        with tempfile.TemporaryDirectory() as folder:
+            kept = KeptRounds(Path(folder), arguments.jobs, quiet=True, on_done=lambda: None)
+            return correspond(scans, settings, template=template, run=kept)
+
+    for name in arguments.cases or [*SETS, *OTHERS]:
         begun = time.process_time()
-        made, told = case(arguments.scans or usual, arguments.seed, settings)
-        seconds = [second for one in made.scans for second in one.seconds]
-        aside = {one.name: one.reason for one in made.scans if one.reason}
-        told |= {"cpu_s": time.process_time() - begun, "cpu_s_a_scan_and_round": float(np.mean(seconds))}
-        moved = [round(share, 4) for share in made.moved]
-        print(
-            json.dumps({"case": name, "scans": len(made.scans), **told, "moved": moved, "set_aside": aside}, indent=1)
-        )
+        told: dict[str, object]
+        if name == "spleens":
+            told = spleens(arguments.scans or 40, arguments.seed, run)
+        elif name == "templates":
+            told = templates(faces(arguments.scans or 24, arguments.seed, arguments.people), run, arguments.vertices)
+        else:
+            make, options, usual = SETS[name]
+            drawn = make(arguments.scans or usual, arguments.seed, arguments.people, **options)
+            first = drawn.known[0]
+            true = drawn.mean.with_vertices(first.T_scan_model.inverse().apply(first.truth))
+            made = run([one.scan for one in drawn.known], true if arguments.given else None)
+            told = {**dispersion(made, drawn), **said(made)}
+        told |= {"cpu_s": time.process_time() - begun}
+        asked = {"case": name, **vars(arguments), "cases": None}
+        print(json.dumps({**asked, **told}, indent=1), flush=True)
 
 
 if __name__ == "__main__":
