@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from shapespace.batch.folder import names_for
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
@@ -23,6 +24,8 @@ from shapespace.correspondence.rounds import (
     first_template,
 )
 from shapespace.errors import ShapespaceError
+from shapespace.geometry.distortion import Distortion
+from shapespace.geometry.surface import face_areas
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh, write_mesh
@@ -81,7 +84,7 @@ def correspond_files(
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
-    records = _records(made, list(scans), names, paths, unread, folder)
+    records = _records(made, scans, names, paths, unread, folder)
     _forget_others({record.name for record in records}, folder, say)
     _write(made, records, list(scans), folder)
     summary = CorrespondenceRecord(
@@ -130,7 +133,7 @@ def _read_all(paths: Sequence[Path], names: Sequence[str], *, quiet: bool) -> tu
 
 def _records(
     made: Correspondence,
-    read: Sequence[str],
+    read: Mapping[str, Mesh],
     names: Sequence[str],
     paths: Sequence[Path],
     unread: dict[str, str],
@@ -141,8 +144,21 @@ def _records(
     records: list[CorrespondRecord] = []
     for name, path in zip(names, paths, strict=True):
         source = Source.at(path, sha256_of_file(path) if name in came else "", folder)
-        records.append(_record(name, source, came.get(name), unread.get(name, ""), size))
+        one = came.get(name)
+        record = _record(name, source, one, unread.get(name, ""), size)
+        if one is not None and one.vertices is not None:
+            record = _judged(record, Mesh(one.vertices, made.template.faces, name=name), made.template, read[name])
+        records.append(record)
     return records
+
+
+def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> CorrespondRecord:
+    """Return a record with what the triangles of its surface tell."""
+    changed = Distortion.of(surface, mean)
+    area = None if scan.faces is None else float(np.nansum(face_areas(surface)) / face_areas(scan).sum())
+    return structs.replace(
+        record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area
+    )  # fmt: skip
 
 
 def _record(name: str, source: Source, one: Corresponding | None, unread: str, size: float) -> CorrespondRecord:
