@@ -350,6 +350,8 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     CALLED: ClassVar = "a record of correspondence"
     FORMAT: ClassVar = "shapespace corresponding"
     VERSION: ClassVar = 1
+    ENDING: ClassVar = ".correspond.json"
+    SURFACE: ClassVar = ".corresponding.ply"
 
     name: str
     path: str
@@ -388,6 +390,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     CALLED: ClassVar = "a correspondence"
     FORMAT: ClassVar = "shapespace correspondence"
     VERSION: ClassVar = 1
+    FILE: ClassVar = "correspondence.json"
+    MEAN: ClassVar = "template/mean.ply"
 
     template: str
     vertices: int

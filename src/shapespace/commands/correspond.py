@@ -33,7 +33,8 @@ from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
-SURFACE, RECORD, SUMMARY, MEAN = ".corresponding.ply", ".correspond.json", "correspondence.json", "template/mean.ply"
+SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
+SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 _KEPT = ".rounds"
 
 

@@ -21,9 +21,6 @@ from shapespace.report.wording import printable, without_folders
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
-SUMMARY, RECORD, SURFACE, MEAN = "correspondence.json", ".correspond.json", ".corresponding.ply", "template/mean.ply"
-"""The files of such a folder: of the run, the endings of those of each scan, and the mean shape."""
-
 _AGAIN = "run shapespace correspond again"
 _FEWEST_VERTICES = 3
 _ONE_UNIT = 5.0
@@ -79,10 +76,11 @@ class Corresponded:
 
     def __init__(self, folder: Path) -> None:
         self.folder = Folder(folder, _AGAIN)
-        self.run = read(CorrespondenceRecord, self.folder.json(SUMMARY), SUMMARY, _AGAIN)
-        self._mean = self.folder.mesh(MEAN)
+        summary = CorrespondenceRecord.FILE
+        self.run = read(CorrespondenceRecord, self.folder.json(summary), summary, _AGAIN)
+        self._mean = self.folder.mesh(CorrespondenceRecord.MEAN)
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
-            raise FileFormatError(f"{MEAN} is no whole surface; {_AGAIN}.")
+            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {_AGAIN}.")
         self.unread: dict[str, str] = {}
         found = [record for file in self._record_files() if (record := self._record(file)) is not None]
         self.records = {record.name: record for record in found}
@@ -117,11 +115,13 @@ class Corresponded:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
-        mesh = self.folder.mesh(f"{name}{SURFACE}")
+        mesh = self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}")
         if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
-            raise FileFormatError(f"{name}{SURFACE} is not on the template of this folder; {_AGAIN}.")
+            raise FileFormatError(f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {_AGAIN}.")
         if there_are(mesh.vertices).sum() < _FEWEST_VERTICES:
-            raise FileFormatError(f"{name}{SURFACE} has hardly a vertex that is not missing; {_AGAIN}.")
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {_AGAIN}."
+            )
         return mesh
 
     def placed(self, name: str) -> Placed:
@@ -136,7 +136,9 @@ class Corresponded:
         try:
             T = fit_similarity(self.mean.vertices[seen], own[seen])
         except ShapespaceError as error:
-            raise FileFormatError(f"{name}{SURFACE} cannot be laid onto the mean shape; {_AGAIN}.") from error
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {_AGAIN}."
+            ) from error
         return Placed(np.where(seen[:, None], T.inverse().apply(own), np.nan), T)
 
     def raw_scan(self, record: CorrespondRecord) -> Mesh:
@@ -188,6 +190,12 @@ class Corresponded:
         return self._population
 
     @property
+    def settled(self) -> float:
+        """The share of the size by which vertices move at most in a round that is the last one."""
+        value = self.run.settings.get("settled")
+        return float(value) if isinstance(value, int | float) else 0.0
+
+    @property
     def units_mixed(self) -> bool:
         """Whether sizes differ so much that the scans cannot be in one unit."""
         scales = [record.scale for record in self.corresponding if record.scale]
@@ -195,12 +203,12 @@ class Corresponded:
 
     def _record_files(self) -> list[str]:
         try:
-            return sorted(path.name for path in self.root.iterdir() if path.name.endswith(RECORD))
+            return sorted(path.name for path in self.root.iterdir() if path.name.endswith(CorrespondRecord.ENDING))
         except OSError as error:
             raise read_error(self.root, error) from error
 
     def _record(self, file: str) -> CorrespondRecord | None:
-        name = file.removesuffix(RECORD)
+        name = file.removesuffix(CorrespondRecord.ENDING)
         try:
             record = read(CorrespondRecord, self.folder.json(file), file, _AGAIN)
             if record.name != name:
@@ -210,11 +218,6 @@ class Corresponded:
             return None
         # A report is mailed and a viewer has visitors: neither is to tell where the scans lie on this machine.
         return structs.replace(record, reason=without_folders(record.reason))
-
-
-def is_correspondence(folder: Path) -> bool:
-    """Return whether `folder` is one that `shapespace correspond` wrote."""
-    return (folder / SUMMARY).is_file()
 
 
 def there_are(vertices: FloatArray) -> BoolArray:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import isfinite, log, nan
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from math import isfinite, nan
 from typing import TypeAlias
 
 import numpy as np
@@ -32,6 +32,7 @@ from shapespace.report.blocks import (
     text_table,
 )
 from shapespace.report.colours import DIVERGING, SEQUENTIAL
+from shapespace.report.concerns import concerns_of, distance_share, known, median, percent_of, scan_status, sentence
 from shapespace.report.corresponded import Corresponded, Placed, drawable, upright
 from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder
@@ -43,27 +44,16 @@ from shapespace.version import __version__
 
 MOST_CARDS, MOST_EMPTY_CARDS, MOST_BOARDS, MOST_ROWS = 24, 6, 11, 2000
 _MOST_NAMED = 12
-_STANDS_OUT = 4.0
-"""How many times the usual spread (MAD) above the middle makes a scan one to look at."""
-_FEW = 8
-_FAR_SHARE, _FOLDED_SHARE, _LITTLE_SHARE = 0.03, 0.001, 0.8
 _HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
+_STATUS = {
+    "unreadable": ("unreadable", "failed"),
+    "set aside": ("set aside", "failed"),
+    "look": ("to be looked at", "doubtful"),
+    "corresponding": ("in correspondence", "converged"),
+}
 _TRIANGLES_DRAWN = 400_000
 
 _Make: TypeAlias = Callable[[CorrespondRecord], Cell]
-
-
-@dataclass(frozen=True)
-class Concern:
-    """Why a scan in correspondence may need a look.
-
-    Args:
-        weight: how much, 0 for not at all.
-        reasons: in words, the weightiest first.
-    """
-
-    weight: float
-    reasons: tuple[str, ...]
 
 
 class CorrespondencePage:
@@ -88,7 +78,7 @@ class CorrespondencePage:
         self.mean = self.at.mean
         self.size = dict(zip(self.all.names, self.all.sizes, strict=True))
         self.records = [self.at.records[name] for name in self.all.names]
-        self.concerns = dict(zip(self.all.names, self._judged(), strict=True))
+        self.concerns = concerns_of(self.at)
         self.ordered = sorted(self.records, key=lambda record: (-self.concerns[record.name].weight, record.name))
         self.out = [*self.at.set_aside, *(self.at.records[name] for name in self.all.unread)]
         self._cards = {record.name: self.page.place(f"scan-{record.name}") for record in self._carded()}
@@ -97,57 +87,13 @@ class CorrespondencePage:
 
     def share(self, record: CorrespondRecord, which: str) -> float:
         """Return a distance of a record as a share of the object's size."""
-        return _known(getattr(record, f"distance_{which}")) / self.size.get(record.name, nan)
+        return distance_share(record, which, self.size.get(record.name, nan))
 
-    def _judged(self) -> list[Concern]:
-        """Return for each scan what stands out, beside the others and by itself."""
-        measures: list[tuple[FloatArray, float, float, Callable[[float], str]]] = []
-
-        def measure(
-            values: Sequence[float], least_spread: float, at_least: float, told: Callable[[float], str]
-        ) -> None:
-            measures.append((np.array(values, dtype=np.float64), least_spread, at_least, told))
-
-        far = [self.share(record, "p99") for record in self.records]
-        usual = float(np.nanmedian(far)) if far and not np.isnan(far).all() else 0.0
-        measure(far, 0.25 * usual, 0.0, lambda v: f"1 % of its points lie farther off than {_percent(v)} of its size, "
-                f"where {_percent(usual)} is usual")  # fmt: skip
-        measure([_known(r.folded_share) for r in self.records], 0.25 * _FOLDED_SHARE, _FOLDED_SHARE,
-                lambda v: f"{_percent(v)} of its triangles are folded over")  # fmt: skip
-        measure([1 - _known(r.seen_share) for r in self.records], 0.03, 1 - _LITTLE_SHARE,
-                lambda v: f"it shows only {percent(1 - v)} of the mean shape")  # fmt: skip
-        measure([1 - _known(r.covered_share) for r in self.records], 0.03, 1 - _LITTLE_SHARE,
-                lambda v: f"only {percent(1 - v)} of its points are reached")  # fmt: skip
-        growth = [log(f) if f else nan for f in (_known(r.area_factor) for r in self.records)]
-        middle = float(np.nanmedian(growth)) if growth and not np.isnan(growth).all() else 0.0
-        measure(growth, 0.25 * middle, 0.0,
-                lambda v: f"its triangles grow or shrink up to {np.exp(v):.1f} times, where {np.exp(middle):.1f} is "
-                "usual")  # fmt: skip
-        moved = [r.moved_share[-1] if r.moved_share else nan for r in self.records]
-        settled = self.settled
-        measure(moved, 0.25 * _median(moved), settled,
-                lambda v: f"its vertices still moved by {_percent(v)} of its size in the last round")  # fmt: skip
-        found: list[list[tuple[float, str]]] = [[] for _ in self.records]
-        for values, least, at_least, told in measures:
-            known = values[np.isfinite(values)]
-            if not len(known):
-                continue
-            centre = float(np.median(known))
-            spread = max(1.4826 * float(np.median(np.abs(known - centre))), least, 1e-12)
-            for k, value in enumerate(values):
-                over = (value - centre) / spread
-                if isfinite(over) and over > _STANDS_OUT and value > at_least:
-                    found[k].append((float(over), told(float(value))))
-        return [
-            Concern(max((weight for weight, _ in some), default=0.0), tuple(told for _, told in sorted(some)[::-1]))
-            for some in found
-        ]
-
-    @property
-    def settled(self) -> float:
-        """The share of the size below which a round is the last one."""
-        value = self.at.run.settings.get("settled")
-        return float(value) if isinstance(value, int | float) else 0.0
+    def status(self, record: CorrespondRecord) -> Cell:
+        """Return what came of a scan, sorted from bad to good."""
+        found = scan_status(record, self.concerns)
+        words, colour = _STATUS[found]
+        return Cell(words, float(list(_STATUS).index(found)), colour)
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
@@ -185,21 +131,21 @@ class CorrespondencePage:
 
     def summary(self) -> list[Block]:
         """Return what came of the scans, in a sentence, in figures, and those that need a look."""
-        mean, far = (_median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
-        seen = _median([_known(record.seen_share) for record in self.records])
+        mean, far = (median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
+        seen = median([known(record.seen_share) for record in self.records])
         tiles = [
             (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
             (f"{self.at.run.vertices:,}", "", "vertices, the same on all"),
             (
-                _percent(mean).removesuffix(" %"),
+                percent_of(mean).removesuffix(" %"),
                 "%",
                 "of its size: mean distance between scan and surface, median scan",
             ),
-            (_percent(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
+            (percent_of(far).removesuffix(" %"), "%", "of its size: 99 % of the points lie nearer, median scan"),
             (percent(seen).removesuffix(" %"), "%", "of the vertices are shown by the median scan"),
         ]
         if self.at.run.rounds:
-            last = _percent(self.at.run.rounds[-1])
+            last = percent_of(self.at.run.rounds[-1])
             tiles.append((last.removesuffix(" %"), "%", "of the size: movement of vertices in the last round (RMS)"))
         return [
             Text(self.verdict()),
@@ -222,7 +168,7 @@ class CorrespondencePage:
         told += f"; {aside} {'is' if aside == 1 else 'are'} set aside." if aside else "."
         folded = [record.folded_share for record in self.records if record.folded_share]
         told += " No triangle is folded over." if not folded else (
-            f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {_percent(max(folded))} at most."
+            f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
         )  # fmt: skip
         return f"{told} {self._settling()}"
 
@@ -230,15 +176,15 @@ class CorrespondencePage:
         moved = self.at.run.rounds
         if not moved:
             return ""
-        if moved[-1] < self.settled:
-            return f"The rounds have settled: in the last one vertices moved by {_percent(moved[-1])} of the size."
+        if moved[-1] < self.at.settled:
+            return f"The rounds have settled: in the last one vertices moved by {percent_of(moved[-1])} of the size."
         return (
-            f"The rounds have not settled: in the last one vertices still moved by {_percent(moved[-1])} of the size, "
-            f"and {_percent(self.settled)} counts as settled; more --rounds may still better it."
+            f"The rounds have not settled: in the last one vertices still moved by {percent_of(moved[-1])} of the "
+            f"size, and {percent_of(self.at.settled)} counts as settled; more --rounds may still better it."
         )
 
     def _set_aside(self) -> Notice:
-        items = [Item(_sentence(r.reason), Cell(r.name, place=self._cards.get(r.name))) for r in self.at.set_aside]
+        items = [Item(sentence(r.reason), Cell(r.name, place=self._cards.get(r.name))) for r in self.at.set_aside]
         if len(items) > _MOST_NAMED:
             items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
         return Notice("Set aside, and not in a model built from this folder", items, "broken")
@@ -246,16 +192,12 @@ class CorrespondencePage:
     def _to_look_at(self) -> Notice:
         some = self.looked_at
         items = [
-            Item(self._reasons(record), Cell(record.name, place=self._cards.get(record.name)))
+            Item(self.concerns[record.name].told, Cell(record.name, place=self._cards.get(record.name)))
             for record in some[:_MOST_NAMED]
         ]
         if len(some) > _MOST_NAMED:
             items.append(Item(f"{counted(len(some) - _MOST_NAMED, 'other')}, in the table of all."))
         return Notice("In correspondence, and to be looked at", items)
-
-    def _reasons(self, record: CorrespondRecord) -> str:
-        reasons = self.concerns[record.name].reasons
-        return _sentence("; ".join(reasons)) if reasons else "Nothing about it stands out."
 
     def _damaged(self) -> Mapping[str, str]:
         return {**self.at.unread, **self.all.unread}
@@ -309,11 +251,13 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        told = "Every scan shows every vertex. " if not share.any() else (
-            f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and "
-            f"{f'{percent(hardly)} on more than half of them, which build leaves out' if hardly else 'none on half'}. "
-        )  # fmt: skip
-        there = _median([_known(record.area_share) for record in self.records])
+        told = "Every scan shows every vertex."
+        if share.any():
+            most = (
+                f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
+            )
+            told = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
+        there = median([known(record.area_share) for record in self.records])
         lacking: list[Block] = []
         if there < _WHOLE_SHARE:
             what = (
@@ -336,7 +280,7 @@ class CorrespondencePage:
                 ),
                 self.page.figure(
                     figures.missing_figure(self.mean, share),
-                    f"{told}The mean shape from four sides.",
+                    f"{told} The mean shape from four sides.",
                     alt="Share of scans that do not show each vertex, on the mean shape from four sides",
                 ),
             ),
@@ -362,7 +306,7 @@ class CorrespondencePage:
         """Return a card for each of the first scans."""
         from shapespace.report import stills
 
-        limit = 100 * (_median([self.share(record, "p99") for record in self.records]) or nan)
+        limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
         limit = nice_ceiling(limit)
         bars = [(SEQUENTIAL, "0", f"{limit:g} % of its size, or more"), (DIVERGING, "half the area", "twice the area")]
         key = StripKey(
@@ -389,10 +333,10 @@ class CorrespondencePage:
         except ShapespaceError as error:
             note = f"No picture: {error}"
         self.page.step(record.name)
-        status = _status(record, self.concerns)
+        status = self.status(record)
         if record in self.out:
             return Card(self._cards[record.name], record.name, status, "", self._reason(record), image, note)
-        told = f"Mean distance {_percent(self.share(record, 'mean'))} of its size. {self._reasons(record)}"
+        told = f"Mean distance {percent_of(self.share(record, 'mean'))} of its size. {self.concerns[record.name].told}"
         told += f" {note}" if note else ""
         return Card(self._cards[record.name], record.name, status, "", told, image)
 
@@ -437,19 +381,19 @@ class CorrespondencePage:
             out.append(Text("The scans are in different units: compare distances in % of the size.", "notice"))
         columns: list[tuple[Column, _Make]] = [
             (Column("Scan"), lambda r: Cell(r.name, place=self._cards.get(r.name))),
-            (Column("Status"), lambda r: _status(r, self.concerns)),
-            (Column("Mean distance", "number"), lambda r: _cell(_known(r.distance_mean))),
-            (Column("95 % within", "number"), lambda r: _cell(_known(r.distance_p95))),
-            (Column("99 % within", "number"), lambda r: _cell(_known(r.distance_p99))),
-            (Column("Farthest", "number"), lambda r: _cell(_known(r.distance_max))),
+            (Column("Status"), lambda r: self.status(r)),
+            (Column("Mean distance", "number"), lambda r: _cell(known(r.distance_mean))),
+            (Column("95 % within", "number"), lambda r: _cell(known(r.distance_p95))),
+            (Column("99 % within", "number"), lambda r: _cell(known(r.distance_p99))),
+            (Column("Farthest", "number"), lambda r: _cell(known(r.distance_max))),
             (Column("Mean, % of size", "number"), lambda r: _cell(100 * self.share(r, "mean"))),
             (Column("99 %, % of size", "number"), lambda r: _cell(100 * self.share(r, "p99"))),
-            (Column("Vertices shown, %", "number"), lambda r: number(100 * _known(r.seen_share), 1)),
-            (Column("Scan reached, %", "number"), lambda r: number(100 * _known(r.covered_share), 1)),
-            (Column("Area covered, %", "number"), lambda r: number(100 * _known(r.area_share), 1)),
-            (Column("Folded, %", "number"), lambda r: _cell(100 * _known(r.folded_share))),
-            (Column("Area change, times", "number"), lambda r: number(_known(r.area_factor), 2)),
-            (Column("Size beside the usual", "number"), lambda r: number(_known(r.scale), 3)),
+            (Column("Vertices shown, %", "number"), lambda r: number(100 * known(r.seen_share), 1)),
+            (Column("Scan reached, %", "number"), lambda r: number(100 * known(r.covered_share), 1)),
+            (Column("Area covered, %", "number"), lambda r: number(100 * known(r.area_share), 1)),
+            (Column("Folded, %", "number"), lambda r: _cell(100 * known(r.folded_share))),
+            (Column("Area change, times", "number"), lambda r: number(known(r.area_factor), 2)),
+            (Column("Size beside the usual", "number"), lambda r: number(known(r.scale), 3)),
             (Column("Moved last, % of size", "number"), lambda r: _cell(100 * (r.moved_share or [nan])[-1])),
             (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
         ]
@@ -466,14 +410,14 @@ class CorrespondencePage:
         notes: list[Block] = [Text(what, "soft")]
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
         if why:
-            heading = f"Why {counted(len(why), 'scan stands', 'scans stand')} out, or are set aside"
+            heading = f"The reasons of {counted(len(why), 'scan')}"
             notes = [*notes, Folded(heading, [text_table(("Scan", "Why"), why, "Reasons")])]
         return [*out, table, *notes]
 
     def _reason(self, record: CorrespondRecord) -> str:
         if record in self.out:
-            return _sentence(record.reason or self.all.unread.get(record.name, ""))
-        return self._reasons(record) if self.concerns[record.name].reasons else ""
+            return sentence(record.reason or self.all.unread.get(record.name, ""))
+        return self.concerns[record.name].told if self.concerns[record.name].reasons else ""
 
     # The rest
 
@@ -483,18 +427,18 @@ class CorrespondencePage:
 
         run = self.at.run
         figure = self.page.figure(
-            figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.settled),
+            figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.at.settled),
             "Each round begins at what the last one found. The first counts from the first template, so it is the "
             "largest; when vertices move no more, another round changes nothing.",
             alt=f"Movement of vertices in {counted(len(run.rounds), 'round')}: "
-            + listed([_percent(moved) for moved in run.rounds]),
+            + listed([percent_of(moved) for moved in run.rounds]),
             chart=True,
         )
         rows: list[list[Cell]] = []
         for k, moved in enumerate(run.rounds):
             cpu = [record.cpu_s[k] for record in self.records if len(record.cpu_s) > k]
             row = [Cell(f"Round {k + 1}", float(k + 1)), _cell(100 * moved)]
-            rows.append([*row, number(sum(cpu), 1), number(_median(cpu), 1), number(max(cpu, default=nan), 1)])
+            rows.append([*row, number(sum(cpu), 1), number(median(cpu), 1), number(max(cpu, default=nan), 1)])
         heads = ["Moved (RMS), % of size", "CPU seconds, all scans", "a scan, median", "a scan, most"]
         table = Table(
             [Column("Round"), *(Column(head, "number") for head in heads)], rows, "Movement and time by round"
@@ -518,34 +462,6 @@ class CorrespondencePage:
         return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
 
 
-def _status(record: CorrespondRecord, concerns: Mapping[str, Concern]) -> Cell:
-    if record.name not in concerns:
-        return (
-            Cell("set aside", 0.0, "failed") if record.status != "corresponding" else Cell("unreadable", 0.0, "failed")
-        )
-    if concerns[record.name].reasons:
-        return Cell("to be looked at", 1.0, "doubtful")
-    return Cell("in correspondence", 2.0, "converged")
-
-
-def _known(value: float | None) -> float:
-    return nan if value is None else value
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if isfinite(value)]
-    return float(np.median(known)) if known else nan
-
-
-def _percent(share: float) -> str:
-    """Return a small share in percent with two digits or so."""
-    return f"{plain(float(f'{100 * share:.2g}'))} %" if isfinite(share) else DASH
-
-
 def _cell(value: float) -> Cell:
     """Return a number of any size with three digits or so."""
     return Cell(plain(value) if isfinite(value) else DASH, value)
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith(".") else ".") if text else ""

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import write_text
-from shapespace.report.corresponded import is_correspondence
 from shapespace.report.page import LARGEST_REPORT_BYTES, Step
 from shapespace.report.recognition import is_study, study_page
 from shapespace.report.saved import Folder, find_fits
+from shapespace.schemas import CorrespondenceRecord
 
 __all__ = ["LARGEST_REPORT_BYTES", "require_report_extra", "write_report"]
 
@@ -68,7 +68,7 @@ def write_report(
                 f"{folder} is a demo, which names its models and labels itself; leave out --model and --labels."
             )
         page = DemoPage(results, on_step).html()
-    elif is_correspondence(folder):
+    elif (folder / CorrespondenceRecord.FILE).is_file():
         from shapespace.report.correspondence_page import CorrespondencePage
 
         if model is not None or labels is not None:
