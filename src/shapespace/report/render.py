@@ -135,15 +135,16 @@ class Layer:
     def __post_init__(self) -> None:
         if self.scalars is None:
             return
-        if self.across is not None:
-            object.__setattr__(self, "across", read_only(self.across))
         name = self.mesh.name
-        scalars = read_only(self.scalars)
-        object.__setattr__(self, "scalars", scalars)
-        if scalars.shape != (len(self.mesh.vertices),):
-            raise InputError(
-                f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {scalars.shape}."
-            )
+        for which, given in (("scalars", self.scalars), ("across", self.across)):
+            if given is None:
+                continue
+            values = read_only(given)
+            object.__setattr__(self, which, values)
+            if values.shape != (len(self.mesh.vertices),):
+                raise InputError(
+                    f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {values.shape}."
+                )
         if self.colormap is None or np.ndim(self.colormap) != 2 or np.shape(self.colormap)[1] != 3:
             raise InputError(f"{name}: scalars need a colour map of the shape (N, 3).")
         if not self.vmax > self.vmin:
@@ -328,14 +329,14 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
 def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
     """Return codes (n,) of the squares of a checkerboard: 0 for every other one, the others 1, 2, ... in turn.
 
-    Neighbours on a diagonal differ, so that a square is told from the next one.
+    Those nearest to each other differ, also two columns or rows apart, so that a square is told from the next ones.
 
     Args:
         along: (n,) where the points lie in one direction, a square being 1 wide.
         across: (n,) and in the other.
     """
     column, row = np.floor(along).astype(np.int64), np.floor(across).astype(np.int64)
-    turn = (column + 2 * row) // 2 % SQUARE_COLOURS
+    turn = (3 * column - row) // 2 % SQUARE_COLOURS
     return np.where((column + row) % 2 == 0, 1 + turn, 0).astype(np.float32)
 
 

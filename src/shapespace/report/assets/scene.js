@@ -180,9 +180,9 @@
       if (paint == 0) return colour;
       if (paint == 2) return own;
       if (paint == 3) {
-        // As render.squares: every other one is paper, the others take turns, so that neighbours on a diagonal differ.
+        // As render.squares: every other one is paper, the others take turns so that near ones differ.
         vec2 at = floor(value);
-        float turn = mod(at.x + at.y, 2.0) > 0.5 ? 0.0 : 1.0 + mod(floor((at.x + 2.0 * at.y) / 2.0), squares - 1.0);
+        float turn = mod(at.x + at.y, 2.0) > 0.5 ? 0.0 : 1.0 + mod(floor((3.0 * at.x - at.y) / 2.0), squares - 1.0);
         return texture2D(map, vec2((turn + 0.5) / squares, 0.5)).rgb;
       }
       if (value.y < 0.999) return unknown;
@@ -207,7 +207,7 @@
       vec3 n = normalize(vNormal);
       float back = gl_FrontFacing ? 0.0 : 1.0;
       if (back > 0.5) n = -n;
-      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 ? 0.0 : 1.0), opacity);
+      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 ? 0.0 : paint == 3 ? 0.4 : 1.0), opacity);
     }`;
 
   const POINT_VERTEX = `
