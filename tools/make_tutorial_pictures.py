@@ -16,15 +16,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 import shapespace as ss
 from shapespace.cli import main as shapespace
-from shapespace.geometry import remesh
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import faces_of, without_vertices
+from shapespace.report.checker import checker_layer, checker_places
 from shapespace.report.render import Camera, Layer, render
 from shapespace.types import FloatArray, Mesh
 
 SHOWN, SIZE, HEIGHT_MM, BAND = 5, (300, 240), 122.0, 34
-SQUARE_MM = 13.0
-CHECKS = np.array([[214, 203, 190], [94, 129, 158]]) / 255.0
 
 
 def main() -> None:
@@ -48,7 +45,7 @@ def spleens(folder: Path, out: Path) -> None:
     modes = [(0, -2.0), (0, 2.0), (0, 0.0), (1, -2.0), (1, 2.0)]
     rows = {
         "as they came: any pose, triangles of their own": [picture(mesh, np.eye(3)) for mesh in raw],
-        "in correspondence: the same squares on all of them": checked(same, model.mean_vertices),
+        "in correspondence: the same squares on all of them": checked(same, model.mesh()),
         "the shape space: first mode at -2 and 2 standard deviations, the mean, second mode at -2 and 2": [
             picture(model.mesh(z * model.stddev[k] * np.eye(model.n_modes)[k]), turn) for k, z in modes
         ],
@@ -68,9 +65,8 @@ def volumes(folder: Path, out: Path) -> None:
         title: [picture(ss.read_mesh(path), np.eye(3)) for path in sorted(made.glob("*.ply"))[:SHOWN]]
         for title, made in (("voxels, 1.5 x 1.5 x 2.5 mm", stairs), ("surfaces of label 1", surfaces))
     }
-    rows["in correspondence: the same squares on all of them"] = checked(
-        same, ss.ShapeModel.load(folder / "organs.h5").mean_vertices
-    )
+    mean = ss.ShapeModel.load(folder / "organs.h5").mesh()
+    rows["in correspondence: the same squares on all of them"] = checked(same, mean)
     save(rows, out / "tutorial-volumes.png")
 
 
@@ -79,27 +75,17 @@ def run(*arguments: object) -> None:
         raise SystemExit(f"shapespace {' '.join(map(str, arguments))} failed.")
 
 
-def checked(same: Path, mean: FloatArray) -> list[np.ndarray]:
-    """Return pictures of the surfaces in the pose of the mean, with squares that are the same vertices on all."""
-    turn = upright(mean)
+def checked(same: Path, mean: Mesh) -> list[np.ndarray]:
+    """Return pictures of the surfaces in the pose of the mean, under squares that are the same vertices on all."""
+    turn = upright(mean.vertices)
+    places = checker_places(placed(mean, turn))
     out: list[np.ndarray] = []
     for path in sorted(same.glob("*.corresponding.ply"))[:SHOWN]:
         mesh = ss.read_mesh(path)
         there = np.isfinite(mesh.vertices).all(axis=1)
-        T = fit_similarity(mesh.vertices[there], mean[there], with_scale=False)
-        vertices, faces = without_vertices(T.apply(mesh.vertices), faces_of(mesh), there)
-        fine, triangles = finer(vertices, faces)
-        on_mean = finer(mean[there], faces)[0] @ turn.T
-        squares = np.floor(on_mean[:, :2] / SQUARE_MM).sum(axis=1) % 2
-        out.append(picture(Mesh(fine, triangles.astype(np.int32)), turn, squares))
+        T = fit_similarity(mesh.vertices[there], mean.vertices[there], with_scale=False)
+        out.append(drawn(checker_layer(placed(mesh.with_vertices(T.apply(mesh.vertices)), turn), places)))
     return out
-
-
-def finer(vertices: FloatArray, faces: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-    """Return flat triangles parted into sixteen, so that squares have even edges."""
-    for _ in range(2):
-        vertices, faces = remesh.split(vertices, faces, "surface")
-    return vertices, faces
 
 
 def upright(points: FloatArray) -> FloatArray:
@@ -109,11 +95,15 @@ def upright(points: FloatArray) -> FloatArray:
     return axes
 
 
-def picture(mesh: Mesh, turn: FloatArray, squares: FloatArray | None = None) -> np.ndarray:
-    mesh = mesh.with_vertices((mesh.vertices - mesh.vertices.mean(axis=0)) @ turn.T)
-    layer = Layer(mesh)
-    if squares is not None:
-        layer = Layer(mesh, scalars=squares, colormap=CHECKS, vmin=0.0, vmax=1.0, categories=True)
+def placed(mesh: Mesh, turn: FloatArray) -> Mesh:
+    return mesh.with_vertices((mesh.vertices - np.nanmean(mesh.vertices, axis=0)) @ turn.T)
+
+
+def picture(mesh: Mesh, turn: FloatArray) -> np.ndarray:
+    return drawn(Layer(placed(mesh, turn)))
+
+
+def drawn(layer: Layer) -> np.ndarray:
     return np.asarray(render(layer, camera=Camera(np.zeros(3), HEIGHT_MM), size=SIZE))
 
 
