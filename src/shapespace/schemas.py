@@ -338,12 +338,17 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         status: `corresponding` or `set aside`.
         reason: why it is set aside.
         seen_share: share of the template's vertices that it shows; the others are not-a-number.
-        covered_share: share of its points that the template reaches.
+        covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
+        area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
+            parts that the scan shows.
         distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
         scale: its size beside the usual one, units told apart.
         unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
             among millimetres.
         notes: sentences on what should be known.
+        folded_share: share of the triangles that turn back over their neighbours, as they do not on the mean shape.
+        area_factor: 95 % of the triangles grow or shrink by less than this factor beside those of the mean shape, the
+            change of size divided out.
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
     """
@@ -351,6 +356,8 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     CALLED: ClassVar = "a record of correspondence"
     FORMAT: ClassVar = "shapespace corresponding"
     VERSION: ClassVar = 1
+    ENDING: ClassVar = ".correspond.json"
+    SURFACE: ClassVar = ".corresponding.ply"
 
     name: str
     path: str
@@ -359,6 +366,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     reason: str = ""
     seen_share: float | None = None
     covered_share: float | None = None
+    area_share: float | None = None
     distance_mean: float | None = None
     distance_p95: float | None = None
     distance_p99: float | None = None
@@ -366,6 +374,8 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     scale: float | None = None
     unit_ratio: float = 1.0
     notes: list[str] = []
+    folded_share: float | None = None
+    area_factor: float | None = None
     moved_share: list[float] = []
     cpu_s: list[float] = []
     format: str = FORMAT
@@ -389,6 +399,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     CALLED: ClassVar = "a correspondence"
     FORMAT: ClassVar = "shapespace correspondence"
     VERSION: ClassVar = 1
+    FILE: ClassVar = "correspondence.json"
+    MEAN: ClassVar = "template/mean.ply"
 
     template: str
     vertices: int

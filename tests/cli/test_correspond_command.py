@@ -41,6 +41,7 @@ def test_each_scan_has_a_surface_and_a_record_and_a_bad_one_a_reason(same: Path)
         record = json.loads((same / f"blob{k}.correspond.json").read_text("utf-8"))
         assert record["status"] == "corresponding" and 0.9 < record["covered_share"] <= 1.0
         assert 0.5 < record["scale"] < 2.0 and len(record["moved_share"]) == 1
+        assert 0 <= record["folded_share"] < 0.05 and 1 < record["area_factor"] < 4 and 0.8 < record["area_share"] < 1.2
         surface = read_mesh(same / f"blob{k}.corresponding.ply")
         np.testing.assert_array_equal(surface.faces, first.faces)
     assert json.loads((same / "torn.correspond.json").read_text("utf-8"))["status"] == "set aside"

@@ -50,8 +50,8 @@ Start = Callable[..., Running]
 
 
 @contextmanager
-def running(shown: Shown, limits: Limits, token: str | None, worker: Worker) -> Iterator[Running]:
-    app, sessions = make_app(shown, limits=limits, token=token, worker=worker)
+def served(app: Any) -> Iterator[str]:
+    """Serve an application in a thread, and give its address."""
     server = uvicorn.Server(
         uvicorn.Config(app, log_level="error", access_log=False, ws="none", timeout_graceful_shutdown=2)
     )
@@ -61,12 +61,21 @@ def running(shown: Shown, limits: Limits, token: str | None, worker: Worker) -> 
     thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])))
     thread.start()
     try:
-        with ExitStack() as clients:
-            yield Running(f"http://127.0.0.1:{listening.getsockname()[1]}", sessions, sessions.root, clients)
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
     finally:
-        sessions.closing = True
         server.should_exit = True
         thread.join()
+
+
+@contextmanager
+def running(shown: Shown, limits: Limits, token: str | None, worker: Worker) -> Iterator[Running]:
+    app, sessions = make_app(shown, limits=limits, token=token, worker=worker)
+    with served(app) as address:
+        try:
+            with ExitStack() as clients:
+                yield Running(address, sessions, sessions.root, clients)
+        finally:
+            sessions.closing = True
 
 
 @pytest.fixture(scope="session")

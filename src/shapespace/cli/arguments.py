@@ -64,8 +64,8 @@ def _add_demo(commands: Any) -> None:
 
 
 def _add_data(commands: Any) -> None:
-    sub = commands.add_parser("data", help="open data sets and simulated faces").add_subparsers(
-        required=True, metavar="list|get|faces"
+    sub = commands.add_parser("data", help="open data sets, simulated faces and organs").add_subparsers(
+        required=True, metavar="list|get|faces|organs"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
     listing.set_defaults(run=run.data_list)
@@ -89,6 +89,13 @@ def _add_data(commands: Any) -> None:
     faces.add_argument("--wide", action="store_true",
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
+    organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
+                  "shapespace data organs -o organs --count 40")  # fmt: skip
+    organs.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    organs.add_argument("--count", type=_positive, default=40, metavar="N")
+    organs.add_argument("--seed", type=_natural, default=0, metavar="S")
+    organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
+    organs.set_defaults(run=run.data_organs)
 
 
 def _add_surface(commands: Any) -> None:
@@ -194,8 +201,9 @@ def _add_quality(commands: Any) -> None:
 
 
 def _add_info(commands: Any) -> None:
-    sub = _add(commands, "info", "facts of a model, a mesh or a fit", "shapespace info model.h5")
-    sub.add_argument("file", type=Path, metavar="FILE")
+    sub = _add(commands, "info", "facts of a model, a mesh, a fit or a folder in correspondence",
+               "shapespace info model.h5")  # fmt: skip
+    sub.add_argument("file", type=Path, metavar="FILE|DIR", help="a model, a mesh, a record, or what correspond wrote")
     sub.set_defaults(run=run.info)
 
 
@@ -233,9 +241,11 @@ def _add_fit(commands: Any) -> None:
 
 
 def _add_view(commands: Any) -> None:
-    sub = _add(commands, "view", "shape model and fits in the browser, and scans dropped there fitted",
+    sub = _add(commands, "view", "a shape model, fits or surfaces in correspondence in the browser",
                "shapespace view model.h5", json_facts=False)  # fmt: skip
-    sub.add_argument("path", type=Path, metavar="MODEL.h5|DIR", help="a model, or a folder that fit wrote")
+    sub.add_argument(
+        "path", type=Path, metavar="MODEL.h5|DIR", help="a model, or a folder that fit or correspond wrote"
+    )
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits in DIR (default: named in them)")
     sub.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default 127.0.0.1)")
     sub.add_argument("--port", type=_natural, metavar="N", help="default: the first free one from 7860")
@@ -245,9 +255,9 @@ def _add_view(commands: Any) -> None:
 
 
 def _add_report(commands: Any) -> None:
-    sub = _add(commands, "report", "one HTML file on the results in a folder: summary, model, fits, settings",
+    sub = _add(commands, "report", "one HTML file on the results in a folder: fits, a correspondence, a study",
                "shapespace fit model.h5 scans -o out --stages\n         shapespace report out")  # fmt: skip
-    sub.add_argument("folder", type=Path, metavar="DIR", help="written by shapespace fit or shapespace demo")
+    sub.add_argument("folder", type=Path, metavar="DIR", help="written by shapespace fit, correspond or demo")
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
     sub.add_argument("--labels", type=Path, metavar="FILE",

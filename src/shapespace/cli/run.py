@@ -13,6 +13,7 @@ from shapespace.cli.printing import now, say, short, show, show_json, warn
 if TYPE_CHECKING:
     from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
 
+_BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
 _LISTED = 10
 """Scans that the terminal lists."""
 _OTHER_SIZE = 0.02
@@ -100,6 +101,19 @@ def data_faces(arguments: argparse.Namespace) -> int:
         show_json({"folder": str(arguments.output), "faces": count})
     else:
         show(f"{count} {'face' if count == 1 else 'faces'} in {arguments.output}")
+    return 0
+
+
+def data_organs(arguments: argparse.Namespace) -> int:
+    """Write simulated organs."""
+    from shapespace.commands.data import write_simulated_organs
+
+    out, count = arguments.output, arguments.count
+    write_simulated_organs(out, count=count, seed=arguments.seed, volumes=arguments.volumes, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"folder": str(out), "organs": count})
+    else:
+        show(f"{count} {'organ' if count == 1 else 'organs'} in {out}")
     return 0
 
 
@@ -291,7 +305,7 @@ def quality_lines(quality: Quality) -> list[str]:
 
 
 def info(arguments: argparse.Namespace) -> int:
-    """Facts of a model, a mesh or a fit."""
+    """Facts of a model, a mesh, a fit or a folder in correspondence."""
     from shapespace.commands.look import info
 
     facts = info(arguments.file)
@@ -299,7 +313,12 @@ def info(arguments: argparse.Namespace) -> int:
         show_json(facts)
     else:
         for key, value in facts.items():
-            show(f"{key}: {short(value)}")
+            if key in _BY_SCAN:
+                show(f"{key}: {len(value)}")
+                for name, told in value.items():
+                    show(f"  {name}: {told}")
+            else:
+                show(f"{key}: {short(value)}")
     return 0
 
 
@@ -437,7 +456,7 @@ def recognise_study(arguments: argparse.Namespace) -> int:
 
 
 def view(arguments: argparse.Namespace) -> int:
-    """Show a model and fits in the browser."""
+    """Show a model, fits, or surfaces in correspondence in the browser."""
     from shapespace.viewer.serve import serve
 
     serve(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
 from msgspec import structs
 
 from shapespace.batch.folder import names_for
@@ -26,7 +27,9 @@ from shapespace.correspondence.rounds import (
 )
 from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.errors import MeshError, ShapespaceError
+from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.surface import face_areas
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh, write_mesh
@@ -91,7 +94,7 @@ def correspond_files(
     _note_copies(scans, notes)
     if template is None or made.moved[0] < _ANOTHER_SHAPE:
         _note_other_objects(made, notes)
-    records = _records(made, notes, names, paths, unread, folder)
+    records = _records(made, scans, notes, names, paths, unread, folder)
     _tell(records, made, template, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
@@ -197,6 +200,7 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, template: M
 
 def _records(
     made: Correspondence,
+    read: Mapping[str, Mesh],
     notes: dict[str, list[str]],
     names: Sequence[str],
     paths: Sequence[Path],
@@ -209,12 +213,24 @@ def _records(
     records: list[CorrespondRecord] = []
     for name, path in zip(names, paths, strict=True):
         source = Source.at(path, sha256_of_file(path) if name in came else "", folder)
-        record = _record(name, source, came.get(name), unread.get(name, ""), notes.get(name, []))
+        one = came.get(name)
+        record = _record(name, source, one, unread.get(name, ""), notes.get(name, []))
+        if one is not None and one.vertices is not None:
+            record = _judged(record, Mesh(one.vertices, made.template.faces, name=name), made.template, read[name])
         if name in sizes:
             scale, ratio = sizes[name]
             record = structs.replace(record, scale=float(scale), unit_ratio=float(ratio))
         records.append(record)
     return records
+
+
+def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> CorrespondRecord:
+    """Return a record with what the triangles of its surface tell."""
+    changed = Distortion.of(surface, mean)
+    area = None if scan.faces is None else float(np.nansum(face_areas(surface)) / face_areas(scan).sum())
+    return structs.replace(
+        record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area
+    )  # fmt: skip
 
 
 def _record(

@@ -10,9 +10,10 @@ from pathlib import Path
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
 
-SURFACE, RECORD, SUMMARY, MEAN = ".corresponding.ply", ".correspond.json", "correspondence.json", "template/mean.ply"
+SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
+SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 _NAMED = 3
 
 

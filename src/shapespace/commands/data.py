@@ -1,4 +1,4 @@
-"""What `data` does: open data sets, and simulated faces."""
+"""What `data` does: open data sets, and simulated faces and organs."""
 
 from __future__ import annotations
 
@@ -78,3 +78,23 @@ def write_simulated_faces(
     said = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
     write_about(folder, said, licence)
     return total
+
+
+def write_simulated_organs(folder: Path, *, count: int, seed: int, volumes: bool, quiet: bool) -> None:
+    """Write raw surfaces, or label volumes, of simulated organs.
+
+    Raises:
+        InputError: too many.
+        ShapespaceError: volumes, without the extra `volumes`.
+        FileError: the folder cannot be written.
+    """
+    from shapespace.datasets.faces import LICENSE
+    from shapespace.datasets.organs import write_organs
+
+    with progress(count, "writing", "organ", quiet=quiet) as bar:
+
+        def one_more() -> None:
+            bar.update()
+
+        write_organs(folder, count=count, seed=seed, volumes=volumes, progress=one_more)
+    write_about(folder, f"{count} simulated organs of shapespace, seed {seed}", LICENSE)

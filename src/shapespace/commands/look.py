@@ -1,7 +1,8 @@
-"""What `check` and `info` do: facts of meshes, models and fits."""
+"""What `check` and `info` do: facts of meshes, models, fits and correspondences."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,11 +12,14 @@ import numpy as np
 
 from shapespace.batch.results import read_record
 from shapespace.batch.run import naming
-from shapespace.errors import ShapespaceError
+from shapespace.errors import FileError, FileFormatError, ShapespaceError
 from shapespace.geometry.doctor import examine
+from shapespace.geometry.surface import faces_of
+from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, read, to_json
 
 
 def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
@@ -43,11 +47,16 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
 
 
 def info(path: Path) -> dict[str, Any]:
-    """Return the facts of a model, a mesh or the record of a fit.
+    """Return the facts of a model, a mesh, the record of a fit, or a folder in correspondence.
 
     Raises:
         FileError: it cannot be read, or is none of these.
     """
+    if path.is_dir() or path.name == CorrespondenceRecord.FILE:
+        return {"kind": "correspondence", **correspondence_facts(path if path.is_dir() else path.parent)}
+    if path.name.endswith(CorrespondRecord.ENDING):
+        record = read(CorrespondRecord, _json(path), path.name, "run shapespace correspond again")
+        return {"kind": "scan in correspondence", **to_json(record)}
     if path.name.endswith(".json"):
         record = read_record(path)
         return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
@@ -55,6 +64,59 @@ def info(path: Path) -> dict[str, Any]:
         return {"kind": "model", **model_facts(ShapeModel.load(path))}
     mesh = read_mesh(path)
     return {"kind": "mesh", "file": str(path), **asdict(examine(mesh))}
+
+
+def correspondence_facts(folder: Path) -> dict[str, Any]:
+    """Return the facts of a folder that `shapespace correspond` wrote; lengths are shares of the size of each object.
+
+    Raises:
+        FileError: it is none, or it cannot be read.
+    """
+    from shapespace.report.concerns import concerns_of, distance_share, known, median
+    from shapespace.report.corresponded import Corresponded
+
+    if not (folder / CorrespondenceRecord.FILE).is_file():
+        raise FileError(
+            f"{folder} is a folder without {CorrespondenceRecord.FILE}; give a model, a mesh, a .fit.json, or a folder "
+            "that shapespace correspond wrote."
+        )
+    at = Corresponded(folder)
+    population = at.population()
+    records = [at.records[name] for name in population.names]
+    concerns = concerns_of(at)
+    far = {
+        which: median(
+            [distance_share(record, which, size) for record, size in zip(records, population.sizes, strict=True)]
+        )
+        for which in ("mean", "p95", "p99", "max")
+    }
+    return {
+        "folder": str(folder),
+        "scans": len(at.records) + len(at.unread),
+        "in_correspondence": len(records),
+        "set_aside": {record.name: record.reason for record in at.set_aside},
+        "unreadable": {**at.unread, **population.unread},
+        "to_be_looked_at": {name: concern.told for name, concern in concerns.items() if concern.reasons},
+        "vertices": len(at.mean.vertices),
+        "triangles": len(faces_of(at.mean)),
+        "template": at.run.template,
+        "units_mixed": at.units_mixed,
+        "distance_share_median": far,
+        "seen_share_median": median([known(record.seen_share) for record in records]),
+        "vertices_missing_somewhere": int((population.seen_count < len(records)).sum()),
+        "scans_with_folds": sum(bool(record.folded_share) for record in records),
+        "moved_share_by_round": list(at.run.rounds),
+        "settled": bool(at.run.rounds) and at.run.rounds[-1] < at.settled,
+        "cpu_s": sum(sum(record.cpu_s) for record in records),
+        "version": at.run.version,
+    }
+
+
+def _json(path: Path) -> object:
+    try:
+        return json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path} is not JSON, or it is cut short; run shapespace correspond again.") from error
 
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:

@@ -16,8 +16,13 @@ def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
+    write_text(path, table_text(header, rows))
+
+
+def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a CSV table with `header` as text."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
     writer.writerows(rows)
-    write_text(path, text.getvalue())
+    return text.getvalue()

@@ -206,6 +206,15 @@ class ScaleKey:
 
 
 @dataclass(frozen=True)
+class StripKey:
+    """The key of other strips: what their panels show in words, and scales, each (bar, its ends in words)."""
+
+    told: str
+    bars: Sequence[tuple[Image, str, str]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class Folded:
     """A part that is folded away until it is asked for."""
 
@@ -246,6 +255,7 @@ Block: TypeAlias = (
     | Turning
     | Gallery
     | ScaleKey
+    | StripKey
     | Folded
     | Group
     | Section

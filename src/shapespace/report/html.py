@@ -1,4 +1,4 @@
-"""One self-contained HTML file from saved results: of the demo, or of a folder of fits. It runs no fit."""
+"""One self-contained HTML file from saved results: of the demo, of fits, of a correspondence. It runs no fit."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from shapespace.io.files import write_text
 from shapespace.report.page import LARGEST_REPORT_BYTES, Step
 from shapespace.report.recognition import is_study, study_page
 from shapespace.report.saved import Folder, find_fits
+from shapespace.schemas import CorrespondenceRecord
 
 __all__ = ["LARGEST_REPORT_BYTES", "require_report_extra", "write_report"]
 
@@ -37,9 +38,9 @@ def write_report(
 ) -> Path:
     """Write one HTML file on the results saved in `folder`, and return its path.
 
-    A folder with a demo.json is reported as the demo, one with a recognition.json and no fits as a study of
-    recognition, any other as the results of `shapespace fit`. The page needs no
-    network; without a script it loses what turns and sorts, and can be read.
+    A folder with a demo.json is reported as the demo, one with a correspondence.json as a correspondence, one with a
+    recognition.json and no fits as a study of recognition, any other as the results of `shapespace fit`. The page needs
+    no network; without a script it loses what turns and sorts, and can be read.
 
     Args:
         folder: of the results.
@@ -50,7 +51,8 @@ def write_report(
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
-        FileFormatError: demo.json, the recognition.json of a study, `model` or `labels` is damaged.
+        FileFormatError: demo.json, correspondence.json or the mean shape beside it, the recognition.json of a study,
+            `model` or `labels` is damaged.
         InputError: the folder holds no results, or only records that cannot be read, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
@@ -66,6 +68,12 @@ def write_report(
                 f"{folder} is a demo, which names its models and labels itself; leave out --model and --labels."
             )
         page = DemoPage(results, on_step).html()
+    elif (folder / CorrespondenceRecord.FILE).is_file():
+        from shapespace.report.correspondence_page import CorrespondencePage
+
+        if model is not None or labels is not None:
+            raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
+        page = CorrespondencePage(results, on_step).html()
     elif is_study(results):
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a study without fits; leave out --model and --labels.")

@@ -206,6 +206,7 @@ def lit(
     unknown: npt.NDArray[np.float32],
     low: float,
     high: float,
+    as_map: bool,
     lights: npt.NDArray[np.float32],
     occlusion: npt.NDArray[np.float32],
     back: npt.NDArray[np.bool_],
@@ -220,6 +221,7 @@ def lit(
         unknown: (3,) linear colour where the scalar is not finite.
         low: scalar of the first colour.
         high: scalar of the last colour.
+        as_map: whether colours are read by a scale, and shading must leave them alone.
         lights: (5, 3): directions of key, fill and gloss, colours of key and fill.
         occlusion: (n,) in (0, 1].
         back: (n,) whether a surface is seen from its inside.
@@ -244,7 +246,7 @@ def lit(
         plain = (0.50 + 0.48 * key + 0.08 * fill) * (1.0 - 0.45 * rim**4)
         for k in range(3):
             base = table[at, k] if known else unknown[k]
-            if mapped:
+            if as_map:
                 value = base * plain * occlusion[i] + 0.02 * gloss
             else:
                 light = key * lights[3, k] + (0.15 * fill + 0.13 * (0.5 + 0.5 * y)) * lights[4, k] + 0.035

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,6 +24,9 @@ from shapespace.types import FloatArray, IntArray, Mesh, read_only
 Image: TypeAlias = npt.NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 _Single: TypeAlias = npt.NDArray[np.float32]
+
+SQUARE_COLOURS = 5
+"""How many colours the squares of a checkerboard take in turn."""
 
 _LARGEST_SIDE = 8192
 _SUPERSAMPLE = 2
@@ -112,6 +115,8 @@ class Layer:
         point_radius_mm: radius of the balls of a point cloud; None takes one by their spacing, and shades them as the
             surface that they lie on.
         categories: the scalars are codes: a pixel takes that of most of its triangle, and nothing between two of them.
+        across: (V,) float64, a second scalar: the surface is then a checkerboard of squares from one whole number of
+            each scalar to the next. The first colour is that of every other square, the others take turns.
 
     Raises:
         InputError: scalars without a map, of another length, or an empty range.
@@ -125,17 +130,21 @@ class Layer:
     vmax: float = 1.0
     point_radius_mm: float | None = None
     categories: bool = False
+    across: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.scalars is None:
             return
         name = self.mesh.name
-        scalars = read_only(self.scalars)
-        object.__setattr__(self, "scalars", scalars)
-        if scalars.shape != (len(self.mesh.vertices),):
-            raise InputError(
-                f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {scalars.shape}."
-            )
+        for which, given in (("scalars", self.scalars), ("across", self.across)):
+            if given is None:
+                continue
+            values = read_only(given)
+            object.__setattr__(self, which, values)
+            if values.shape != (len(self.mesh.vertices),):
+                raise InputError(
+                    f"{name} has {len(self.mesh.vertices)} vertices but the scalars have the shape {values.shape}."
+                )
         if self.colormap is None or np.ndim(self.colormap) != 2 or np.shape(self.colormap)[1] != 3:
             raise InputError(f"{name}: scalars need a colour map of the shape (N, 3).")
         if not self.vmax > self.vmin:
@@ -210,7 +219,8 @@ def render_series(
     for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
         # Layers hold views of their scalars: those of one array begin at one place.
         scalars = None if layer.scalars is None else layer.scalars.ctypes.data
-        seen = (id(layer.mesh), scalars, layer.point_radius_mm, layer.categories)
+        across = None if layer.across is None else layer.across.ctypes.data
+        seen = (id(layer.mesh), scalars, across, layer.point_radius_mm, layer.categories)
         if seen not in found:
             found[seen] = _surfels(layer, camera, fine, supersample)
         pieces[id(layer)] = (_shaded(layer, found[seen]), found[seen])
@@ -305,9 +315,29 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
         normal, scalar, back,
     )  # fmt: skip
+    if layer.across is not None:
+        other = np.empty_like(scalar)
+        interpolated(
+            pixel, triangle[pixel], screen, nearness, faces, normals, layer.across, False, size[0], normal, other, back
+        )
+        scalar = squares(scalar, other)
     depth_mm = _depth_mm(nearest[pixel], camera).astype(np.float32)
     occlusion = _occlusion(pixel, depth_mm, size, supersample, camera)
     return _Surfels(pixel, depth_mm, normal, scalar, back, occlusion)
+
+
+def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floating[Any]]) -> _Single:
+    """Return codes (n,) of the squares of a checkerboard: 0 for every other one, the others 1, 2, ... in turn.
+
+    Those nearest to each other differ, also two columns or rows apart, so that a square is told from the next ones.
+
+    Args:
+        along: (n,) where the points lie in one direction, a square being 1 wide.
+        across: (n,) and in the other.
+    """
+    column, row = np.floor(along).astype(np.int64), np.floor(across).astype(np.int64)
+    turn = (3 * column - row) // 2 % SQUARE_COLOURS
+    return np.where((column + row) % 2 == 0, 1 + turn, 0).astype(np.float32)
 
 
 def _unit(vectors: _Single) -> _Single:
@@ -395,7 +425,7 @@ def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
     table = _linear(layer.colour if layer.scalars is None or layer.colormap is None else layer.colormap)
     lit(
         surfels.normal, surfels.scalar, table, _linear(UNKNOWN_COLOUR)[0], float(layer.vmin), float(layer.vmax),
-        _LIGHTS, surfels.occlusion, surfels.back, out,
+        layer.scalars is not None and layer.across is None, _LIGHTS, surfels.occlusion, surfels.back, out,
     )  # fmt: skip
     return out
 

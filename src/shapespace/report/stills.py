@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from PIL import Image as PillowImage
 
-from shapespace.report.colours import DIVERGING, MODEL_COLOUR, SCAN_COLOUR
+from shapespace.geometry.distortion import Distortion
+from shapespace.geometry.surface import faces_of
+from shapespace.report.checker import checker_layer, checker_places
+from shapespace.report.colours import DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
+from shapespace.report.corresponded import drawable, there_are
 from shapespace.report.render import Camera, Image, Layer, distance_layer, render, render_series
-from shapespace.types import Mesh
+from shapespace.types import FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
@@ -19,6 +23,9 @@ if TYPE_CHECKING:
 PANEL = (176, 232)
 """Width and height of a panel in pixels."""
 
+AREA_LIMIT = 2.0
+"""The factor of growth at which the maps of change of area end."""
+FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)
 
 Still: TypeAlias = tuple[bytes, tuple[int, int]]
 """WebP, and its width and height in pixels."""
@@ -42,6 +49,54 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     distances = distance_layer(surface, fit.model_to_scan_mm["final"], limit_mm, signed=fit.scan.faces is not None)
     seen = render(distances, camera=camera, size=panel)
     return encoded(np.concatenate([plain, both, seen], axis=1))
+
+
+def correspondence_strip(
+    mean: Mesh, vertices: FloatArray, scan: Mesh | None, distance: FloatArray, limit: float,
+    panel: tuple[int, int] = PANEL,
+) -> Still:  # fmt: skip
+    """Return panels: the scan, the checkerboard on it, its distance, and the change of area with folded triangles.
+
+    Distances are on `colours.SEQUENTIAL` from 0; areas on `colours.DIVERGING`, from blue for `1 / AREA_LIMIT` to red
+    for `AREA_LIMIT`. Triangles that fold over are black, with those around them, so that they are seen.
+
+    Args:
+        mean: the mean shape, upright.
+        vertices: (V, 3) of the surface, moved onto the mean shape; not-a-number where missing.
+        scan: the raw scan moved likewise; None leaves out its panel and that of the distances.
+        distance: (V,) of the vertices from the scan, not-a-number where unknown; not used without a scan.
+        limit: where the scale of the distances ends.
+        panel: width and height of each panel in pixels.
+    """
+    surface = mean.with_vertices(vertices)
+    there, far = drawable(surface, distance)
+    faces, changed = faces_of(surface), Distortion.of(surface, mean)
+    _, growth = drawable(surface, _at_vertices(changed.growth, faces, len(vertices)))
+    layers = [[checker_layer(surface, checker_places(mean))]]
+    if scan is not None:
+        layers = [
+            [Layer(drawable(scan)[0], SCAN_COLOUR)], *layers,
+            [Layer(there, scalars=far, colormap=SEQUENTIAL, vmax=limit)],
+        ]  # fmt: skip
+    end = float(np.log(AREA_LIMIT))
+    area = [Layer(there, scalars=growth, colormap=DIVERGING, vmin=-end, vmax=end)]
+    if changed.folded.any():
+        around = np.isin(faces, faces[changed.folded]).any(axis=1) & there_are(vertices)[faces].all(axis=1)
+        # Of equally near surfaces the first stays.
+        area.insert(0, Layer(Mesh(np.nan_to_num(vertices), faces[around]), FOLD_COLOUR))
+    framed = np.concatenate([mean.vertices, there.vertices])
+    camera = Camera.framing(framed, aspect=panel[0] / panel[1], margin=0.02)
+    pictures = [render(*one, camera=camera, size=panel) for one in (*layers, area)]
+    return encoded(np.concatenate(pictures, axis=1))
+
+
+def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
+    """Return the mean (V,) of what is known of the triangles around each vertex."""
+    known = np.isfinite(values)
+    flat = faces[known].ravel()
+    count = np.bincount(flat, minlength=vertices)
+    total = np.bincount(flat, np.repeat(values[known], 3), vertices)
+    return np.divide(total, count, out=np.full(vertices, np.nan), where=count > 0)
 
 
 def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:

@@ -18,11 +18,17 @@ STATUS_WORDS: Mapping[str, str] = {
 """What each status is called, the best first."""
 
 DASH = "–"
+_FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
 
 
 def printable(text: str) -> str:
     """Return `text` with control characters and lone surrogates replaced; white space stays."""
     return "".join(c if c.isprintable() or c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def without_folders(sentence: str) -> str:
+    """Return `sentence` with the last part of each absolute path in place of the path."""
+    return _FOLDERS.sub("", sentence)
 
 
 def anchor(text: str) -> str:

@@ -13,10 +13,11 @@ import webbrowser
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from shapespace.batch.workers import cores, start_loading
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.schemas import CorrespondenceRecord
 
 if TYPE_CHECKING:
     from shapespace.viewer.sessions import Sessions
@@ -38,10 +39,10 @@ def serve(
     quiet: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a model, or the fits of a folder, in the browser until Ctrl-C.
+    """Show a model, the fits of a folder, or surfaces in correspondence, in the browser until Ctrl-C.
 
     Args:
-        path: a model file, or a folder that `shapespace fit` wrote.
+        path: a model file, or a folder that `shapespace fit` or `shapespace correspond` wrote.
         model: the model's file, where the records of the folder do not lead to it.
         host: the address to listen at; anything but loopback needs a token, which is part of the address printed.
         port: None takes the first free one from `FIRST_PORT`.
@@ -53,28 +54,23 @@ def serve(
     Raises:
         ShapespaceError: the extra `view` is not installed.
         FileError: the model or the folder cannot be read.
-        InputError: the port is taken, or the host is none of this machine's.
+        InputError: the port is taken, the host is none of this machine's, or a model is given with surfaces.
     """
     for needed in ("starlette", "uvicorn"):
         if importlib.util.find_spec(needed) is None:
             raise ShapespaceError(
                 f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
             )
-    # While this process loads its own code.
-    start_loading(tell=not quiet)
-    from shapespace.viewer.scratch import sweep
-    from shapespace.viewer.server import make_app
-    from shapespace.viewer.sessions import Limits
-    from shapespace.viewer.shown import Shown
-
+    if (path / CorrespondenceRecord.FILE).is_file():
+        make = _of_surfaces(path, model)
+    else:
+        make = _of_model(path, model, max_upload_mb, quiet=quiet)
     with _ended_by_signals():
-        sweep()
-        shown = Shown.open(path, model)
+        build = make()
         listening = listen(host, port)
         taken = int(listening.getsockname()[1])
         token = None if host in _LOOPBACK else secrets.token_urlsafe(24)
-        limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
-        app, sessions = make_app(shown, limits=limits, token=token, cookie_name=f"shapespace_{taken}")
+        app, sessions = build(token, f"shapespace_{taken}")
         address = page_address(host, taken, token)
 
         def started() -> None:
@@ -86,6 +82,44 @@ def serve(
                 threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 
         run(app, sessions, listening, started)
+
+
+_App: TypeAlias = "tuple[object, Sessions | None]"
+_Build: TypeAlias = Callable[[str | None, str], _App]
+
+
+def _of_surfaces(path: Path, model: Path | None) -> Callable[[], _Build]:
+    """Return what opens a folder in correspondence, and then makes its application from a token and a cookie's name."""
+    if model is not None:
+        raise InputError(f"{path} is a correspondence without fits; leave --model out.")
+
+    def open_() -> _Build:
+        from shapespace.viewer.surfaces import Surfaces
+        from shapespace.viewer.surfaces_server import make_surfaces_app
+
+        shown = Surfaces(path)
+        return lambda token, cookie_name: (make_surfaces_app(shown, token=token, cookie_name=cookie_name), None)
+
+    return open_
+
+
+def _of_model(path: Path, model: Path | None, max_upload_mb: int, *, quiet: bool) -> Callable[[], _Build]:
+    """Return the same of a model, or of a folder of fits."""
+    # While this process loads its own code.
+    start_loading(tell=not quiet)
+
+    def open_() -> _Build:
+        from shapespace.viewer.scratch import sweep
+        from shapespace.viewer.server import make_app
+        from shapespace.viewer.sessions import Limits
+        from shapespace.viewer.shown import Shown
+
+        sweep()
+        shown = Shown.open(path, model)
+        limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
+        return lambda token, cookie_name: make_app(shown, limits=limits, token=token, cookie_name=cookie_name)
+
+    return open_
 
 
 def _ending_signals() -> list[signal.Signals]:
@@ -113,12 +147,12 @@ def _ended_by_signals() -> Generator[None]:
             signal.signal(number, handler)
 
 
-def run(app: object, sessions: Sessions, listening: socket.socket, started: Callable[[], None]) -> None:
+def run(app: object, sessions: Sessions | None, listening: socket.socket, started: Callable[[], None]) -> None:
     """Serve `app` until a signal ends it; scans and processes of visitors are gone when it returns.
 
     Args:
         app: the application.
-        sessions: its sessions.
+        sessions: its sessions, None where it has none.
         listening: where it is served.
         started: called when it answers.
     """
@@ -143,7 +177,8 @@ def run(app: object, sessions: Sessions, listening: socket.socket, started: Call
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             # Pages that watch a fit would otherwise hold the server up.
-            sessions.closing = True
+            if sessions is not None:
+                sessions.closing = True
             super().handle_exit(sig, frame)
 
     config = uvicorn.Config(
@@ -162,7 +197,8 @@ def run(app: object, sessions: Sessions, listening: socket.socket, started: Call
         # Ctrl-C is how a viewer ends.
         pass
     finally:
-        sessions.close()
+        if sessions is not None:
+            sessions.close()
 
 
 def listen(host: str, port: int | None) -> socket.socket:

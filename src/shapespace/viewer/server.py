@@ -16,46 +16,30 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from shapespace.errors import ShapespaceError
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks import write_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.report import colours
 from shapespace.types import Mesh
 from shapespace.version import __version__
+from shapespace.viewer.answers import BINARY, PAGES, asset, download, handlers
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
-from shapespace.viewer.guard import Guard, cookie, refusal
+from shapespace.viewer.guard import Guard, cookie
 from shapespace.viewer.scratch import new_folder
 from shapespace.viewer.sessions import DroppedScan, Limits, Session, Sessions
 from shapespace.viewer.shown import Shown, shape_of
-
-_OWN_ASSETS = Path(__file__).parent / "assets"
-_SHARED_ASSETS = Path(__file__).parents[1] / "report" / "assets"
-ASSETS: Mapping[str, tuple[Path, str]] = {
-    "viewer.css": (_OWN_ASSETS / "viewer.css", "text/css"),
-    "charts.js": (_OWN_ASSETS / "charts.js", "text/javascript"),
-    "fit-view.js": (_OWN_ASSETS / "fit-view.js", "text/javascript"),
-    "viewer.js": (_OWN_ASSETS / "viewer.js", "text/javascript"),
-    "theme.js": (_SHARED_ASSETS / "theme.js", "text/javascript"),
-    "widgets.css": (_SHARED_ASSETS / "widgets.css", "text/css"),
-    "scene.js": (_SHARED_ASSETS / "scene.js", "text/javascript"),
-    "three.min.js": (_SHARED_ASSETS / "vendor" / "three.min.js", "text/javascript"),
-}
-"""What the page may load, by name."""
 
 EXPORTS = ("ply", "obj", "stl")
 _LARGEST_QUESTION = 2**20
 _LONGEST_NAME = 120
 _FEWEST_LANDMARKS = 3
-_BINARY = "application/octet-stream"
 _NO_SCAN = "There is no such scan; it was removed, or it never was yours."
 _NO_SESSION = "This visit has ended, and its scans were removed; reload the page."
-_BROKEN = "The server met an error of its own; look at the terminal where it runs, and reload the page."
 _DISK = "The server could not store the scan: {}; free some space there and drop it again."
 
 Endpoint: TypeAlias = Callable[[Request], Coroutine[Any, Any, Response]]
@@ -114,12 +98,7 @@ def make_app(
     app = Starlette(
         routes=viewer.routes(),
         lifespan=lifespan,
-        exception_handlers={
-            HTTPException: _told,
-            ShapespaceError: viewer.sentence,
-            ClientDisconnect: _left,
-            Exception: _broken,
-        },
+        exception_handlers=handlers(shown.told),
     )
     return Guard(app, token=token, cookie=f"{cookie_name}_token"), sessions
 
@@ -136,7 +115,7 @@ class _Viewer:
         scan = "/api/scans/{key}"
         return [
             Route("/", self.page),
-            Route("/assets/{name}", self.asset),
+            Route("/assets/{name}", asset),
             Route("/api/about", self.about),
             Route("/api/model", self.model),
             Route("/api/fits", self.fits),
@@ -155,17 +134,10 @@ class _Viewer:
 
     async def page(self, request: Request) -> Response:
         session = self._sessions.find(request.cookies.get(self._cookie))
-        response = FileResponse(_OWN_ASSETS / "viewer.html", media_type="text/html")
+        response = FileResponse(PAGES / "viewer.html", media_type="text/html")
         if session is None:
             response.headers.append("Set-Cookie", cookie(self._cookie, self._sessions.new().key))
         return response
-
-    async def asset(self, request: Request) -> Response:
-        name = request.path_params["name"]
-        if name not in ASSETS:
-            raise HTTPException(404, "There is no such file.")
-        path, kind = ASSETS[name]
-        return FileResponse(path, media_type=kind)
 
     async def about(self, request: Request) -> Response:
         model, limits = self._shown.model, self._sessions.limits
@@ -197,7 +169,7 @@ class _Viewer:
 
     async def model(self, request: Request) -> Response:
         packed, _ = await self.packed_model()
-        return Response(packed, media_type=_BINARY)
+        return Response(packed, media_type=BINARY)
 
     async def fits(self, request: Request) -> Response:
         return JSONResponse(await asyncio.to_thread(self._shown.fit_list))
@@ -209,7 +181,7 @@ class _Viewer:
             raise HTTPException(
                 404, "There is no such fit; reload the page to see what the folder holds now."
             ) from None
-        return Response(packed, media_type=_BINARY)
+        return Response(packed, media_type=BINARY)
 
     async def export(self, request: Request) -> Response:
         kind = request.query_params.get("format", "")
@@ -217,7 +189,7 @@ class _Viewer:
             raise HTTPException(400, f"There is no export as {kind[:20]!r}; choose one of {', '.join(EXPORTS)}.")
         question = await _question(request)
         content = await asyncio.to_thread(self._exported, kind, question, self._session(request))
-        return _download(content, f"shape.{kind}")
+        return download(content, f"shape.{kind}")
 
     def _exported(self, kind: str, question: Mapping[str, Any], session: Session | None) -> bytes:
         mesh = self._asked_mesh(question, session)
@@ -303,7 +275,7 @@ class _Viewer:
         path = self._own_scan(request).folder / f"{NAME}.fit.json"
         if not path.is_file():
             raise HTTPException(404, "This scan has no result yet.")
-        return _download(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
+        return download(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
 
     async def landmarks(self, request: Request) -> Response:
         session, scan = self._own_session(request), self._own_scan(request)
@@ -346,9 +318,6 @@ class _Viewer:
         if scan is None:
             raise HTTPException(404, _NO_SCAN)
         return scan
-
-    async def sentence(self, request: Request, error: Exception) -> Response:
-        return refusal(422, self._shown.told(str(error)))
 
     async def packed_model(self) -> tuple[bytes, int]:
         async with self._packing:
@@ -405,11 +374,7 @@ def _shown_name(name: str) -> str:
 def _file(path: Path) -> Response:
     if not path.is_file():
         raise HTTPException(404, "There is no picture of this scan.")
-    return FileResponse(path, media_type=_BINARY)
-
-
-def _download(content: bytes, name: str) -> Response:
-    return Response(content, media_type=_BINARY, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    return FileResponse(path, media_type=BINARY)
 
 
 def _finite(value: Any) -> Any:
@@ -419,17 +384,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in cast(Mapping[str, Any], value).items()}
     return [_finite(item) for item in cast(list[Any], value)] if isinstance(value, list) else value
-
-
-async def _told(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    plain = "There is nothing at this address." if error.detail == "Not Found" else error.detail
-    return refusal(error.status_code, plain)
-
-
-async def _left(_: Request, error: Exception) -> Response:
-    return refusal(400, "The upload ended early.")
-
-
-async def _broken(_: Request, error: Exception) -> Response:
-    return refusal(500, _BROKEN)

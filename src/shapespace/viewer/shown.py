@@ -15,6 +15,7 @@ from shapespace.errors import FileError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
 from shapespace.report.scene import pack_model
+from shapespace.report.wording import without_folders
 from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
@@ -23,7 +24,6 @@ MODEL_BYTES = 48 * 2**20
 """Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
-_FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
 
 
 class Shown:
@@ -171,11 +171,6 @@ class Shown:
         if self._ours(fit) and fit.record.z:
             row["z"] = _rounded(fit.record.z)
         return row
-
-
-def without_folders(sentence: str) -> str:
-    """Return `sentence` with the last part of each absolute path in place of the path."""
-    return _FOLDERS.sub("", sentence)
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:

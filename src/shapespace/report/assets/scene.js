@@ -175,10 +175,16 @@
 
   const COLOUR = `
     uniform vec3 colour; uniform vec3 signal; uniform vec3 unknown; uniform sampler2D map;
-    uniform vec2 range; uniform float threshold; uniform int paint;
+    uniform vec2 range; uniform float threshold; uniform int paint; uniform float squares;
     vec3 painted(vec2 value, vec3 own) {
       if (paint == 0) return colour;
       if (paint == 2) return own;
+      if (paint == 3) {
+        // As render.squares: every other one is paper, the others take turns so that near ones differ.
+        vec2 at = floor(value);
+        float turn = mod(at.x + at.y, 2.0) > 0.5 ? 0.0 : 1.0 + mod(floor((3.0 * at.x - at.y) / 2.0), squares - 1.0);
+        return texture2D(map, vec2((turn + 0.5) / squares, 0.5)).rgb;
+      }
       if (value.y < 0.999) return unknown;
       if (abs(value.x) > threshold) return signal;
       return texture2D(map, vec2(clamp((value.x - range.x) / (range.y - range.x), 0.0, 1.0), 0.5)).rgb;
@@ -201,7 +207,7 @@
       vec3 n = normalize(vNormal);
       float back = gl_FrontFacing ? 0.0 : 1.0;
       if (back > 0.5) n = -n;
-      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 ? 0.0 : 1.0), opacity);
+      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 ? 0.0 : paint == 3 ? 0.4 : 1.0), opacity);
     }`;
 
   const POINT_VERTEX = `
@@ -425,7 +431,8 @@
       if (positions.length !== attribute.array.length || !Number.isFinite(sum)) {
         const { colour, opacity, visible, given, paint, size } = thing;
         this.setSurface(id, { positions, faces: given, colour, opacity, visible, size });
-        if (paint && paint.values.length === positions.length / 3) this.paint(id, paint.values, paint.options);
+        const each = paint && paint.options.squares ? 2 : 1;
+        if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
         return;
       }
       attribute.array.set(positions);
@@ -439,7 +446,8 @@
 
     /**
      * Colour a surface by numbers at its vertices: {map, range, threshold, signal}, or {categories: [[r,g,b], ...]}
-     * where they are codes. values null goes back to the plain colour.
+     * where they are codes, or {squares: [[r,g,b], ...]} where they are two a vertex: places on a checkerboard.
+     * values null goes back to the plain colour.
      */
     paint(id, values, options) {
       const thing = this._things.get(id);
@@ -451,7 +459,7 @@
         this.request();
         return;
       }
-      const { map = null, range = [0, 1], threshold = null, signal = SIGNAL, unknown = GREY, categories = null } = options;
+      const { map = null, range = [0, 1], threshold = null, signal = SIGNAL, unknown = GREY, categories = null, squares = null } = options;
       const attributes = thing.object.geometry.attributes;
       const count = Math.min(values.length, attributes.position.count);
       if (categories) {
@@ -462,6 +470,12 @@
         }
         attributes.own.needsUpdate = true;
         uniforms.paint.value = 2;
+      } else if (squares) {
+        attributes.value.array.set(values.subarray(0, attributes.value.array.length));
+        attributes.value.needsUpdate = true;
+        uniforms.squares.value = squares.length;
+        useMap(thing, squares);
+        uniforms.paint.value = 3;
       } else {
         // The same numbers again, as when a threshold moves, need no new upload.
         if (!thing.paint || thing.paint.values !== values || options.changed) {
@@ -475,11 +489,7 @@
           }
           attributes.value.needsUpdate = true;
         }
-        if (!thing.paint || thing.paint.options.map !== map) {
-          if (thing.texture) thing.texture.dispose();
-          thing.texture = texture(map || [[0, 0, 0], [1, 1, 1]]);
-          uniforms.map.value = thing.texture;
-        }
+        if (!thing.paint || thing.paint.options.map !== map) useMap(thing, map || [[0, 0, 0], [1, 1, 1]]);
         uniforms.range.value.set(range[0], range[1] > range[0] ? range[1] : range[0] + 1e-9);
         uniforms.threshold.value = threshold === null || !Number.isFinite(threshold) ? 1e30 : threshold;
         uniforms.signal.value.fromArray(signal);
@@ -1029,6 +1039,11 @@
     return p.length ? Math.max(1.4 * Math.sqrt((sides[0] * sides[1]) / (p.length / 3)), 1e-3) : 1;
   }
 
+  function useMap(thing, colours) {
+    if (thing.texture) thing.texture.dispose();
+    thing.texture = thing.material.uniforms.map.value = texture(colours);
+  }
+
   function texture(map) {
     const data = new Uint8Array(4 * map.length);
     map.forEach((colour, k) => data.set([255 * colour[0], 255 * colour[1], 255 * colour[2], 255].map(Math.round), 4 * k));
@@ -1042,7 +1057,7 @@
     const uniforms = {
       colour: { value: new THREE.Vector3() }, signal: { value: new THREE.Vector3() },
       unknown: { value: new THREE.Vector3() }, map: { value: null }, range: { value: new THREE.Vector2(0, 1) },
-      threshold: { value: 1e30 }, paint: { value: 0 }, opacity: { value: 1 }, nearer: { value: 0 },
+      threshold: { value: 1e30 }, paint: { value: 0 }, squares: { value: 2 }, opacity: { value: 1 }, nearer: { value: 0 },
     };
     if (isPoints) {
       Object.assign(uniforms, {

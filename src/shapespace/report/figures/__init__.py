@@ -12,6 +12,13 @@ readers. Importing this package needs the extra `report`.
 """
 
 from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_matrix
+from shapespace.report.figures.correspondence import (
+    SIDE_DEG,
+    checkerboard_figure,
+    missing_figure,
+    movement_figure,
+    nearness_figure,
+)
 from shapespace.report.figures.draw import STAGE_WORDS, encode_webp
 from shapespace.report.figures.fit import (
     THRESHOLDS_MM,
@@ -51,6 +58,7 @@ from shapespace.report.figures.recognition import (
 from shapespace.report.staged import StagedFit
 
 __all__ = [
+    "SIDE_DEG",
     "STAGE_WORDS",
     "THRESHOLDS_MM",
     "Coefficients",
@@ -59,6 +67,7 @@ __all__ = [
     "b_plane",
     "b_space",
     "calibration_figure",
+    "checkerboard_figure",
     "coefficients_figure",
     "confusion_figure",
     "curve_figure",
@@ -73,8 +82,11 @@ __all__ = [
     "learning_curve_figure",
     "mean_figure",
     "mesh_rows_figure",
+    "missing_figure",
     "mode_animation",
     "modes_figure",
+    "movement_figure",
+    "nearness_figure",
     "overlay_figure",
     "portrait_figure",
     "quality_figure",

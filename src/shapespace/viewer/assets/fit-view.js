@@ -2,19 +2,9 @@
 (function () {
   "use strict";
 
-  const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
+  const Viewer = window.ShapespaceViewer;
 
-  /** Return an element: h("button", {type: "button", onclick}, "text", child, ...). */
-  const h = (Viewer.h = function (tag, properties, ...children) {
-    const element = document.createElement(tag);
-    for (const [key, value] of Object.entries(properties || {})) {
-      if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
-      else if (value === true) element.setAttribute(key, "");
-      else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, value);
-    }
-    element.append(...children.filter((child) => child !== null && child !== undefined));
-    return element;
-  });
+  const { h } = Viewer;
 
   /** Fill the track of a slider from its middle (a range about zero) or from its start. */
   const paintTrack = (Viewer.paintTrack = function (slider) {
@@ -35,14 +25,6 @@
   Viewer.quantile = function (values, q) {
     const sorted = Float32Array.from(values).filter(Number.isFinite).map(Math.abs).sort();
     return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(q * sorted.length))] : 0;
-  };
-
-  Viewer.save = function (blob, name) {
-    const link = h("a", { href: URL.createObjectURL(blob), download: name });
-    document.body.append(link);
-    link.click();
-    link.remove();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
 
   const STAGES = { before: "Before", initial: "Phase 1", final: "Phase 2", dense: "Dense" };

@@ -3,8 +3,7 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { h, sign, paintTrack, nice, quantile, save } = Viewer;
-  const $ = (id) => document.getElementById(id);
+  const { $, h, sign, paintTrack, nice, quantile, save, alertUser, ask, telling, guarded, json, binary, post } = Viewer;
   const SHOWN_AT_FIRST = 12;
   const FILTERED_FROM = 12;
   const OTHER_SIZE = 0.02; // share by which the scan's millimetres differ where both are told
@@ -22,76 +21,6 @@
   let positions;
   let stage;
   let shown = "model";
-
-  // Messages --------------------------------------------------------------------------------------------------------
-
-  let alerts = 0; // told so far
-  let running = 0; // actions that may still fail
-
-  function alertUser(sentence) {
-    alerts += 1;
-    const close = h("button", { type: "button", class: "small quiet", "data-testid": "message-close", onclick: quiet }, "Close");
-    $("message").replaceChildren(h("span", {}, sentence), close);
-    $("message").hidden = false;
-  }
-
-  function quiet() {
-    $("message").hidden = true;
-  }
-
-  /** An older message goes when what was done after it went well; what the server is asked for decides by itself. */
-  function startMessages() {
-    const control = "button, input, select, [role=option]";
-    for (const kind of ["click", "input", "change"]) {
-      addEventListener(kind, (event) => {
-        const before = alerts;
-        if (event.target.closest && event.target.closest(control)) setTimeout(() => { if (alerts === before && !running) quiet(); }, 0);
-      }, true);
-    }
-    addEventListener("keydown", (event) => { if (event.key === "Escape") quiet(); });
-  }
-
-  const UNREACHABLE = "The viewer's server does not answer; see whether shapespace view still runs, then reload the page.";
-
-  /** fetch, with the server's own sentence as the error. */
-  async function ask(path, options) {
-    let answer;
-    try {
-      answer = await fetch(path, options);
-    } catch (error) {
-      throw new Error(UNREACHABLE);
-    }
-    if (answer.ok) return answer;
-    let told = null;
-    try { told = (await answer.json()).error; } catch (error) { /* not one of our answers */ }
-    throw new Error(told || `The server answered with the error ${answer.status}; reload the page.`);
-  }
-
-  /** `action` with what goes wrong told to the user. */
-  const telling = (action) => async (...given) => {
-    try {
-      return await action(...given);
-    } catch (error) {
-      alertUser(error.message);
-      return undefined;
-    }
-  };
-
-  /** The same of what the user does, where success ends an older message. */
-  const guarded = (action) => async (...given) => {
-    const before = alerts;
-    running += 1;
-    try {
-      return await telling(action)(...given);
-    } finally {
-      running -= 1;
-      if (alerts === before) quiet();
-    }
-  };
-
-  const json = async (path, options) => (await ask(path, options)).json();
-  const binary = async (path) => Shapespace.unpack(await (await ask(path)).arrayBuffer());
-  const post = (content) => ({ method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
 
   const download = guarded(async (question, kind, name) => {
     const { fit, scan, z: shape } = question;
@@ -1042,14 +971,7 @@
         $(`tab-${next}`).focus();
       });
     }
-    $("theme").addEventListener("click", () => {
-      const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-      const now = document.documentElement.dataset.theme || (dark ? "dark" : "light");
-      const next = now === "dark" ? "light" : "dark";
-      document.documentElement.dataset.theme = next;
-      try { localStorage.setItem("shapespace-theme", next); } catch (refused) { /* the choice lasts for this visit */ }
-      for (const view of [stage.a, stage.b]) if (view) view.request();
-    });
+    Viewer.startTheme(() => { for (const view of [stage.a, stage.b]) if (view) view.request(); });
     $("view-home").addEventListener("click", () => stage.a.reset());
     $("picture").addEventListener("click", guarded(async () => save(await stage.picture(), "shapespace.png")));
   }
@@ -1060,8 +982,7 @@
   }
 
   async function begin() {
-    // The token is in a cookie now, and need not stay in the address or the history.
-    if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", location.pathname);
+    Viewer.forgetToken();
     about = await json("/api/about");
     const unpacked = await binary("/api/model");
     model = new Shapespace.Model(unpacked);
@@ -1084,7 +1005,7 @@
     startModel();
     startCompare();
     startTabs();
-    startMessages();
+    Viewer.startMessages();
     drawModel();
     stage.a.frame(["model"]);
     $("loading").hidden = true;

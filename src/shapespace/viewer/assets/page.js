@@ -1,0 +1,118 @@
+/* What the viewer's pages share: elements, messages, talking to the server, the theme. */
+(function () {
+  "use strict";
+
+  const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
+  const $ = (id) => document.getElementById(id);
+
+  /** Return an element: h("button", {type: "button", onclick}, "text", child, ...). */
+  const h = (Viewer.h = function (tag, properties, ...children) {
+    const element = document.createElement(tag);
+    for (const [key, value] of Object.entries(properties || {})) {
+      if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+      else if (value === true) element.setAttribute(key, "");
+      else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, value);
+    }
+    element.append(...children.filter((child) => child !== null && child !== undefined));
+    return element;
+  });
+
+  Viewer.save = function (blob, name) {
+    const link = h("a", { href: URL.createObjectURL(blob), download: name });
+    document.body.append(link);
+    link.click();
+    link.remove();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  };
+
+  // Messages --------------------------------------------------------------------------------------------------------
+
+  let alerts = 0; // told so far
+  let running = 0; // actions that may still fail
+
+  function alertUser(sentence) {
+    alerts += 1;
+    const close = h("button", { type: "button", class: "small quiet", "data-testid": "message-close", onclick: quiet }, "Close");
+    $("message").replaceChildren(h("span", {}, sentence), close);
+    $("message").hidden = false;
+  }
+
+  function quiet() {
+    $("message").hidden = true;
+  }
+
+  /** An older message goes when what was done after it went well; what the server is asked for decides by itself. */
+  function startMessages() {
+    const control = "button, input, select, [role=option]";
+    for (const kind of ["click", "input", "change"]) {
+      addEventListener(kind, (event) => {
+        const before = alerts;
+        if (event.target.closest && event.target.closest(control)) setTimeout(() => { if (alerts === before && !running) quiet(); }, 0);
+      }, true);
+    }
+    addEventListener("keydown", (event) => { if (event.key === "Escape") quiet(); });
+  }
+
+  const UNREACHABLE = "The viewer's server does not answer; see whether shapespace view still runs, then reload the page.";
+
+  /** fetch, with the server's own sentence as the error. */
+  async function ask(path, options) {
+    let answer;
+    try {
+      answer = await fetch(path, options);
+    } catch (error) {
+      throw new Error(UNREACHABLE);
+    }
+    if (answer.ok) return answer;
+    let told = null;
+    try { told = (await answer.json()).error; } catch (error) { /* not one of our answers */ }
+    throw new Error(told || `The server answered with the error ${answer.status}; reload the page.`);
+  }
+
+  /** `action` with what goes wrong told to the user. */
+  const telling = (action) => async (...given) => {
+    try {
+      return await action(...given);
+    } catch (error) {
+      alertUser(error.message);
+      return undefined;
+    }
+  };
+
+  /** The same of what the user does, where success ends an older message. */
+  const guarded = (action) => async (...given) => {
+    const before = alerts;
+    running += 1;
+    try {
+      return await telling(action)(...given);
+    } finally {
+      running -= 1;
+      if (alerts === before) quiet();
+    }
+  };
+
+  const json = async (path, options) => (await ask(path, options)).json();
+  const binary = async (path) => Shapespace.unpack(await (await ask(path)).arrayBuffer());
+  const post = (content) => ({ method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+
+  // The rest --------------------------------------------------------------------------------------------------------
+
+  /** The button that switches colours; `changed` is called after. */
+  function startTheme(changed) {
+    $("theme").addEventListener("click", () => {
+      const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+      const now = document.documentElement.dataset.theme || (dark ? "dark" : "light");
+      const next = now === "dark" ? "light" : "dark";
+      document.documentElement.dataset.theme = next;
+      try { localStorage.setItem("shapespace-theme", next); } catch (refused) { /* the choice lasts for this visit */ }
+      changed();
+    });
+  }
+
+  /** The token is in a cookie now, and need not stay in the address or the history. */
+  function forgetToken() {
+    if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", location.pathname);
+  }
+
+  Object.assign(Viewer, { $, alertUser, ask, telling, guarded, json, binary, post, startMessages, startTheme, forgetToken });
+})();

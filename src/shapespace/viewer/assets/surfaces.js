@@ -1,0 +1,206 @@
+/* Surfaces in correspondence side by side: a click on one marks the same vertex on all of them. */
+(function () {
+  "use strict";
+
+  const Viewer = window.ShapespaceViewer;
+  const { $, h, save, alertUser, ask, guarded, json, binary } = Viewer;
+  const WORDS = { unreadable: "unreadable", "set aside": "set aside", look: "to be looked at", corresponding: "in correspondence" };
+  const DOTS = { unreadable: "unreadable", "set aside": "failed", look: "doubtful", corresponding: "converged" };
+
+  window.shapespaceReady = false;
+
+  let about, mean, scans;
+  let rows = []; // all scans, as listed
+  let wanted = []; // those with a surface that the filter leaves
+  let first = 0; // number of the first one that is shown
+  let cells = []; // the mean shape, then one a scan
+  let marks = []; // numbers of vertices
+  let colour = "squares";
+  let turn = 0; // a page that is still on its way is not shown when another was asked for
+
+  const percent = (share) => `${(100 * share).toFixed(share > 0 && share < 0.0995 ? 1 : 0)} %`;
+
+  // The grid --------------------------------------------------------------------------------------------------------
+
+  function makeCells() {
+    for (let k = 0; k <= about.page; k++) {
+      const canvas = h("div", { class: "view", "data-testid": `view-${k}` });
+      const name = h("strong", {}), note = h("span", { class: "note", "data-testid": `note-${k}` });
+      const box = h("div", { class: "cell", "data-testid": `cell-${k}` }, canvas, note, h("p", {}, name));
+      $("grid").append(box);
+      const cell = { box, name, note, positions: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
+      cell.view.on("click", (event) => {
+        const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
+        if (hit) addMark(hit.vertex);
+      });
+      cells.push(cell);
+    }
+  }
+
+  function put(cell, name, positions) {
+    cell.positions = positions;
+    cell.name.textContent = name;
+    cell.view.label = `${name} in 3-D`;
+    cell.view.setSurface("surface", { positions, faces: mean.faces, colour: about.clay });
+    paint(cell);
+    drawMarks(cell);
+  }
+
+  function paint(cell) {
+    if (!cell.positions) return;
+    if (colour === "plain") cell.view.paint("surface", null);
+    else if (colour === "squares") cell.view.paint("surface", mean.places, { squares: about.squares });
+    else cell.view.paint("surface", missing, { map: about.sequential, range: [0, most()] });
+  }
+
+  let missing;
+  const most = () => [5, 10, 25, 50, 100].find((limit) => missing.every((value) => value <= limit));
+
+  function drawBar() {
+    $("scale").hidden = colour !== "missing";
+    if (colour === "missing") {
+      Shapespace.colourBar($("scale"), { map: about.sequential, range: [0, most()], unit: "%", title: "Scans that do not show the vertex" });
+    }
+  }
+
+  // Marks -----------------------------------------------------------------------------------------------------------
+
+  const markColour = (k) => about.marks[k % about.marks.length];
+
+  function addMark(vertex) {
+    if (marks.includes(vertex)) return;
+    if (marks.length >= about.most_marked) {
+      alertUser(`At most ${about.most_marked} vertices can be marked at a time; clear some first.`);
+      return;
+    }
+    marks.push(vertex);
+    drawAllMarks();
+  }
+
+  function drawMarks(cell) {
+    const shown = [], gone = [];
+    marks.forEach((vertex, k) => {
+      const position = Array.from(cell.positions.subarray(3 * vertex, 3 * vertex + 3));
+      if (position.every(Number.isFinite)) shown.push({ position, label: String(vertex), colour: markColour(k) });
+      else gone.push(vertex);
+    });
+    cell.view.marks("marks", shown);
+    cell.note.textContent = gone.length ? `${gone.length > 3 ? `${gone.length} marked vertices` : gone.join(", ")} not shown` : "";
+  }
+
+  function drawAllMarks() {
+    for (const cell of cells) if (cell.positions) drawMarks(cell);
+    $("marks").replaceChildren(...marks.map((vertex, k) => {
+      const seen = mean.seen[vertex];
+      const dot = h("span", { class: "dot" });
+      dot.style.background = `rgb(${markColour(k).map((c) => Math.round(255 * c)).join(",")})`;
+      const told = `shown by ${seen === scans ? `all ${scans}` : `${seen} of ${scans}`} scans`;
+      return h("p", { "data-testid": `marked-${vertex}` }, dot, h("strong", {}, `Vertex ${vertex}`), h("span", {}, told), h("button", {
+        type: "button", class: "small quiet", "aria-label": `Remove the mark of vertex ${vertex}`, onclick: () => { marks = marks.filter((one) => one !== vertex); drawAllMarks(); },
+      }, "\u00d7"));
+    }));
+    $("clear").disabled = $("save").disabled = !marks.length;
+  }
+
+  function startMarks() {
+    $("number").max = String(about.vertices - 1);
+    const typed = guarded(async () => {
+      const text = $("number").value.trim(), vertex = Number(text);
+      if (!text || !Number.isInteger(vertex) || vertex < 0 || vertex >= about.vertices) {
+        throw new Error(`The vertices have the numbers 0 to ${about.vertices - 1}; give one of them.`);
+      }
+      addMark(vertex);
+    });
+    $("mark").addEventListener("click", typed);
+    $("number").addEventListener("keydown", (event) => { if (event.key === "Enter") typed(); });
+    $("clear").addEventListener("click", () => { marks = []; drawAllMarks(); });
+    $("save").addEventListener("click", guarded(async () => {
+      const answer = await ask(`/api/places?vertices=${marks.join(",")}`);
+      save(await answer.blob(), `${about.name.replace(/[^\w.-]+/g, "_")}.places.csv`);
+    }));
+  }
+
+  // Scans -----------------------------------------------------------------------------------------------------------
+
+  const pictured = (row) => row.status === "corresponding" || row.status === "look";
+
+  function filterRows() {
+    const asked = $("filter").value.trim().toLowerCase();
+    const found = rows.filter((row) => `${row.name} ${WORDS[row.status]} ${row.told}`.toLowerCase().includes(asked));
+    wanted = found.filter(pictured);
+    $("list").replaceChildren(...found.slice(0, 500).map((row) => h("p", { class: DOTS[row.status], "data-testid": `row-${row.name}` },
+      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "corresponding" ? null : h("small", {}, row.told)))));
+    showPage(0);
+  }
+
+  const showPage = guarded(async (from) => {
+    const mine = ++turn;
+    first = Math.max(0, Math.min(from, Math.max(0, wanted.length - 1)));
+    const shown = wanted.slice(first, first + about.page);
+    $("previous").disabled = first === 0;
+    $("next").disabled = first + about.page >= wanted.length;
+    $("which").textContent = shown.length ? `${first + 1} to ${first + shown.length} of ${wanted.length}` : "No scan";
+    cells.slice(1).forEach((cell, k) => { cell.box.hidden = k >= shown.length; });
+    const problems = [];
+    for (let k = 0; k < shown.length; k++) {
+      const cell = cells[k + 1];
+      let positions = null;
+      try {
+        positions = (await binary(`/api/surfaces/${encodeURIComponent(shown[k].name)}`)).arrays.positions;
+      } catch (error) {
+        problems.push(error.message);
+      }
+      if (mine !== turn) return;
+      if (positions) put(cell, shown[k].name, positions);
+      else cell.box.hidden = true;
+    }
+    for (const cell of cells.slice(1 + shown.length)) {
+      cell.positions = null;
+      cell.view.remove("surface");
+      cell.view.remove("marks");
+    }
+    window.shapespaceReady = true;
+    document.body.dataset.ready = "true";
+    if (problems.length) throw new Error(problems.join(" "));
+  });
+
+  function startScans() {
+    $("previous").addEventListener("click", () => showPage(first - about.page));
+    $("next").addEventListener("click", () => showPage(first + about.page));
+    $("front").addEventListener("click", () => cells[0].view.reset());
+    $("filter").addEventListener("input", filterRows);
+    for (const button of $("colours").querySelectorAll("button")) {
+      button.addEventListener("click", () => {
+        colour = button.dataset.colour;
+        for (const other of $("colours").querySelectorAll("button")) other.setAttribute("aria-pressed", String(other === button));
+        cells.forEach(paint);
+        drawBar();
+      });
+    }
+  }
+
+  async function begin() {
+    Viewer.forgetToken();
+    about = await json("/api/about");
+    document.title = `${about.name} \u2013 shapespace`;
+    $("about").textContent = `${about.name}: ${about.corresponding} of ${about.scans} scans in correspondence, ${about.vertices.toLocaleString("en")} vertices`;
+    const unpacked = await binary("/api/mean");
+    mean = unpacked.arrays;
+    scans = unpacked.facts.scans;
+    missing = Float32Array.from(mean.seen, (count) => (100 * (scans - count)) / Math.max(scans, 1));
+    makeCells();
+    put(cells[0], "Mean shape", mean.positions);
+    cells[0].view.frame(["surface"], 1.06);
+    for (const cell of cells.slice(1)) cells[0].view.link(cell.view);
+    Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
+    Viewer.startMessages();
+    startMarks();
+    startScans();
+    $("loading").hidden = true;
+    rows = await json("/api/surfaces");
+    window.shapespaceCells = cells;
+    filterRows();
+  }
+
+  guarded(begin)();
+})();

@@ -1,0 +1,175 @@
+"""The viewer of a folder in correspondence: what it sends, in which order, and what it refuses."""
+
+import csv
+import io
+import json
+import shutil
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from viewer_world import served
+
+from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
+from shapespace.errors import FileFormatError, InputError
+from shapespace.viewer import surfaces as module
+from shapespace.viewer.guard import SECURITY_HEADERS
+from shapespace.viewer.serve import serve
+from shapespace.viewer.surfaces import Surfaces
+from shapespace.viewer.surfaces_server import make_surfaces_app
+
+
+def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """As scene.js reads it."""
+    (length,) = struct.unpack("<I", content[:4])
+    header = json.loads(content[4 : 4 + length])
+    start, arrays = 8 * -(-(4 + length) // 8), {}
+    for name, spec in header["arrays"].items():
+        count = int(np.prod(spec["shape"]))
+        at = start + spec["offset"]
+        if "coded" in spec:
+            columns = spec["shape"][-1]
+            planes = np.frombuffer(content, np.uint8, 2 * count, at).reshape(columns, 2, -1).astype(np.uint16)
+            zigzag = (planes[:, 0] | planes[:, 1] << 8).astype(np.int32)
+            steps = np.where(zigzag & 1, -(zigzag >> 1) - 1, zigzag >> 1)
+            values = np.cumsum(steps, axis=1).astype(np.int16).T
+        else:
+            values = np.frombuffer(content, spec["dtype"], count, at).reshape(spec["shape"])
+        if "scale" in spec:
+            values = np.where(values == -32768, np.nan, values * spec["scale"])
+        arrays[name] = values
+    return header["facts"], arrays
+
+
+@contextmanager
+def opened(surfaces: Surfaces, token: str | None = None) -> Iterator[httpx.Client]:
+    app = make_surfaces_app(surfaces, token=token)
+    with served(app) as address, httpx.Client(base_url=address, timeout=60) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_same(tmp_path_factory.mktemp("blobs"))
+
+
+@pytest.fixture(scope="module")
+def client(template: Path) -> Iterator[httpx.Client]:
+    with opened(Surfaces(template)) as one:
+        yield one
+
+
+def test_the_mean_shape_says_how_many_scans_show_each_vertex(client: httpx.Client) -> None:
+    facts, arrays = unpacked(client.get("/api/mean").content)
+    hidden = np.isnan(surface(HIDDEN, NAMES.index(HIDDEN))[0].vertices).any(axis=1)
+    assert facts["scans"] == 6
+    np.testing.assert_array_equal(arrays["seen"], np.where(hidden, 5, 6))
+    assert arrays["positions"].shape == (VERTICES, 3) and arrays["places"].shape == (VERTICES, 2)
+    np.testing.assert_allclose(arrays["positions"].mean(axis=0), 0, atol=1e-3)
+
+
+def test_a_surface_lies_on_the_mean_shape_and_misses_what_its_scan_does(client: httpx.Client) -> None:
+    _, mean = unpacked(client.get("/api/mean").content)
+    facts, arrays = unpacked(client.get(f"/api/surfaces/{HIDDEN}").content)
+    own = surface(HIDDEN, NAMES.index(HIDDEN))[0].vertices
+    np.testing.assert_array_equal(np.isnan(arrays["positions"]), np.isnan(own))
+    off = np.linalg.norm(arrays["positions"] - mean["positions"], axis=1)
+    assert facts["name"] == HIDDEN and np.nanmean(off) < 6
+    assert len(client.get(f"/api/surfaces/{HIDDEN}").content) < 6 * VERTICES + 500  # two bytes a number
+
+
+def test_scans_are_listed_with_what_speaks_against_them_first(client: httpx.Client) -> None:
+    rows = client.get("/api/surfaces").json()
+    assert rows[0]["name"] == ASIDE and {row["name"] for row in rows[1:4]} == {FAR, FOLDED, HIDDEN}
+    assert [row["status"] for row in rows] == ["set aside", *["look"] * 3, *["corresponding"] * 3]
+    assert "/home/somebody" not in client.get("/api/surfaces").text
+    assert all(row["told"].endswith(".") for row in rows)
+
+
+def test_places_of_vertices_are_those_of_each_scans_own_file(client: httpx.Client) -> None:
+    top = int(np.flatnonzero(np.isnan(surface(HIDDEN, NAMES.index(HIDDEN))[0].vertices[:, 0]))[0])
+    bottom = VERTICES - 1
+    answer = client.get(f"/api/places?vertices={top},{bottom}")
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [(row["scan"], row["vertex"]) for row in rows] == [
+        (name, str(vertex)) for name in sorted(NAMES) for vertex in (top, bottom)
+    ]
+    for row in rows:
+        own = surface(row["scan"], NAMES.index(row["scan"]))[0].vertices[int(row["vertex"])]
+        if np.isnan(own).any():
+            assert (row["x"], row["y"], row["z"]) == ("", "", "")
+        else:
+            np.testing.assert_allclose([float(row[axis]) for axis in "xyz"], own, atol=1e-3)
+    assert sum(row["x"] == "" for row in rows) == 1
+    assert 'filename="places.csv"' in answer.headers["content-disposition"]
+
+
+@pytest.mark.parametrize("asked", ["", "x", "-1", "1,,2", "600", "1.5", "0," * 100 + "0", "²"])
+def test_places_of_what_is_no_vertex_are_refused_in_a_sentence(client: httpx.Client, asked: str) -> None:
+    answer = client.get("/api/places", params={"vertices": asked})
+    assert answer.status_code in (400, 422) and answer.json()["error"].endswith(".")
+
+
+@pytest.mark.parametrize("path", ["/api/surfaces/nobody", f"/api/surfaces/{ASIDE}", "/api/surfaces/..%2Fsame", "/x"])
+def test_what_is_not_there_is_refused_in_a_sentence(client: httpx.Client, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 404 and answer.json()["error"].endswith(".")
+    assert client.get("/assets/../serve.py").status_code == 404
+
+
+def test_only_its_own_page_may_ask_and_only_read(client: httpx.Client) -> None:
+    page = client.get("/")
+    assert page.status_code == 200 and all(page.headers[name] == value for name, value in SECURITY_HEADERS.items())
+    assert client.get("/api/mean", headers={"host": "evil.example"}).status_code == 421
+    assert client.get("/api/mean", headers={"origin": "http://evil.example"}).status_code == 403
+    for method in ("POST", "PUT", "DELETE"):
+        assert client.request(method, "/api/surfaces").status_code == 405
+
+
+def test_with_a_token_nothing_is_answered_without_it(template: Path) -> None:
+    with opened(Surfaces(template), token="secret") as stranger:
+        for path in ("/", "/api/about", "/api/mean", "/api/surfaces", "/api/surfaces/able", "/assets/surfaces.js"):
+            assert stranger.get(path).status_code == 401
+        assert stranger.get("/?token=secret").status_code == 200
+        assert stranger.get("/api/about").status_code == 200  # the cookie
+
+
+def test_few_surfaces_are_held_however_many_there_are(template: Path, tmp_path: Path, monkeypatch) -> None:
+    shutil.copytree(template.parent, tmp_path / "w")
+    folder = tmp_path / "w" / "same"
+    record = json.loads((folder / "able.correspond.json").read_text())
+    for k in range(40):
+        (folder / f"more{k}.correspond.json").write_text(json.dumps(record | {"name": f"more{k}"}))
+        shutil.copy(folder / "able.corresponding.ply", folder / f"more{k}.corresponding.ply")
+    shown = Surfaces(folder)
+    for k in range(40):
+        shown.packed_surface(f"more{k}")
+    assert shown.packed_surface.cache_info().currsize <= 2 * shown.about()["page"] < 40
+    monkeypatch.setattr(module, "_PAGE_BYTES", 3 * 6 * VERTICES)
+    assert shown.about()["page"] == 3
+
+
+def test_a_surface_that_is_damaged_is_one_sentence_and_the_others_stay(template: Path, tmp_path: Path) -> None:
+    shutil.copytree(template.parent, tmp_path / "w")
+    folder = tmp_path / "w" / "same"
+    (folder / "able.corresponding.ply").write_bytes(b"ply\n")
+    with opened(Surfaces(folder)) as one:
+        answer = one.get("/api/surfaces/able")
+        assert answer.status_code == 422 and "able.corresponding.ply" in answer.json()["error"]
+        assert str(tmp_path) not in answer.text and str(tmp_path) not in one.get("/api/surfaces").text
+        assert one.get("/api/surfaces/baker").status_code == 200
+        assert unpacked(one.get("/api/mean").content)[0]["scans"] == 5
+        places = one.get("/api/places?vertices=3").text
+        assert "able,3,,," in places
+
+
+def test_a_folder_that_cannot_be_shown_is_one_sentence(template: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="leave --model out"):
+        serve(template, model=template / "m.h5", open_browser=False)
+    (tmp_path / "correspondence.json").write_text("{")
+    with pytest.raises(FileFormatError, match=r"correspondence\.json"):
+        serve(tmp_path, open_browser=False)
