@@ -126,7 +126,7 @@ class Marks:
         kernel = spread @ functions.T
         ratio = self.uncertainty * size_mm / (_OFF_SHARE * range_mm)
         loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
-        pulled: FloatArray = np.linalg.solve(loaded, self.points - self.places.at(x))  # pyright: ignore
+        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, self.points - self.places.at(x)), dtype=np.float64)
         return harmonics.functions @ (spread.T @ pulled)
 
     def rms(self, vertices: FloatArray) -> float:

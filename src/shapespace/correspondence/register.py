@@ -56,7 +56,7 @@ class ElasticSettings:
     fine: float = 0.15
     normal_cosine: float = 0.3
     inliers: float = 3.0
-    borders: bool = True
+    borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
 

@@ -34,6 +34,9 @@ SIZE = 100.0
 FEWEST = 2
 _ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
 _PARTS = 4
+_MIRRORED = 0.85
+"""A scan whose mirror image lies nearer to the template, by this ratio, is one: of 60 faces, femora and spleens that were
+not mirrored none had less than 0.88."""
 
 
 @dataclass(frozen=True)
@@ -306,7 +309,7 @@ class _State:
         last, self.placed, self.reasons = self.placed, {}, dict(self.broken)
         for placed in sorted(ended, key=lambda one: one.index):
             self.seconds[placed.index].append(placed.seconds)
-            if reason := self._why_not(placed):
+            if reason := self._why_not(placed, first=placed.index not in last):
                 self.reasons[placed.index] = reason
             else:
                 self.placed[placed.index] = placed
@@ -332,10 +335,15 @@ class _State:
         T = self.placed[i].T_scan_template
         return PlaceTask(i, self.scans[i], T, self.expected.get(i), self.settings.next, part, marks)
 
-    def _why_not(self, placed: Placed) -> str:
+    def _why_not(self, placed: Placed, *, first: bool) -> str:
         s = self.settings
         if placed.reason:
             return placed.reason
+        if first and placed.mirrored < _MIRRORED:
+            return (
+                f"mirrored: its mirror image lies {placed.mirrored:.2f} times as far from the template as itself; turn "
+                "it over, or do such scans on their own"
+            )
         if placed.covered < s.fewest_covered:
             return (
                 f"surface not reached: the template covers {100 * placed.covered:.0f} % of it; another object, or "
