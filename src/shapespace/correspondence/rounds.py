@@ -35,8 +35,8 @@ FEWEST = 2
 _ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
 _PARTS = 4
 _MIRRORED = 0.85
-"""A scan whose mirror image lies nearer to the template, by this ratio, is one: of 60 faces, femora and spleens that were
-not mirrored none had less than 0.88."""
+"""A scan whose mirror image lies nearer to the template, by this ratio, is one: of 60 faces, femora and spleens that
+were not mirrored none had less than 0.88."""
 
 
 @dataclass(frozen=True)
