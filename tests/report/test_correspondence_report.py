@@ -266,6 +266,16 @@ def test_a_mean_shape_that_lacks_what_scans_show_is_told(same: Path) -> None:
     assert "its surface is 70 % of the median scan's" in Page(report(same)).words
 
 
+def test_holes_of_the_mean_shape_are_told(same: Path) -> None:
+    assert "beside its border" not in Page(report(same)).words
+    mean = read_mesh(same / "template" / "mean.ply")
+    at = [int(mean.vertices[:, axis].argmax()) for axis in (0, 1, 2)]
+    faces = mean.faces[~np.isin(mean.faces, at).any(axis=1)]
+    for path in (same / "template" / "mean.ply", *same.glob("*.corresponding.ply")):
+        write_mesh(path, Mesh(read_mesh(path).vertices, faces))
+    assert "The mean shape has 2 holes beside its border." in Page(report(same)).words
+
+
 def test_scans_in_mixed_units_are_compared_by_their_size(same: Path) -> None:
     edit(same, lambda record: record.update(scale=0.001), "able.correspond.json")
     assert "The scans are in different units" in Page(report(same)).words
