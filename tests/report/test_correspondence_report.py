@@ -260,6 +260,16 @@ def test_hundreds_of_scans_are_all_in_the_table_and_some_in_pictures(same: Path)
     assert alt and FAR in alt[1] and HIDDEN in alt[1]
 
 
+def test_many_scans_that_were_set_aside_leave_room_for_the_others(same: Path) -> None:
+    record = json.loads((same / f"{ASIDE}.correspond.json").read_text())
+    for k in range(30):
+        (same / f"aside{k}.correspond.json").write_text(json.dumps(record | {"name": f"aside{k}"}))
+    page = report(same)
+    cards = re.findall(r'<li class="card" id="scan-([^"]+)"', page)
+    assert len(cards) == correspondence_page.MOST_CARDS and set(NAMES) <= set(cards)
+    assert "Set aside, and not in a model" in page and "The reasons of 34 scans" in page
+
+
 def test_a_mean_shape_that_lacks_what_scans_show_is_told(same: Path) -> None:
     for name in NAMES:
         edit(same, lambda record: record.update(area_share=0.7), f"{name}.correspond.json")
