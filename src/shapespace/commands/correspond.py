@@ -239,9 +239,7 @@ def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> 
     """Return a record with what the triangles of its surface tell."""
     changed = Distortion.of(surface, mean)
     area = None if scan.faces is None else float(np.nansum(face_areas(surface)) / face_areas(scan).sum())
-    return structs.replace(
-        record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area
-    )  # fmt: skip
+    return structs.replace(record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area)
 
 
 def _record(
