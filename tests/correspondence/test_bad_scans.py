@@ -1,5 +1,6 @@
 """Scans and templates as people have them: points, other windings, pieces, fins, copies, other units, other objects."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -213,6 +214,13 @@ def test_an_object_of_another_kind_among_few_is_named(say: Callable[..., str]) -
     said = say(a=SCANS[0], b=SCANS[1], c=SCANS[2], box=box)
     assert "box: It differs from the others by" in said or "box is set aside" in said
     assert not any(line.startswith(("shapespace: a:", "shapespace: b:")) for line in said.splitlines())
+
+
+def test_a_scan_of_quite_another_size_is_named(say: Callable[..., str]) -> None:
+    large = SCANS[2].with_vertices(2.6 * SCANS[2].vertices)
+    said = say(a=SCANS[0], b=SCANS[1], large=large, d=SCANS[3])
+    assert re.search(r"large: It is 2\.\d times as large as most; look whether it is the same kind of object", said)
+    assert said.count("times as large") == 1 and "another unit" not in said
 
 
 def test_a_template_of_another_kind_is_named(say: Callable[..., str], tmp_path: Path) -> None:

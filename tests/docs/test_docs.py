@@ -8,14 +8,17 @@ import inspect
 import io
 import re
 import shlex
+import shutil
 import tomllib
 import webbrowser
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shapespace import cli
@@ -83,8 +86,14 @@ def arguments(command: str) -> list[str]:
     return out
 
 
-def run(document: Path, *, with_data: bool) -> int:
-    """Run the examples of `document` in order in the current folder, and return how many there were."""
+def run(document: Path, *, with_data: bool, instead: Mapping[str, Callable[[], None]] = MappingProxyType({})) -> int:
+    """Run the examples of `document` in order in the current folder, and return how many there were.
+
+    Args:
+        document: the document.
+        with_data: whether to run those that need open data.
+        instead: what to do for some commands.
+    """
     namespace: dict[str, Any] = {"__name__": "__main__"}
     count = 0
     for block in blocks(document):
@@ -98,6 +107,9 @@ def run(document: Path, *, with_data: bool) -> int:
         for command in commands(block):
             program = shlex.split(command, comments=True)[0]
             if program != "shapespace":
+                continue
+            if command in instead:
+                instead[command]()
                 continue
             argv = arguments(command)
             if argv[0] in PARSED_ONLY:
@@ -128,7 +140,7 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
     return any(b.language == "python" or any(c.startswith("shapespace") for c in commands(b)) for b in chosen)
 
 
-LONG = ("tutorial-recognition.md",)
+LONG = ("tutorial-recognition.md", "tutorial-spleens.md", "tutorial-volumes.md")
 """Documents whose examples take minutes."""
 
 
@@ -151,6 +163,51 @@ def test_examples_with_open_data_run_too(
 ) -> None:
     monkeypatch.setenv("SHAPESPACE_DATA", str(shared_data))
     assert run(document, with_data=True) > 0
+
+
+@pytest.mark.long
+def test_the_tutorial_on_raw_scans_goes_with_real_spleens(workplace: Path, shared_data: Path) -> None:
+    spleens = sorted((shared_data / "spleens").glob("*.ply"))[:7]
+    if not spleens:
+        pytest.skip("no spleens there")
+
+    def copy(some: list[Path], folder: str) -> Callable[[], None]:
+        def put() -> None:
+            Path(folder).mkdir()
+            for path in some:
+                shutil.copy(path, folder)
+
+        return put
+
+    instead = {
+        "shapespace data organs -o spleens --count 8": copy(spleens[:6], "spleens"),
+        "shapespace data organs -o new --count 1 --seed 99": copy(spleens[6:], "new"),
+    }
+    assert run(ROOT / "docs" / "tutorial-spleens.md", with_data=False, instead=instead) > 8
+
+
+@pytest.mark.long
+def test_the_tutorial_on_label_volumes_goes_with_real_hippocampi(workplace: Path, shared_data: Path) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="the extra `volumes` is not installed")
+    masks = sorted((shared_data / "hippocampus").glob("*.nii.gz"))[:7]
+    if not masks:
+        pytest.skip("no hippocampi there")
+
+    def join_labels(some: list[Path], folder: str) -> Callable[[], None]:
+        def put() -> None:
+            Path(folder).mkdir()
+            for number, path in enumerate(some):
+                image = nibabel.load(path)
+                whole = (np.asarray(image.dataobj) > 0).astype(np.uint8)
+                nibabel.save(nibabel.Nifti1Image(whole, image.affine), f"{folder}/organ_{number:03d}.nii.gz")
+
+        return put
+
+    instead = {
+        "shapespace data organs -o masks --count 7 --volumes": join_labels(masks[:6], "masks"),
+        "shapespace data organs -o new-masks --count 1 --seed 99 --volumes": join_labels(masks[6:], "new-masks"),
+    }
+    assert run(ROOT / "docs" / "tutorial-volumes.md", with_data=False, instead=instead) > 8
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)

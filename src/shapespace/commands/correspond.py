@@ -45,6 +45,7 @@ _KEPT = ".rounds"
 _LISTED = 10
 _ENOUGH_TO_JUDGE, _ANOTHER_SHAPE = 6, 0.25
 """With so many scans the rounds find other objects themselves; the mean change of one, as a share of its size."""
+_OTHER_SIZE = 2.0
 _Say: TypeAlias = Callable[[str], None]
 
 
@@ -229,10 +230,15 @@ def _records(
         if one is not None and one.vertices is not None:
             record = _judged(record, Mesh(one.vertices, made.template.faces, name=name), made.template, read[name])
         if name in sizes:
-            scale, ratio = sizes[name]
-            record = structs.replace(record, scale=float(scale), unit_ratio=float(ratio))
+            scale, ratio = map(float, sizes[name])
+            odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
+            record = structs.replace(record, scale=scale, unit_ratio=ratio, notes=[*record.notes, *odd])
         records.append(record)
     return records
+
+
+def _told_size(scale: float) -> str:
+    return f"It is {scale:.2g} times as large as most; look whether it is the same kind of object."
 
 
 def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> CorrespondRecord:
