@@ -9,7 +9,7 @@
 
 Faces (ICT-FaceKit, or the bundled ones) and femora (samples of the open femur model) are known, so dispersion can be
 told: each vertex is carried to the true surface of every scan, from there to the mean; its distance from the median
-over scans is what counts; 0 is perfect. Spleens are real, and only distances to their surfaces can be told, as shares of
+over scans counts; 0 is perfect. Spleens are real, and only distances to their surfaces can be told, as shares of
 the diagonal.
 """
 

@@ -20,7 +20,7 @@ from shapespace.correspondence.landmarks import Marks, Places, agreed
 from shapespace.correspondence.mirror import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.scans import copies
+from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.correspondence.template import Glance, choose, clean, given, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
@@ -34,6 +34,9 @@ SIZE = 100.0
 FEWEST = 2
 _ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
 _PARTS = 4
+_WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
+"""Who shows more than this share of the template tells what size is usual; the least standard deviation of sizes; and
+that of a scan's own size for each share that is missing."""
 _MIRRORED = 0.85
 """A scan whose mirror image lies nearer to the template, by this ratio, is one: of 60 faces, femora and spleens that
 were not mirrored none had less than 0.88."""
@@ -332,8 +335,26 @@ class _State:
         marks = Marks.shared(self.places, self.scans[i], self.settings.landmark_uncertainty)
         if i not in self.placed:
             return PlaceTask(i, self.scans[i], None, None, self.settings.first, part, marks)
-        T = self.placed[i].T_scan_template
-        return PlaceTask(i, self.scans[i], T, self.expected.get(i), self.settings.next, part, marks)
+        return PlaceTask(i, self.scans[i], self._sized(i), self.expected.get(i), self.settings.next, part, marks)
+
+    def _sized(self, i: int) -> Similarity:
+        """Return the pose of a scan, its size as the others have it where it shows too little to tell its own.
+
+        A bone without its end fits a smaller whole one, so what it says of its size counts by what it shows.
+        """
+        T, seen = self.placed[i].T_scan_template, self.placed[i].seen
+        order = sorted(self.placed)
+        whole = np.array([self.placed[j].seen.mean() > _WHOLE for j in order])
+        if seen.mean() > _WHOLE or whole.sum() < _ENOUGH_TO_SETTLE:
+            return T
+        logs = np.log(unit_ratios([self.placed[j].T_scan_template.scale for j in order])[0])
+        usual = float(np.median(logs[whole]))
+        spread = max(float(np.std(logs[whole])), _LEAST_SPREAD)
+        own = logs[order.index(i)]
+        trust = 1.0 / (1.0 + (_SIZE_UNSEEN * (1.0 - seen.mean()) / spread) ** 2)
+        ratio = float(np.exp((1.0 - trust) * (usual - own)))
+        centre = T.apply(self.placed[i].vertices[seen]).mean(axis=0)
+        return Similarity(ratio, np.eye(3), (1.0 - ratio) * centre) @ T
 
     def _why_not(self, placed: Placed, *, first: bool) -> str:
         s = self.settings

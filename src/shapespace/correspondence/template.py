@@ -15,7 +15,7 @@ from shapespace.errors import MeshError, ShapespaceError
 from shapespace.fit.start import Start, start_from_any_pose
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import boundary_edges, faces_of, rms_size, without_vertices
+from shapespace.geometry.surface import boundary_edges, face_areas, faces_of, rms_size, without_vertices
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -24,8 +24,11 @@ _GLANCE_HARMONICS = 40
 _CANDIDATES, _OTHERS = 6, 6
 _FEWEST = 100
 """Vertices: fewer do not tell an object's shape."""
-_SMALL_HOLE = 0.05
-"""Holes with a border shorter than this share of the longest border, or of the surface's size, are closed."""
+_AS_WHOLE = 0.93
+"""Candidates that show less than this share of what the most whole one shows lack a part."""
+_SMALL_HOLE, _LONGEST_HOLE = 0.15, 0.05
+"""Holes with a border shorter than this share of the longest border, or of a circle of that size, are closed;
+the longest border of all may be one that the object has, and must be shorter to be closed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +89,8 @@ class Choice:
 def choose(scans: Sequence[Mesh], seed: int) -> Choice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
-    Candidates are those of middle size among the ones with few pieces and short borders, as those lack least.
+    Candidates are some with few pieces and short borders, as those lack least. One that lacks a part shows less of the
+    surface than the others do where it lies on them, and is chosen only if all lack as much.
 
     Raises:
         MeshError: none of them can be a template.
@@ -97,21 +101,24 @@ def choose(scans: Sequence[Mesh], seed: int) -> Choice:
     candidates = candidates[np.isfinite(whole[candidates])]
     candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))
     others = np.sort(rng.choice(len(scans), min(_OTHERS, len(scans)), replace=False))
-    nearness = np.full(len(scans), np.nan)
+    nearness, shown = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
     for i in map(int, candidates):
         try:
             glance = Glance.of(clean(scans[i]))
         except ShapespaceError:
             continue
         size = rms_size(glance.model.mean_vertices)
-        apart = [glance.start(np.array(scans[j].vertices), seed).score_mm / size for j in map(int, others) if j != i]
-        nearness[i] = float(np.median(apart)) if apart else 0.0
+        starts = {j: glance.start(np.array(scans[j].vertices), seed) for j in map(int, others) if j != i}
+        nearness[i] = float(np.median([start.score_mm / size for start in starts.values()])) if starts else 0.0
+        shares = [_area(scans[i]) * s.T_scan_model.scale**2 / _area(scans[j]) for j, s in starts.items()]
+        shown[i] = np.median([share for share in shares if np.isfinite(share)] or [1.0])
     if not np.isfinite(nearness).any():
         raise MeshError(
             f"None of the scans can be a template, since none is a sheet of triangles with {_FEWEST} vertices or more; "
             "give --template MESH."
         )
-    return Choice(int(np.nanargmin(nearness)), tuple(float(share) for share in nearness))
+    fair = np.where(shown >= _AS_WHOLE * np.nanmax(shown), nearness, np.inf)
+    return Choice(int(np.nanargmin(fair)), tuple(float(share) for share in nearness))
 
 
 def given(template: Mesh) -> Mesh:
@@ -162,6 +169,11 @@ def resampled(mesh: Mesh, vertices: int) -> Mesh:
     return Mesh(remesh.onto(coarse, mesh.vertices, faces_of(mesh)), left.astype(np.int32), name=mesh.name)
 
 
+def _area(scan: Mesh) -> float:
+    """Return the area of the triangles of `scan`; not-a-number for points."""
+    return np.nan if scan.faces is None else float(face_areas(scan).sum())
+
+
 def _wholeness(scan: Mesh) -> float:
     """Return a number that grows with the border of `scan`; infinite for what can be no template."""
     if scan.faces is None or len(scan.vertices) < _FEWEST:
@@ -191,8 +203,10 @@ def _small_holes(vertices: FloatArray, faces: IntArray) -> list[IntArray]:
     length = np.array([np.linalg.norm(vertices[loop] - vertices[np.roll(loop, 1)], axis=1).sum() for loop in loops])
     if not len(length):
         return []
-    most = _SMALL_HOLE * max(float(length.max()), 2 * np.pi * rms_size(vertices))
-    return [loop for loop, around in zip(loops, length, strict=True) if around < most and len(loop) >= 3]
+    around = max(float(length.max()), 2 * np.pi * rms_size(vertices))
+    most = np.full(len(loops), _SMALL_HOLE * around)
+    most[length.argmax()] = _LONGEST_HOLE * around
+    return [loop for loop, own, limit in zip(loops, length, most, strict=True) if own < limit and len(loop) >= 3]
 
 
 def _borders(faces: IntArray) -> list[IntArray]:
