@@ -351,6 +351,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
             change of size divided out.
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
+        landmark_rms: distance of its landmarks from their places on the surface.
     """
 
     CALLED: ClassVar = "a record of correspondence"
@@ -378,6 +379,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     area_factor: float | None = None
     moved_share: list[float] = []
     cpu_s: list[float] = []
+    landmark_rms: float | None = None
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -126,7 +126,7 @@ def test_a_surface_is_laid_onto_the_mean_shape_with_its_holes(template: Path) ->
 def test_the_checkerboard_is_carried_by_the_vertices() -> None:
     mean = mean_blob()
     places = checker_places(mean)
-    assert max(np.ptp(places[0]), np.ptp(places[1])) == pytest.approx(12)
+    assert np.sqrt(np.ptp(places[0]) * np.ptp(places[1])) == pytest.approx(10)
     camera = Camera.framing(mean.vertices)
     before = render(checker_layer(mean, places), camera=camera, size=(90, 90)).astype(int)
     # Turned over in plane, vertices and all: squares go with the vertices and not with the picture.
@@ -136,6 +136,14 @@ def test_the_checkerboard_is_carried_by_the_vertices() -> None:
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 20
     assert np.abs(own - after).max() > 60
     assert np.abs(before.max(axis=2) - before.min(axis=2)).max() > 60
+
+
+def test_a_long_thin_object_has_squares_across_too() -> None:
+    mean = mean_blob()
+    thin = checker_places(mean.with_vertices(mean.vertices * [0.1, 1.0, 0.1]))
+    assert np.ptp(thin[0]) > 2.5 and 20 < np.ptp(thin[1]) < 41
+    with pytest.raises(InputError, match="no extent"):
+        checker_places(mean.with_vertices(np.zeros((VERTICES, 3))))
 
 
 def test_neighbouring_squares_differ() -> None:
@@ -260,10 +268,39 @@ def test_hundreds_of_scans_are_all_in_the_table_and_some_in_pictures(same: Path)
     assert alt and FAR in alt[1] and HIDDEN in alt[1]
 
 
+def test_many_scans_that_were_set_aside_leave_room_for_the_others(same: Path) -> None:
+    record = json.loads((same / f"{ASIDE}.correspond.json").read_text())
+    for k in range(30):
+        (same / f"aside{k}.correspond.json").write_text(json.dumps(record | {"name": f"aside{k}"}))
+    page = report(same)
+    cards = re.findall(r'<li class="card" id="scan-([^"]+)"', page)
+    assert len(cards) == correspondence_page.MOST_CARDS and set(NAMES) <= set(cards)
+    assert "Set aside, and not in a model" in page and "The reasons of 34 scans" in page
+
+
 def test_a_mean_shape_that_lacks_what_scans_show_is_told(same: Path) -> None:
     for name in NAMES:
         edit(same, lambda record: record.update(area_share=0.7), f"{name}.correspond.json")
     assert "its surface is 70 % of the median scan's" in Page(report(same)).words
+
+
+def test_what_quality_measured_has_its_section(same: Path) -> None:
+    assert "Quality of the shape space" not in Page(report(same)).headings
+    (same / "quality.json").write_text(json.dumps({"compactness": [0.6, 0.9], "sentences": ["Two modes are enough."]}))
+    page = Page(report(same))
+    assert "Quality of the shape space" in page.headings and "Two modes are enough." in page.words
+    (same / "quality.json").write_text(json.dumps({"compactness": "all"}))
+    assert "quality.json is damaged" in Page(report(same)).words
+
+
+def test_holes_of_the_mean_shape_are_told(same: Path) -> None:
+    assert "beside its border" not in Page(report(same)).words
+    mean = read_mesh(same / "template" / "mean.ply")
+    at = [int(mean.vertices[:, axis].argmax()) for axis in (0, 1, 2)]
+    faces = mean.faces[~np.isin(mean.faces, at).any(axis=1)]
+    for path in (same / "template" / "mean.ply", *same.glob("*.corresponding.ply")):
+        write_mesh(path, Mesh(read_mesh(path).vertices, faces))
+    assert "The mean shape has 2 holes beside its border." in Page(report(same)).words
 
 
 def test_scans_in_mixed_units_are_compared_by_their_size(same: Path) -> None:

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.landmarks import Marks, Places
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
@@ -81,7 +82,9 @@ class KeptRounds:
     def _elsewhere(self, bench: Workbench, left: Sequence[tuple[PlaceTask, Path]], workers: int) -> Generator[Placed]:
         start_loading(tell=not self.quiet)
         wait_until_loaded()
-        shared = (_bench_arrays(bench), [_glance_arrays(glance) for glance in bench.glances], bench.seed)
+        guide = None if bench.guide is None else _model_arrays(bench.guide)
+        glances = [_model_arrays(glance.model) for glance in bench.glances]
+        shared = (_bench_arrays(bench), glances, guide, bench.seed)
         with ProcessPoolExecutor(
             workers,
             mp_context=context(),
@@ -109,23 +112,26 @@ class KeptRounds:
 _bench: Workbench | None = None
 
 
-def _begin(arrays: Arrays, glances: Sequence[Arrays], seed: int) -> None:
+def _begin(arrays: Arrays, glances: Sequence[Arrays], guide: Arrays | None, seed: int) -> None:
     global _bench
     threadpool_limits(1)
     mesh = Mesh(arrays["vertices"], arrays["faces"])
     harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
-    _bench = Workbench(mesh, harmonics, tuple(_glance_of(glance) for glance in glances), seed)
+    looks = tuple(Glance(_model_of(glance)) for glance in glances)
+    _bench = Workbench(mesh, harmonics, looks, seed, None if guide is None else _model_of(guide))
 
 
-def _glance_arrays(glance: Glance) -> Arrays:
-    m = glance.model
-    return {"mean": m.mean, "basis": m.basis, "stddev": m.stddev, "faces": np.array(m.faces)}
+def _model_arrays(m: ShapeModel) -> Arrays:
+    return {
+        "mean": m.mean, "basis": m.basis, "stddev": m.stddev, "faces": np.array(m.faces),
+        "told": np.array([m.total_variance, m.n_training]),
+    }  # fmt: skip
 
 
-def _glance_of(arrays: Arrays) -> Glance:
-    stddev = arrays["stddev"]
-    return Glance(
-        ShapeModel(arrays["mean"], arrays["basis"], stddev, float((stddev**2).sum()), 1, faces=arrays["faces"])
+def _model_of(arrays: Arrays) -> ShapeModel:
+    variance, samples = arrays["told"]
+    return ShapeModel(
+        arrays["mean"], arrays["basis"], arrays["stddev"], float(variance), int(samples), faces=arrays["faces"]
     )
 
 
@@ -133,7 +139,10 @@ def _do(arrays: Arrays, index: int, glance: int, settings: dict[str, Any], file:
     assert _bench is not None
     T = _pose_of(arrays) if "scale" in arrays else None
     scan = Mesh(arrays["vertices"], arrays.get("faces"), name=str(arrays["name"]))
-    placed = _bench.place(PlaceTask(index, scan, T, arrays.get("expected"), ElasticSettings(**settings), glance))
+    task = PlaceTask(
+        index, scan, T, arrays.get("expected"), ElasticSettings(**settings), glance, _marks_of(arrays)
+    )  # fmt: skip
+    placed = _bench.place(task)
     _write(file, placed)
     return placed
 
@@ -154,7 +163,19 @@ def _task_arrays(task: PlaceTask) -> Arrays:
         arrays |= _pose_arrays(task.T_scan_template)
     if task.expected is not None:
         arrays["expected"] = task.expected
+    if (marks := task.marks) is not None:
+        arrays |= {
+            "marks": marks.points, "mark_names": np.array(marks.places.names), "mark_corners": marks.places.corners,
+            "mark_weights": marks.places.weights, "mark_uncertainty": np.array(marks.uncertainty),
+        }  # fmt: skip
     return arrays
+
+
+def _marks_of(arrays: Arrays) -> Marks | None:
+    if "marks" not in arrays:
+        return None
+    places = Places(tuple(map(str, arrays["mark_names"])), arrays["mark_corners"], arrays["mark_weights"])
+    return Marks(places, arrays["marks"], float(arrays["mark_uncertainty"]))
 
 
 def _pose_arrays(T: Similarity) -> Arrays:
@@ -168,7 +189,8 @@ def _pose_of(arrays: Mapping[str, npt.NDArray[Any]]) -> Similarity:
 def _shared_hash(bench: Workbench, glance: Glance) -> str:
     """Return the hash of what the tasks that look through `glance` share."""
     template = {"template": np.array(bench.mesh.vertices), "triangles": np.array(bench.mesh.faces)}
-    return content_hash(_glance_arrays(glance) | template, {"seed": bench.seed})
+    guide = "" if bench.guide is None else bench.guide.content_hash
+    return content_hash(_model_arrays(glance.model) | template, {"seed": bench.seed, "guide": guide})
 
 
 def _key(task: PlaceTask, shared: str) -> str:
@@ -181,7 +203,7 @@ def _write(file: Path, placed: Placed) -> None:
         told: Arrays = {
             "vertices": one.vertices, "seen": one.seen, "covered": np.array(one.covered),
             "distance": np.array(one.distance), "seconds": np.array(one.seconds), "reason": np.array(one.reason),
-            **_pose_arrays(one.T_scan_template),
+            "mirrored": np.array(one.mirrored), **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in told.items()}
     with atomic_path(file) as path, path.open("wb") as stream:
@@ -208,4 +230,5 @@ def _kept_one(kept: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> 
     return Placed(
         index, np.asarray(of("vertices"), dtype=np.float64), T, np.asarray(of("seen"), dtype=np.bool_),
         float(of("covered")), (mean, p95, p99, largest), float(of("seconds")), str(of("reason")),
+        mirrored=float(of("mirrored")),
     )  # fmt: skip

@@ -131,6 +131,13 @@ def _add_correspond(commands: Any) -> None:
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
                      help="a mesh to begin with, as it is (default: the scan nearest to all others)")  # fmt: skip
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5",
+                     help="a model of such objects to begin with: its mean is the template")  # fmt: skip
+    sub.add_argument("--landmarks", type=Path, metavar="DIR",
+                     help="landmarks of all or some scans: files named as the scans, with other endings")  # fmt: skip
+    sub.add_argument("--landmark-error", type=_share, default=0.02, metavar="SHARE",
+                     help="their standard deviation, as a share of the object's size (default 0.02)")  # fmt: skip
+    sub.add_argument("--symmetric", action="store_true", help="the object is its own mirror image")
     sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
                      help="of the template where a scan is chosen (default 10000)")  # fmt: skip
     sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")

@@ -205,8 +205,21 @@ def correspond(arguments: argparse.Namespace) -> int:
     from shapespace.correspondence.rounds import CorrespondSettings
     from shapespace.schemas import to_json
 
-    settings = CorrespondSettings(vertices=arguments.vertices, rounds=arguments.rounds, seed=arguments.seed)
-    files = CorrespondFiles(arguments.scans, arguments.template, arguments.jobs, arguments.recursive)
+    settings = CorrespondSettings(
+        vertices=arguments.vertices,
+        rounds=arguments.rounds,
+        symmetric=arguments.symmetric,
+        landmark_uncertainty=arguments.landmark_error,
+        seed=arguments.seed,
+    )
+    files = CorrespondFiles(
+        arguments.scans,
+        arguments.template,
+        arguments.model,
+        arguments.landmarks,
+        arguments.jobs,
+        arguments.recursive,
+    )
     summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
     if arguments.json:
         show_json({"folder": str(arguments.output), **to_json(summary), "records": to_json(records)})

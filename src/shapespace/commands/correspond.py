@@ -16,7 +16,8 @@ from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.batch.workers import cores
-from shapespace.commands.corresponding import MEAN, RECORD, SUMMARY, SURFACE
+from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
+from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.rounds import (
     Correspondence,
@@ -27,12 +28,15 @@ from shapespace.correspondence.rounds import (
 )
 from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.errors import MeshError, ShapespaceError
+from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import face_areas
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.folders import mesh_files
+from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
@@ -52,12 +56,16 @@ class CorrespondFiles:
     Args:
         scans: files and folders.
         template: a mesh to begin with, or None.
+        model: to begin with, or None.
+        landmarks: a folder of files that are named as the scans, or None.
         jobs: scans at a time; 0 for one a core.
         recursive: take scans in folders below those given too.
     """
 
     scans: Sequence[Path]
     template: Path | None = None
+    model: Path | None = None
+    landmarks: Path | None = None
     jobs: int = 0
     recursive: bool = False
 
@@ -86,11 +94,14 @@ def correspond_files(
         say(f"{len(set(found.files)) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
     names = names_for(paths, None)
     make_folder(folder)
-    scans, unread, notes = _read_all(paths, names, quiet=quiet)
-    template = None if files.template is None else read_mesh(files.template)
+    marks = LandmarkFiles.of(files.landmarks)
+    scans, unread, notes = _read_all(paths, names, marks, quiet=quiet)
+    template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
+    marks.tell(say)
+    model = None if files.model is None else ShapeModel.load(files.model)
     rounds = _Rounds(folder / _KEPT, files.jobs or cores(), quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
-        first = first_template(list(scans.values()), template, settings)
+        first = first_template(list(scans.values()), template, settings, model)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
     _note_copies(scans, notes)
     if template is None or made.moved[0] < _ANOTHER_SHAPE:
@@ -133,7 +144,7 @@ class _Rounds:
 
 
 def _read_all(
-    paths: Sequence[Path], names: Sequence[str], *, quiet: bool
+    paths: Sequence[Path], names: Sequence[str], marks: LandmarkFiles, *, quiet: bool
 ) -> tuple[dict[str, Mesh], dict[str, str], dict[str, list[str]]]:
     """Return the scans by name, why others cannot be read, and what is to be known of each scan."""
     scans: dict[str, Mesh] = {}
@@ -142,11 +153,11 @@ def _read_all(
     with progress(len(paths), "reading", "scan", quiet=quiet) as bar:
         for path, name in zip(paths, names, strict=True):
             try:
-                mesh = read_mesh(path)
+                mesh = marks.onto(read_mesh(path), path)
             except ShapespaceError as error:
                 unread[name] = f"broken: {error}"
             else:
-                scans[name], notes[name] = _looked_at(Mesh(mesh.vertices, mesh.faces, name=name))
+                scans[name], notes[name] = _looked_at(Mesh(mesh.vertices, mesh.faces, mesh.landmarks, name))
             bar.update()
     return scans, unread, notes
 
@@ -234,9 +245,7 @@ def _judged(record: CorrespondRecord, surface: Mesh, mean: Mesh, scan: Mesh) -> 
     """Return a record with what the triangles of its surface tell."""
     changed = Distortion.of(surface, mean)
     area = None if scan.faces is None else float(np.nansum(face_areas(surface)) / face_areas(scan).sum())
-    return structs.replace(
-        record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area
-    )  # fmt: skip
+    return structs.replace(record, folded_share=changed.folded_share, area_factor=changed.area_factor, area_share=area)
 
 
 def _record(
@@ -253,6 +262,7 @@ def _record(
         name=name, path=path, hash=source.content_hash, status="corresponding", seen_share=one.seen,
         covered_share=one.covered, distance_mean=mean, distance_p95=p95, distance_p99=p99, distance_max=largest,
         notes=list(notes), moved_share=list(one.moved), cpu_s=list(one.seconds),
+        landmark_rms=one.landmarks if np.isfinite(one.landmarks) else None,
     )  # fmt: skip
 
 
@@ -268,6 +278,12 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
+    if made.template.landmarks:
+        points = np.stack(list(made.template.landmarks.values()))
+        nearest = build_engine(made.template).query(points).vertex
+        write_landmark_indices(folder / LANDMARKS, dict(zip(made.template.landmarks, nearest.tolist(), strict=True)))
+    else:
+        remove_file(folder / LANDMARKS)
 
 
 def _forget_others(names: set[str], folder: Path, say: _Say) -> None:

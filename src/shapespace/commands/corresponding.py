@@ -14,6 +14,7 @@ from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, Correspon
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
+LANDMARKS = "landmarks.csv"
 _NAMED = 3
 
 

@@ -77,17 +77,22 @@ class Others:
         return float(np.sqrt(((shape - self.told(shape, seen))[there] ** 2).sum(axis=1).mean()))
 
 
-def told_by_others(shapes: FloatArray, seen: FloatArray, noise_share: float) -> FloatArray:
+def told_by_others(
+    shapes: FloatArray, seen: FloatArray, noise_share: float, images: FloatArray | None = None
+) -> FloatArray:
     """Return each of the aligned `shapes` (N, V, 3) as far as the others tell it, (N, V, 3).
 
     Args:
         shapes: aligned.
         seen: (N, V) how much each vertex counts, 0 to 1.
         noise_share: as in `Others.of`.
+        images: (N, V, 3) the shapes' mirror images, which tell of others too.
     """
     n, out = len(shapes), np.empty_like(shapes)
     for fold in np.array_split(np.arange(n), min(n, _FOLDS)):
-        others = Others.of(shapes[np.setdiff1d(np.arange(n), fold)], noise_share)
+        rest = np.setdiff1d(np.arange(n), fold)
+        known = shapes[rest] if images is None else np.concatenate([shapes[rest], images[rest]])
+        others = Others.of(known, noise_share)
         for i in fold.tolist():
             out[i] = others.told(shapes[i], seen[i])
     return out

@@ -12,10 +12,12 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.landmarks import Marks
 from shapespace.correspondence.register import ElasticSettings, Template, register
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.fit.dense import dense_surface
+from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start
@@ -36,6 +38,8 @@ _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
 _FEW_HARMONICS = 4
+_FLIP = np.array([-1.0, 1.0, 1.0])
+_GUIDING = FitConfig(unit="mm", scale="free")
 _MEASURED = 20_000
 _FAR = (np.inf, np.inf, np.inf, np.inf)
 
@@ -51,6 +55,7 @@ class PlaceTask:
         expected: (V, 3) the shape to begin from, in the template's frame; None is the template.
         settings: of the registration.
         glance: which of the bench's glances knows nothing of this scan.
+        marks: the scan's landmarks, in its own frame; None where it has none.
     """
 
     index: int
@@ -59,6 +64,7 @@ class PlaceTask:
     expected: FloatArray | None
     settings: ElasticSettings
     glance: int = 0
+    marks: Marks | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +81,8 @@ class Placed:
         seconds: CPU time.
         reason: why there is nothing, where there is nothing; the arrays are then those of the template.
         rivals: what came of other poses that are about as likely.
+        mirrored: how far from the template the scan's mirror image lies, as a share of how far the scan does, by what
+            is known for a pose; not-a-number where the pose is told by landmarks.
     """
 
     index: int
@@ -86,6 +94,7 @@ class Placed:
     seconds: float
     reason: str = ""
     rivals: tuple[Placed, ...] = ()
+    mirrored: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +106,14 @@ class Workbench:
         harmonics: its smooth functions.
         glances: the template with few vertices, for poses: one, or one for each part of the scans that it leaves out.
         seed: of all that is drawn.
+        guide: a model whose mean is the template; where nothing else is known of a scan, its fit tells.
     """
 
     mesh: Mesh
     harmonics: Harmonics
     glances: tuple[Glance, ...]
     seed: int
+    guide: ShapeModel | None = None
 
     @cached_property
     def template(self) -> Template:
@@ -125,7 +136,16 @@ class Workbench:
         return replace(placed, seconds=time.process_time() - begun)
 
     def _best(self, task: PlaceTask) -> Placed:
-        start = self.glances[task.glance].start(np.array(task.scan.vertices), self.seed)
+        T = task.T_scan_template
+        marked = None if task.marks is None else task.marks.pose(self.mesh.vertices)
+        if marked is not None:
+            return self._from(task, T) if T is not None else self._from(*self._guided(task, marked))
+        glance, vertices = self.glances[task.glance], np.array(task.scan.vertices)
+        start = glance.start(vertices, self.seed)
+        mirrored = glance.start(vertices * _FLIP, self.seed).score_mm / max(start.score_mm, 1e-12)
+        return replace(self._unmarked(task, start), mirrored=mirrored)
+
+    def _unmarked(self, task: PlaceTask, start: Start) -> Placed:
         T = task.T_scan_template
         if T is not None:
             placed = self._from(task, T)
@@ -144,16 +164,28 @@ class Workbench:
 
     def _tried(self, task: PlaceTask, start: Start) -> Placed | None:
         try:
-            return self._from(task, start.T_scan_model)
+            return self._from(*self._guided(task, start.T_scan_model))
         except (FitError, InputError):
             return None
+
+    def _guided(self, task: PlaceTask, T: Similarity) -> tuple[PlaceTask, Similarity]:
+        """Return what the guide's fit from `T` says of the scan, where nothing else is known and it says something."""
+        if self.guide is None or task.expected is not None:
+            return task, T
+        scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
+        fit = fit_scan(self.guide, scan, _GUIDING, T_scan_model=Similarity.identity())
+        if fit.status != "converged":
+            return task, T
+        shape = np.asarray(self.guide.reconstruct(fit.b), dtype=np.float64)
+        return replace(task, expected=shape), T @ fit.T_scan_model
 
     def _from(self, task: PlaceTask, T: Similarity) -> Placed:
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
         target = ScanTarget(_facing(scan, self.mesh))
         found = register(
-            self.template, target, Similarity.identity(), task.settings, expected=task.expected, seed=self.seed
-        )
+            self.template, target, Similarity.identity(), task.settings, expected=task.expected,
+            marks=None if task.marks is None else task.marks.moved(T.inverse()), seed=self.seed,
+        )  # fmt: skip
         start = found.T_scan_template.apply(found.vertices)
         dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
         seen = dense.seen & self._reached(dense.vertices_scan_mm, target)

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.landmarks import Marks
 from shapespace.fit.kernels import normals_into
 from shapespace.fit.moving_model import Topology
 from shapespace.fit.scan_target import ScanTarget
@@ -55,7 +56,7 @@ class ElasticSettings:
     fine: float = 0.15
     normal_cosine: float = 0.3
     inliers: float = 3.0
-    borders: bool = True
+    borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
 
@@ -103,6 +104,7 @@ def register(
     settings: ElasticSettings,
     *,
     expected: FloatArray | None = None,
+    marks: Marks | None = None,
     seed: int = 0,
 ) -> Registered:
     """Return the template moved onto the scan, all of it: where the scan shows nothing, as its neighbours move.
@@ -113,6 +115,7 @@ def register(
         T_scan_template: where to begin.
         settings: how.
         expected: (V, 3) the shape that the scan is thought to have, in the template's frame; None is the template.
+        marks: the scan's landmarks, in its mm frame.
         seed: of the points that are matched.
     """
     rng, t = np.random.default_rng(seed), settings
@@ -134,6 +137,9 @@ def register(
         pose = fit_similarity(base, x)
         T, x = T @ pose, pose.inverse().apply(x)
         x = base + template.harmonics.diffused(x - base, range_share * template.size_mm)
+        if marks is not None:
+            here = marks.moved(T.inverse())
+            x = x + here.pull(x, template.harmonics, range_share * template.size_mm, template.size_mm)
     return Registered(x, T)
 
 

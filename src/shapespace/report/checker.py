@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from shapespace.errors import InputError
@@ -10,13 +12,14 @@ from shapespace.report.corresponded import drawable
 from shapespace.report.render import SQUARE_COLOURS, Layer
 from shapespace.types import FloatArray, Mesh
 
+_SQUARES, _MOST_SQUARES = 10, 40
 _PAPER = np.array([0.93, 0.90, 0.86])
 # Pale enough that eyes and edges are seen through the squares.
 SQUARES = np.stack([_PAPER, *(0.62 * np.array(colour) + 0.38 * _PAPER for colour in CATEGORIES[:SQUARE_COLOURS])])
 """(N, 3) colours of the checkerboard: that of every other square, then those which the others take in turn."""
 
 
-def checker_places(mean: Mesh, yaw_deg: float = 0.0, squares: int = 12) -> tuple[FloatArray, FloatArray]:
+def checker_places(mean: Mesh, yaw_deg: float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Return where on a checkerboard each vertex of `mean` lies, two of (V,), so that a square is 1 by 1.
 
     The board stands before the mean shape and is thrown onto it; its middle is that of the shape.
@@ -24,7 +27,6 @@ def checker_places(mean: Mesh, yaw_deg: float = 0.0, squares: int = 12) -> tuple
     Args:
         mean: the surface, upright.
         yaw_deg: from where it is thrown: 0 from the front, 90 from the side that a camera of that angle sees.
-        squares: along its longer side.
 
     Raises:
         InputError: the shape has no extent.
@@ -33,7 +35,9 @@ def checker_places(mean: Mesh, yaw_deg: float = 0.0, squares: int = 12) -> tuple
     across = mean.vertices @ np.array([np.cos(yaw), 0.0, np.sin(yaw)])
     at = np.stack([across, mean.vertices[:, 1]])
     low, high = at.min(axis=1), at.max(axis=1)
-    side = float((high - low).max()) / squares
+    wide, high_up = (float(extent) for extent in high - low)
+    # Of a long thin object, the squares must be small enough that there are some across.
+    side = max(math.sqrt(wide * high_up) / _SQUARES, max(wide, high_up) / _MOST_SQUARES)
     if not side > 0:
         raise InputError("The mean shape has no extent; bring the scans into correspondence again.")
     at = (at - ((low + high) / 2)[:, None]) / side

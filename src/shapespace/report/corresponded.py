@@ -13,7 +13,7 @@ from msgspec import structs
 
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import face_vectors, faces_of, rms_size, without_vertices
+from shapespace.geometry.surface import boundary_edges, face_vectors, faces_of, rms_size, without_vertices
 from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.report.saved import Folder
@@ -97,6 +97,16 @@ class Corresponded:
         """The mean shape as pictures show it: upright, about the origin, of the size that it has in its file."""
         at = self._mean.vertices
         return self._mean.with_vertices((at - at.mean(axis=0)) @ self.turn.T)
+
+    @property
+    def holes(self) -> int:
+        """How many borders the mean shape has beside one, which an open surface may have."""
+        from shapespace.geometry.topology import join, labels  # compiled
+
+        edges = boundary_edges(faces_of(self._mean))
+        sets = np.arange(len(self._mean.vertices), dtype=np.int32)
+        join(sets, edges)
+        return max(len(np.unique(labels(sets)[1][edges])) - 1, 0)
 
     @property
     def corresponding(self) -> list[CorrespondRecord]:

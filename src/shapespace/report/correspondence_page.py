@@ -265,6 +265,13 @@ class CorrespondencePage:
                 "scan's, mostly because the first template lacked them. Give a whole one with --template."
             )
             lacking.append(Text(what, "notice"))
+        if self.at.holes:
+            what = (
+                f"The mean shape has {counted(self.at.holes, 'hole')} beside its border. Where the object has no "
+                "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
+                "--template."
+            )
+            lacking.append(Text(what, "notice"))
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "

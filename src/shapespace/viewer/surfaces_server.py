@@ -21,9 +21,7 @@ from shapespace.viewer.surfaces import Surfaces
 _LONGEST = 2000
 
 
-def make_surfaces_app(
-    surfaces: Surfaces, *, token: str | None = None, cookie_name: str = "shapespace"
-) -> ASGIApp:  # fmt: skip
+def make_surfaces_app(surfaces: Surfaces, *, token: str | None = None, cookie_name: str = "shapespace") -> ASGIApp:
     """Return the application.
 
     Args:

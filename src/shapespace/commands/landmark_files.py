@@ -1,0 +1,83 @@
+"""Landmarks in a folder, each file named as the scan it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.types import Mesh
+
+_LISTED = 5
+
+
+@dataclass(frozen=True)
+class LandmarkFiles:
+    """The landmark files of a folder.
+
+    Args:
+        folder: where they are; None where there are none.
+        files: name of a scan without its ending -> file.
+        used: names that a scan had.
+        unread: what is to be said of files that cannot be used.
+    """
+
+    folder: Path | None
+    files: dict[str, Path] = field(default_factory=dict[str, Path])
+    used: set[str] = field(default_factory=set[str])
+    unread: list[str] = field(default_factory=list[str])
+
+    @staticmethod
+    def of(folder: Path | None) -> LandmarkFiles:
+        """Return the landmark files in `folder`.
+
+        Raises:
+            FileError: it is no folder, or holds no such file.
+        """
+        if folder is None:
+            return LandmarkFiles(None)
+        if not folder.is_dir():
+            raise FileError(f"{folder} is no folder; give one with landmarks in files named as the scans.")
+        endings = sorted([*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS], key=len, reverse=True)
+        found: dict[str, Path] = {}
+        for file in sorted(folder.iterdir()):
+            ending = next((one for one in endings if file.name.lower().endswith(one)), None)
+            if ending is not None and file.is_file():
+                found.setdefault(file.name[: -len(ending)], file)
+        if not found:
+            raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
+        return LandmarkFiles(folder, found)
+
+    def onto(self, mesh: Mesh, path: Path) -> Mesh:
+        """Return `mesh`, read from `path`, with the landmarks that the folder has for it."""
+        file = self.files.get(path.stem)
+        if file is None:
+            return mesh
+        self.used.add(path.stem)
+        try:
+            return replace(mesh, landmarks=read_landmarks(file))
+        except ShapespaceError as error:
+            self.unread.append(f"{path.name} goes without landmarks: {error}")
+            return mesh
+
+    def tell(self, say: Callable[[str], None]) -> None:
+        """Say which files are of no use.
+
+        Raises:
+            InputError: none is of any.
+        """
+        if self.folder is None:
+            return
+        if not self.used:
+            names = ", ".join(file.name for file in list(self.files.values())[:_LISTED])
+            raise InputError(
+                f"No file of landmarks in {self.folder} ({names}) is named as one of the scans; name them alike, "
+                "such as anna.ply and anna.csv."
+            )
+        for sentence in self.unread:
+            say(sentence)
+        if left := sorted(set(self.files) - self.used):
+            more = ", ..." if len(left) > _LISTED else ""
+            say(f"{len(left)} files of landmarks belong to no scan that is given: {', '.join(left[:_LISTED])}{more}.")

@@ -1,0 +1,162 @@
+"""Landmarks in a correspondence: where on the template each named point lies, and how it pulls a registration.
+
+A landmark is a soft constraint. After each step of (1) in `register`, what is left between the landmarks y of a scan
+and their places x on the surface is spread over the surface as a Gaussian process would, whose covariance is the heat
+kernel H_r of the range r, and whose observations have the landmarks' own uncertainty:
+
+    d <- d + H_r(., x) (H_r(x, x) + (s / a)^2 h I)^-1 (y - x)                         (2)
+
+h is the mean of the kernel's diagonal, s the uncertainty, a = r / 2 how far a surface is thought off at that range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.closest import build_engine
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import faces_of
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+
+FEWEST = 3
+"""So many give a pose."""
+_OFF_SHARE = 0.5
+_AGREE = 0.2
+"""Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
+_MIRROR_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where named points lie on a template.
+
+    Args:
+        names: of L points.
+        corners: (L, 3) vertices of the triangle that each lies on.
+        weights: (L, 3) barycentric.
+    """
+
+    names: tuple[str, ...]
+    corners: IntArray
+    weights: FloatArray
+
+    @staticmethod
+    def nowhere() -> Places:
+        """Return no points."""
+        return Places((), np.empty((0, 3), dtype=np.int32), np.empty((0, 3)))
+
+    @staticmethod
+    def on(mesh: Mesh, points: Mapping[str, FloatArray]) -> Places:
+        """Return where on `mesh`, which has triangles, the nearest points to `points` lie."""
+        if not points:
+            return Places.nowhere()
+        corners, weights = on_triangles(mesh, np.stack(list(points.values())))
+        return Places(tuple(points), corners, weights)
+
+    def at(self, vertices: FloatArray) -> FloatArray:
+        """Return (L, 3) where they are on `vertices` (V, 3); of any functions (V, C) the values (L, C)."""
+        return np.einsum("lc,lcd->ld", self.weights, vertices[self.corners])
+
+    def of(self, names: Sequence[str]) -> Places:
+        """Return those of `names`, in that order."""
+        which = [self.names.index(name) for name in names]
+        return Places(tuple(names), self.corners[which], self.weights[which])
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """The landmarks of one scan that the template has too.
+
+    Args:
+        places: on the template, L of them.
+        points: (L, 3) in the scan's frame.
+        uncertainty: standard deviation, as a share of the template's size.
+    """
+
+    places: Places
+    points: FloatArray
+    uncertainty: float
+
+    @staticmethod
+    def shared(places: Places, scan: Mesh, uncertainty: float) -> Marks | None:
+        """Return those that `scan` has of `places`; None where it has none."""
+        names = [name for name in places.names if name in scan.landmarks]
+        if not names:
+            return None
+        return Marks(places.of(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
+
+    def moved(self, T: Similarity) -> Marks:
+        """Return the same landmarks with their points moved by `T`."""
+        return Marks(self.places, T.apply(self.points), self.uncertainty)
+
+    def pose(self, vertices: FloatArray) -> Similarity | None:
+        """Return T_scan_template by the landmarks, or None where they are too few or on a line.
+
+        Raises:
+            InputError: they are those of a mirror image, or of something else.
+        """
+        if len(self.points) < FEWEST:
+            return None
+        own = self.places.at(vertices)
+        try:
+            T = fit_similarity(own, self.points)
+            mirrored = fit_similarity(own * [-1.0, 1.0, 1.0], self.points)
+        except InputError:
+            return None
+        spread = float(np.sqrt(((self.points - self.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        off = _rms(T.apply(own) - self.points) / spread
+        other = _rms(mirrored.apply(own * [-1.0, 1.0, 1.0]) - self.points) / spread
+        if len(self.points) > FEWEST and off > _AGREE:
+            if other < _MIRROR_SHARE * off:
+                raise InputError("mirrored: its landmarks are those of a mirror image of the other scans")
+            raise InputError(
+                f"its landmarks lie {100 * off:.0f} % of their spread from those of the others; check their names"
+            )
+        return T
+
+    def pull(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
+        """Return (V, 3) the movement (2) of the surface `x` (V, 3), in whose frame the points must be."""
+        functions = self.places.at(harmonics.functions)
+        spread = functions * harmonics.kept(range_mm)
+        kernel = spread @ functions.T
+        ratio = self.uncertainty * size_mm / (_OFF_SHARE * range_mm)
+        loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
+        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, self.points - self.places.at(x)), dtype=np.float64)
+        return harmonics.functions @ (spread.T @ pulled)
+
+    def rms(self, vertices: FloatArray) -> float:
+        """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
+        return _rms(self.places.at(vertices) - self.points)
+
+
+def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return (M, 3) corners of the triangles of `mesh` that lie nearest to `points` (M, 3), and weights (M, 3)."""
+    near = build_engine(mesh).query(points)
+    if near.triangle is None or near.barycentric is None:
+        raise MeshError(f"{mesh.name} has no triangles, so no points can be placed on it; give a surface.")
+    return np.asarray(faces_of(mesh)[near.triangle], dtype=np.int32), near.barycentric
+
+
+def _rms(difference: FloatArray) -> float:
+    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+
+
+def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> Places:
+    """Return where on `mean` the landmarks of shapes lie: the middle of where each has them.
+
+    Args:
+        mean: with triangles.
+        shapes: (V, 3) vertices of each, and its landmarks in the same frame.
+    """
+    found: dict[str, list[FloatArray]] = {}
+    for vertices, points in shapes:
+        if points:
+            places = Places.on(mean.with_vertices(vertices), points)
+            for name, point in zip(places.names, places.at(mean.vertices), strict=True):
+                found.setdefault(name, []).append(point)
+    return Places.on(mean, {name: np.median(points, axis=0) for name, points in found.items()})
