@@ -213,7 +213,7 @@ def test_long_voxels_are_said() -> None:
 
 @pytest.mark.parametrize(
     ("labels", "what"),
-    [(np.zeros((5, 5, 5)), "all its voxels are 0"), (np.pad([[[1]]], 2), "only 1 voxel that"),
+    [(np.zeros((5, 5, 5)), "all its voxels are 0"), (np.pad([[[1]]], 2), "only 1 voxel;"),
      (np.pad(np.ones((7, 1, 1)), 2), "only 7 voxels that")],
 )  # fmt: skip
 def test_too_few_voxels_are_refused(labels: Any, what: str) -> None:

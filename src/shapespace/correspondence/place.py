@@ -181,9 +181,7 @@ class Workbench:
 
     def _from(self, task: PlaceTask, T: Similarity) -> Placed:
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
-        target = ScanTarget(
-            _facing(scan, self.mesh if task.expected is None else self.mesh.with_vertices(task.expected))
-        )
+        target = ScanTarget(_facing(scan, self.mesh))
         found = register(
             self.template, target, Similarity.identity(), task.settings, expected=task.expected,
             marks=None if task.marks is None else task.marks.moved(T.inverse()), seed=self.seed,
