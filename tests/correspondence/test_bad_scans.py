@@ -223,6 +223,14 @@ def test_a_scan_of_quite_another_size_is_named(say: Callable[..., str]) -> None:
     assert said.count("times as large") == 1 and "another unit" not in said
 
 
+def test_a_scan_that_its_surface_hardly_follows_is_named_whatever_its_unit(say: Callable[..., str]) -> None:
+    rough = raw_blob(2, points=1200, noise_mm=4.0).scan
+    metres = SCANS[1].with_vertices(1e-3 * SCANS[1].vertices)
+    said = say(a=SCANS[0], b=metres, rough=rough, d=SCANS[3])
+    assert re.search(r"rough: Its surface lies \d\S* times as far from it as is usual; look at it", said)
+    assert said.count("as is usual") == 1
+
+
 def test_a_template_of_another_kind_is_named(say: Callable[..., str], tmp_path: Path) -> None:
     directions, faces = sphere(400)
     ss.write_mesh(tmp_path / "rod.ply", Mesh(directions * np.array([10.0, 10.0, 200.0]), faces))

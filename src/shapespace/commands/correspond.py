@@ -46,6 +46,8 @@ _LISTED = 10
 _ENOUGH_TO_JUDGE, _ANOTHER_SHAPE = 6, 0.25
 """With so many scans the rounds find other objects themselves; the mean change of one, as a share of its size."""
 _OTHER_SIZE = 2.0
+_ENOUGH_TO_COMPARE, _FAR = 4, 3.0
+"""Times the usual distance (95 % of both directions), sizes divided out."""
 _Say: TypeAlias = Callable[[str], None]
 
 
@@ -234,7 +236,24 @@ def _records(
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
             record = structs.replace(record, scale=scale, unit_ratio=ratio, notes=[*record.notes, *odd])
         records.append(record)
-    return records
+    return _with_far_ones(records)
+
+
+def _with_far_ones(records: Sequence[CorrespondRecord]) -> list[CorrespondRecord]:
+    """Return `records` with a note on those whose surface lies much farther from its scan than is usual."""
+    far = np.array([(r.distance_p95 or np.nan) / ((r.scale or np.nan) * r.unit_ratio) for r in records])
+    if np.isfinite(far).sum() < _ENOUGH_TO_COMPARE:
+        return list(records)
+    beside = far / np.nanmedian(far)
+    return [
+        record
+        if not times > _FAR
+        else structs.replace(
+            record,
+            notes=[*record.notes, f"Its surface lies {times:.2g} times as far from it as is usual; look at it."],
+        )
+        for record, times in zip(records, beside, strict=True)
+    ]
 
 
 def _told_size(scale: float) -> str:
