@@ -1,6 +1,6 @@
 """Raw scans of blobs with known correspondence: each has triangles, pose, size and noise of its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,6 +8,9 @@ from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob, sphere
+
+LANDMARKS = {"nose": (0, -0.1, 1), "left": (1, 1, 0.3), "top": (0, 1, 0), "back": (0.2, 0, -1), "low": (-0.3, -1, 0.4)}
+"""Name -> direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,15 @@ def raw_blob(k: int, *, T: Similarity | None = None, points: int = 2500, noise_m
     truth = Mesh(T.apply(vertices), faces)
     noisy = T.apply(vertices + noise_mm * rng.standard_normal(vertices.shape))
     return RawBlob(Mesh(noisy, faces, name=f"blob{k}"), truth, directions)
+
+
+def marked(one: RawBlob) -> Mesh:
+    """Return the scan of a blob with the landmarks `LANDMARKS`."""
+    points = {
+        name: one.truth.vertices[(one.directions @ (np.array(at) / np.linalg.norm(at))).argmax()]
+        for name, at in LANDMARKS.items()
+    }
+    return replace(one.scan, landmarks=points)
 
 
 def without_ball(mesh: Mesh, centre: FloatArray, radius: float) -> Mesh:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from conftest import Run
-from raw_blobs import raw_blob
+from raw_blobs import LANDMARKS, marked, raw_blob
 from shapespace.cli import main
+from shapespace.io.landmarks import write_landmarks
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 
@@ -79,3 +80,38 @@ def test_a_later_run_leaves_no_surface_of_another_template(run: Run, raw: Path, 
     assert not list(tmp_path.glob("blob0*"))
     mixed = run("correspond", tmp_path, *scans[:2], "-o", tmp_path, *QUICK)
     assert mixed.code == 0 and "2 surfaces of an earlier correspondence are not taken for scans" in mixed.err
+
+
+def test_landmarks_in_files_named_as_the_scans_go_on_into_the_model(run: Run, raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "marks").mkdir()
+    for k in range(2):
+        write_landmarks(tmp_path / "marks" / f"blob{k}.csv", marked(raw_blob(k, points=1500)).landmarks)
+    write_landmarks(tmp_path / "marks" / "nobody.csv", {"a": np.zeros(3)})
+    (tmp_path / "marks" / "blob2.csv").write_text("no landmarks at all\n", "utf-8")
+    scans = [raw / f"blob{k}.ply" for k in range(3)]
+    outcome = run("correspond", *scans, "-o", tmp_path / "same", "--landmarks", tmp_path / "marks", *QUICK)
+    assert outcome.code == 0
+    assert (
+        "blob2.ply goes without landmarks" in outcome.err and "belong to no scan that is given: nobody" in outcome.err
+    )
+    record = json.loads((tmp_path / "same" / "blob0.correspond.json").read_text("utf-8"))
+    assert 0 <= record["landmark_rms"] < 15
+    assert run("build", tmp_path / "same", "-o", tmp_path / "model.h5").code == 0
+    assert set(ShapeModel.load(tmp_path / "model.h5").landmarks) == set(LANDMARKS)
+
+
+def test_a_model_to_begin_with_and_landmarks_of_nobody(run: Run, raw: Path, same: Path, tmp_path: Path) -> None:
+    assert run("build", same, "-o", tmp_path / "model.h5").code == 0
+    scans = [raw / "blob1.ply", raw / "blob3.ply"]
+    asked = ("correspond", *scans, "-o", tmp_path / "again", *QUICK)
+    outcome = run(*asked, "--model", tmp_path / "model.h5")
+    assert outcome.code == 0 and "The template is the mean of the model given." in outcome.out
+    np.testing.assert_array_equal(
+        read_mesh(tmp_path / "again" / "blob1.corresponding.ply").faces, ShapeModel.load(tmp_path / "model.h5").faces
+    )
+    both = run(*asked, "--model", tmp_path / "model.h5", "--template", scans[0])
+    assert both.code == 2 and "leave one out" in both.sentence()
+    assert "is no folder" in run(*asked, "--landmarks", scans[0]).sentence()
+    (tmp_path / "marks").mkdir()
+    write_landmarks(tmp_path / "marks" / "nobody.csv", {"a": np.zeros(3)})
+    assert "is named as one of the scans" in run(*asked, "--landmarks", tmp_path / "marks").sentence()

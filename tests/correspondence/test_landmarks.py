@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import shapespace as ss
-from raw_blobs import RawBlob, dispersion_mm, raw_blob
+from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks, Places, agreed
 from shapespace.correspondence.mirror import Mirror
@@ -21,22 +21,12 @@ from synthetic_shapes import blob, sphere, training_meshes
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
 SETTINGS = CorrespondSettings(vertices=900, rounds=1, first=QUICK, next=QUICK)
-WHERE = {"nose": (0, -0.1, 1), "left": (1, 1, 0.3), "top": (0, 1, 0), "back": (0.2, 0, -1), "low": (-0.3, -1, 0.4)}
 FLIP = np.array([-1.0, 1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
 def blobs() -> list[RawBlob]:
     return [raw_blob(k) for k in range(6)]
-
-
-def marked(one: RawBlob) -> Mesh:
-    """Return the scan of a blob with the landmarks `WHERE`."""
-    points = {
-        name: one.truth.vertices[(one.directions @ (np.array(at) / np.linalg.norm(at))).argmax()]
-        for name, at in WHERE.items()
-    }
-    return replace(one.scan, landmarks=points)
 
 
 def cut(one: RawBlob, share: float) -> Mesh:
@@ -72,7 +62,7 @@ def test_landmarks_bring_their_places_together_as_far_as_they_are_believed(blobs
 
 def test_the_template_has_the_landmarks_and_scans_without_them_come_along(blobs: list[RawBlob]) -> None:
     made = correspond([marked(blobs[0]), marked(blobs[1]), blobs[2].scan], SETTINGS)
-    assert set(made.template.landmarks) == set(WHERE)
+    assert set(made.template.landmarks) == set(LANDMARKS)
     assert [bool(np.isfinite(scan.landmarks)) for scan in made.scans] == [True, True, False]
     assert not any(scan.reason for scan in made.scans)
 
