@@ -77,9 +77,11 @@ class Set:
     length_mm: float
 
 
-def raw(mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, cut: Sequence[Cut] = ()) -> Known:
-    """Return `mesh` as a scanner would give it, in any pose."""
-    T = random_similarity(rng, 180.0)
+def raw(
+    mesh: Mesh, rng: np.random.Generator, triangles: int, name: str, cut: Sequence[Cut] = (), *, own_size: bool = False
+) -> Known:
+    """Return `mesh` as a scanner would give it, in any pose, its size drawn too unless it keeps its own."""
+    T = random_similarity(rng, 180.0, (1.0, 1.0) if own_size else (0.9, 1.1))
     made = simulate_scan(mesh, rng, triangles=triangles, noise_mm=0.2, T_scan_model=T, name=name, crop=cut)
     return Known(made.scan, made.truth_vertices, T)
 
@@ -164,7 +166,7 @@ def faces(scans: int, seed: int, source: str = "ict", *, harm: bool = False, exp
     return Set(known, mean, counted, float(np.ptp(mean.vertices, axis=0).max()))
 
 
-def femora(scans: int, seed: int, _source: str = "", *, cut_every: int = 0) -> Set:
+def femora(scans: int, seed: int, _source: str = "", *, cut_every: int = 0, own_size: bool = False) -> Set:
     """Samples of the femur model, 12,000 triangles; of every so many, 30 % of the length is cut off at one end."""
     femur, rng = Femora(), np.random.default_rng(seed)
     drawn = [femur.draw(rng) for _ in range(scans)]
@@ -177,7 +179,7 @@ def femora(scans: int, seed: int, _source: str = "", *, cut_every: int = 0) -> S
         point, normal = mesh.vertices.mean(axis=0).copy(), np.zeros(3)
         point[along], normal[along] = (high - 0.3 * (high - low) if end > 0 else low + 0.3 * (high - low)), end
         cut = [Cut(point, normal)] if cut_every and k % cut_every == 0 else []
-        known.append(raw(mesh, rng, 12_000, f"femur{k}", cut))
+        known.append(raw(mesh, rng, 12_000, f"femur{k}", cut, own_size=own_size))
     whole = np.ones(len(mean.vertices), dtype=np.bool_)
     return Set(known, mean, whole, float(np.ptp(mean.vertices, axis=0).max()))
 
@@ -188,6 +190,7 @@ SETS: dict[str, tuple[Callable[..., Set], dict[str, object], int]] = {
     "expressions": (faces, {"expressive": True}, 60),
     "femora": (femora, {}, 40),
     "cut-femora": (femora, {"cut_every": 4}, 40),
+    "cut-femora-of-own-size": (femora, {"cut_every": 4, "own_size": True}, 40),
 }
 OTHERS = ("templates", "spleens")
 
