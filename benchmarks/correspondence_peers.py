@@ -48,7 +48,7 @@ PEERS = {
 }
 """Name in the table -> module of peers and its function."""
 FOLDERS = {"spleens": "spleens", "hippocampi": "hippocampus"}
-FOLDS, MODES, SAMPLES, NEAREST, POINTS = 10, 10, 200, 3, 1000
+MODES, SAMPLES, NEAREST, POINTS = 10, 200, 3, 1000
 FAILED = 0.01
 """Of a scan's diagonal: a surface whose mean distance is more has failed."""
 
@@ -232,6 +232,7 @@ def main() -> None:
     parser.add_argument("--vertices", type=int, default=CorrespondSettings.vertices)
     parser.add_argument("--rounds", type=int, default=CorrespondSettings.rounds)
     parser.add_argument("--jobs", type=int, default=1, help="of shapespace")
+    parser.add_argument("--folds", type=int, default=10, help="of the generalisation")
     parser.add_argument("--methods", default=",".join([OURS, *PEERS]))
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="what is done there is not done again")
     arguments = parser.parse_args()
@@ -270,7 +271,7 @@ def main() -> None:
     common = [scans[name] for name in names]
     for name, way in ways.items():
         meshes = [way.surfaces[one] for one in names]
-        measure = QualitySettings(folds=FOLDS, modes=MODES, samples=SAMPLES, seed=arguments.seed)
+        measure = QualitySettings(folds=arguments.folds, modes=MODES, samples=SAMPLES, seed=arguments.seed)
         quality = measure_quality(meshes, measure, scans=common)
         specific = specificity(meshes, common, [1, 3, MODES], arguments.seed)
         found[name] = (nearness(way, scans, names), quality, specific)
