@@ -1,6 +1,6 @@
 """rustcpd: coherent point drift of the template's vertices to those of the scan, from where the template lies.
 
-`fit` has the settings that came nearest to four spleens (benchmarks/correspondence_peers.py): the 30 nearest matches of
+`fit` has settings that came near to two spleens (benchmarks/correspondence_peers.py): the 30 nearest matches of
 each point alone, and a narrow kernel. `fit_as_documented` has those of its README for clouds of many points in large
 units.
 """
