@@ -194,6 +194,19 @@ def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     np.testing.assert_allclose(places.of(["a", "b"]).at(mean.vertices), mean.vertices[[7, 90]], atol=1e-6)
 
 
+def test_landmarks_in_one_place_that_are_quite_sure_pull_as_one(blobs: list[RawBlob]) -> None:
+    directions, faces = sphere(300)
+    mesh = Mesh(blob(directions, np.zeros(5)), faces)
+    harmonics, at = Harmonics.of(mesh, 60), mesh.vertices[5]
+    twice = Marks(Places.on(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
+    once = Marks(Places.on(mesh, {"a": at}), at[None] + 1.0, 1e-300)
+    x = mesh.vertices
+    np.testing.assert_allclose(twice.pull(x, harmonics, 20.0, 80.0), once.pull(x, harmonics, 20.0, 80.0), atol=1e-3)
+    for uncertainty in (0.0, np.nan, -1.0):
+        with pytest.raises(InputError, match="above 0"):
+            correspond([blobs[0].scan, blobs[1].scan], replace(SETTINGS, landmark_uncertainty=uncertainty))
+
+
 def test_shapes_that_are_wrongly_placed_do_not_move_landmarks() -> None:
     directions, faces = sphere(300)
     shapes = [blob(directions, z) for z in np.eye(5)]

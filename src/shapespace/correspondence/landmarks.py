@@ -29,6 +29,8 @@ _OFF_SHARE = 0.5
 _AGREE = 0.2
 """Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
 _MIRROR_SHARE = 0.5
+_FIRMEST = 1e-3
+"""Two landmarks in one place leave (2) without a solution where s / a is 0."""
 _SURE = 3.0
 """Landmarks on a line, but for less than this many times their uncertainty, do not tell how a shape is turned."""
 _ASTRAY = 0.25
@@ -134,7 +136,7 @@ class Marks:
         functions = self.places.at(harmonics.functions)
         spread = functions * harmonics.kept(range_mm)
         kernel = spread @ functions.T
-        ratio = self.uncertainty * size_mm / (_OFF_SHARE * range_mm)
+        ratio = max(self.uncertainty * size_mm / (_OFF_SHARE * range_mm), _FIRMEST)
         loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
         pulled: FloatArray = np.asarray(np.linalg.solve(loaded, self.points - self.places.at(x)), dtype=np.float64)
         return harmonics.functions @ (spread.T @ pulled)
@@ -201,11 +203,8 @@ def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArra
     shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])
     contrary = off > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
     kept = ~contrary[((shared > 0) & ~contrary).sum(axis=1).argmax()]
-    return Places.on(
-        mean,
-        {
-            name: np.nanmedian(points, axis=0)
-            for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True)
-            if np.isfinite(points).any()
-        },
-    )
+    middle: dict[str, FloatArray] = {}
+    for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True):
+        if np.isfinite(points).any():
+            middle[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
+    return Places.on(mean, middle)

@@ -178,6 +178,8 @@ def first_template(
     """
     if len(scans) < FEWEST:
         raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
+    if not 0 < settings.landmark_uncertainty < np.inf:
+        raise InputError(f"Landmarks have an uncertainty above 0, not {settings.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
     good, broken = _repaired(scans)
