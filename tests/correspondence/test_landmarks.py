@@ -185,6 +185,17 @@ def test_landmarks_of_another_size_than_their_scan_are_named() -> None:
     assert "look at their unit" in placed.reason
 
 
+def test_a_scan_not_reached_from_the_pose_of_its_landmarks_says_so(blobs: list[RawBlob]) -> None:
+    three = [
+        replace(scan, landmarks={name: scan.landmarks[name] for name in ("nose", "left", "top")})
+        for scan in map(marked, blobs[:3])
+    ]
+    points = three[1].landmarks
+    three[1] = replace(three[1], landmarks={**points, "left": points["top"], "top": points["left"]})
+    made = correspond(three, SETTINGS, template=three[0])
+    assert ["have wrong names" in scan.reason for scan in made.scans] == [False, True, False]
+
+
 def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     directions, faces = sphere(300)
     shapes = [blob(directions, z) for z in np.eye(5)]

@@ -376,11 +376,16 @@ class _State:
         if placed.covered < s.fewest_covered:
             return (
                 f"surface not reached: the template covers {100 * placed.covered:.0f} % of it; another object, or "
-                "one with much beside it"
+                f"one with much beside it{self._doubt(placed)}"
             )
         if placed.seen.mean() < s.fewest_seen:
             return f"half missing: it shows {100 * placed.seen.mean():.0f} % of the template"
         return ""
+
+    def _doubt(self, placed: Placed) -> str:
+        """Return what else may be wrong with a scan whose pose its landmarks tell."""
+        told = bool(self.scans[placed.index].landmarks) and np.isnan(placed.mirrored)
+        return "; or its landmarks, which tell its pose, have wrong names" if told else ""
 
     def _settle_rivals(self) -> None:
         """Where several poses were about as likely, take the one whose shape the scans of sure pose tell best."""
@@ -409,7 +414,7 @@ class _State:
             if value > self.settings.strange * usual:
                 self.reasons[i] = (
                     f"another object, or wrongly placed: {value / usual:.1f} times as far as usual from what the other "
-                    "scans say of it"
+                    f"scans say of it{self._doubt(self.placed[i])}"
                 )
                 del self.placed[i]
 
