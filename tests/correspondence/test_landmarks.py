@@ -1,5 +1,6 @@
 """Landmarks, a model to begin with, mirror images and scans that lack a part: what each tells a correspondence."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks, Places, agreed, astray
 from shapespace.correspondence.mirror import Mirror
-from shapespace.correspondence.place import PlaceTask, Workbench
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.rounds import CorrespondSettings, correspond, first_template
 from shapespace.correspondence.template import Glance, choose
@@ -259,6 +260,20 @@ def test_a_mirrored_scan_is_named(blobs: list[RawBlob]) -> None:
     scans[3] = mirrored(scans[3])
     made = correspond(scans, SETTINGS)
     assert [scan.reason.startswith("mirrored") for scan in made.scans] == [k == 3 for k in range(6)]
+
+
+def test_no_scan_of_a_symmetric_object_is_mirrored() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(even(directions), faces, name="even")
+    scans = [Mesh(mesh.vertices * (1 + 0.1 * k), np.roll(faces, k, axis=1), name=str(k)) for k in range(2)]
+
+    def run(bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
+        return [replace(bench.place(task), mirrored=0.5) for task in tasks]
+
+    made = correspond(scans, replace(SETTINGS, symmetric=True), template=mesh, run=run)
+    assert not any(scan.reason for scan in made.scans)
+    with pytest.raises(InputError, match="mirrored"):
+        correspond(scans, SETTINGS, template=mesh, run=run)
 
 
 def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
