@@ -1,12 +1,13 @@
 """Rounds of correspondence on disk: nothing is done twice, and it does not matter where it is done."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from raw_blobs import raw_blob
+from raw_blobs import marked, raw_blob
 from shapespace.batch.rounds import KeptRounds
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
@@ -14,9 +15,11 @@ from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.rounds import CorrespondSettings, correspond
 from shapespace.correspondence.template import Glance, resampled
 from shapespace.types import Mesh
+from synthetic_shapes import blob_model
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
 SETTINGS = CorrespondSettings(vertices=400, rounds=2, first=QUICK, next=QUICK)
+FIRST = replace(SETTINGS, rounds=1)
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +97,23 @@ def test_what_poses_are_found_with_is_part_of_a_task(scans: list[Mesh], placed: 
     for glance in (alone, taught, alone):
         list(kept(tmp_path)(Workbench(mesh, harmonics, (glance,), 0), [task]))
     assert placed == [0, 0]
+
+
+def test_with_other_landmarks_what_they_do_not_touch_is_kept(placed: list[int], tmp_path: Path) -> None:
+    one = [marked(raw_blob(k, points=1200)) for k in range(3)]
+    correspond(one, FIRST, template=one[0], run=kept(tmp_path))
+    placed.clear()
+    other = replace(one[1], landmarks={name: point + 1.0 for name, point in one[1].landmarks.items()})
+    correspond([one[0], other, one[2]], FIRST, template=one[0], run=kept(tmp_path))
+    assert placed == [1]
+    placed.clear()
+    correspond(one, replace(FIRST, landmark_uncertainty=0.05), template=one[0], run=kept(tmp_path))
+    assert placed == [0, 1, 2]
+
+
+def test_a_model_and_landmarks_guide_in_other_processes_as_in_this_one(tmp_path: Path) -> None:
+    scans, model = [marked(raw_blob(k, points=1200)) for k in range(3)], blob_model()
+    here = correspond(scans, SETTINGS, model=model, run=kept(tmp_path / "here"))
+    elsewhere = correspond(scans, SETTINGS, model=model, run=kept(tmp_path / "elsewhere", jobs=2))
+    for one, other in zip(here.scans, elsewhere.scans, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)

@@ -12,6 +12,8 @@ from shapespace.cli import main
 from shapespace.io.landmarks import write_landmarks
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.types import Mesh
+from synthetic_shapes import sphere
 
 SCANS = 4
 QUICK = ("--vertices", "500", "--rounds", "1", "--jobs", "1", "--quiet")
@@ -115,3 +117,28 @@ def test_a_model_to_begin_with_and_landmarks_of_nobody(run: Run, raw: Path, same
     (tmp_path / "marks").mkdir()
     write_landmarks(tmp_path / "marks" / "nobody.csv", {"a": np.zeros(3)})
     assert "is named as one of the scans" in run(*asked, "--landmarks", tmp_path / "marks").sentence()
+
+
+def test_landmarks_off_the_scan_or_of_two_scans_are_told(run: Run, raw: Path, tmp_path: Path) -> None:
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    points = marked(raw_blob(0, points=1500)).landmarks
+    write_landmarks(marks / "blob0.csv", {name: point + 4000 for name, point in points.items()})
+    write_landmarks(marks / "blob0.json", points)
+    scans = [raw / "blob0.ply", raw / "blob2.ply"]
+    outcome = run("correspond", *scans, "-o", tmp_path / "same", "--landmarks", marks, *QUICK)
+    assert outcome.code == 0 and "look at their unit and frame" in outcome.err
+    assert "blob0.json is not read, since blob0.csv has landmarks of the same scan" in outcome.err
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "blob0.ply").write_bytes((raw / "blob0.ply").read_bytes())
+    two = ("correspond", *scans, tmp_path / "other" / "blob0.ply", "-o", tmp_path / "no", "--landmarks", marks, *QUICK)
+    assert "would both take the landmarks" in run(*two).sentence()
+
+
+def test_a_model_of_another_object_is_told(run: Run, raw: Path, tmp_path: Path) -> None:
+    directions, faces = sphere(400)
+    longish = [directions * [8.0, 8.0 + k, 100.0] + 30 * np.sin(4 * directions[:, [2]]) * [1, 0, 0] for k in range(4)]
+    ShapeModel.fit([Mesh(x, faces, name=str(k)) for k, x in enumerate(longish)], modes=1).save(tmp_path / "model.h5")
+    scans = [raw / f"blob{k}.ply" for k in range(2)]
+    outcome = run("correspond", *scans, "-o", tmp_path / "same", "--model", tmp_path / "model.h5", *QUICK)
+    assert "set aside" in outcome.err or "hardly an object of their kind" in outcome.err

@@ -1,5 +1,6 @@
 """Landmarks, a model to begin with, mirror images and scans that lack a part: what each tells a correspondence."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,15 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places, agreed
+from shapespace.correspondence.landmarks import Marks, Places, agreed, astray
 from shapespace.correspondence.mirror import Mirror
+from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import CorrespondSettings, correspond
-from shapespace.correspondence.template import choose
-from shapespace.errors import InputError
+from shapespace.correspondence.rounds import CorrespondSettings, correspond, first_template
+from shapespace.correspondence.template import Glance, choose
+from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob, sphere, training_meshes
 
@@ -43,6 +46,15 @@ def cut(one: RawBlob, share: float) -> Mesh:
 def mirrored(mesh: Mesh) -> Mesh:
     """Return the mirror image of a scan."""
     return Mesh(mesh.vertices * FLIP, mesh.faces[:, ::-1], name=mesh.name)
+
+
+def bowl(mesh: Mesh) -> Mesh:
+    """Return a mesh of the blobs without its back, which has a rim."""
+    front = sphere(len(mesh.vertices))[0][:, 2] > -0.5
+    number = np.cumsum(front) - 1
+    return Mesh(
+        mesh.vertices[front], number[mesh.faces[front[mesh.faces].all(axis=1)]].astype(np.int32), name=mesh.name
+    )
 
 
 def even(directions: FloatArray) -> FloatArray:
@@ -97,6 +109,94 @@ def test_landmarks_tell_the_pose_or_why_they_cannot() -> None:
     assert Marks(two, two.at(mesh.vertices), 0.02).pose(mesh.vertices) is None
 
 
+def test_landmarks_as_good_as_on_a_line_tell_no_pose() -> None:
+    directions, faces = sphere(300)
+    mesh = Mesh(blob(directions, np.zeros(5)), faces)
+    poles = [directions[:, 1].argmax(), directions[:, 1].argmin()]
+    ends = mesh.vertices[poles]
+    middle = ends.mean(axis=0) + np.array([0.5, 0.0, 0.0])
+    places = Places(("a", "b", "c"), np.array([[poles[0]] * 3, [poles[1]] * 3, [*poles, 0]]), np.full((3, 3), 1 / 3))
+    line = replace(places, weights=np.array([[1.0, 0, 0], [1.0, 0, 0], [0.495, 0.495, 0.01]]))
+    assert Marks(line, np.stack([*ends, middle]), 0.02).pose(mesh.vertices) is None
+    assert Marks(line, np.stack([*ends, middle]), 1e-6).pose(mesh.vertices) is not None
+
+
+def test_landmarks_in_another_unit_or_far_off_are_left_out(blobs: list[RawBlob]) -> None:
+    scan = marked(blobs[0])
+    assert astray(scan) == {}
+    metres = replace(scan, landmarks={name: point / 1000 + 500 for name, point in scan.landmarks.items()})
+    assert set(astray(metres)) == set(LANDMARKS)
+    far = replace(scan, landmarks={**scan.landmarks, "nose": scan.landmarks["nose"] + [400, 0, 0]})
+    assert set(astray(far)) == {"nose"} and astray(far)["nose"] > 1
+    made = correspond([metres, marked(blobs[1]), far], SETTINGS)
+    assert not any(scan.reason for scan in made.scans)
+    assert [bool(np.isfinite(scan.landmarks)) for scan in made.scans] == [False, True, True]
+
+
+def test_a_template_whose_landmarks_have_wrong_names_does_not_set_the_others_aside(blobs: list[RawBlob]) -> None:
+    scans = [marked(one) for one in blobs[:4]]
+    points = scans[0].landmarks
+    wrong = dict(zip(points, [points[name] for name in ("back", "nose", "low", "left", "top")], strict=True))
+    scans[0] = replace(scans[0], landmarks=wrong)
+    first = first_template(scans, scans[0], SETTINGS)
+    assert not first.mesh.landmarks and "contradict those of most scans" in first.why
+    made = correspond(scans, replace(SETTINGS, rounds=2), first=first)
+    assert ["check their names" in scan.reason for scan in made.scans] == [True, False, False, False]
+    assert first_template(scans, marked(blobs[4]), SETTINGS).mesh.landmarks
+
+
+def _bench(template: Mesh) -> tuple[Workbench, Places]:
+    harmonics = Harmonics.of(template, QUICK.harmonics)
+    names = {name: template.vertices[(template.vertices @ np.array(at)).argmax()] for name, at in LANDMARKS.items()}
+    return Workbench(template, harmonics, (Glance.of(template),), 0), Places.on(template, names)
+
+
+def test_landmarks_correct_a_pose_that_was_found_without_them() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
+    bench, places = _bench(mesh)
+    over = Similarity(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    marks = Marks(places, places.at(mesh.vertices), 0.02)
+    placed = bench.place(PlaceTask(0, mesh, over, mesh.vertices, QUICK, marks=marks))
+    assert np.trace(placed.T_scan_template.rotation) > 2.9
+
+
+def test_two_landmarks_tell_which_end_of_a_smooth_object_is_which() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
+    bench, places = _bench(mesh)
+    two = places.of(["left", "low"])
+    for turn in (np.eye(3), np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0])):
+        T = Similarity(1.0, turn, np.zeros(3))
+        scan = Mesh(T.apply(mesh.vertices), mesh.faces)
+        placed = bench.place(
+            PlaceTask(0, scan, None, None, QUICK, marks=Marks(two, T.apply(two.at(mesh.vertices)), 0.02))
+        )
+        ends = placed.T_scan_template.apply(mesh.vertices[[directions[:, 0].argmax(), directions[:, 0].argmin()]])
+        np.testing.assert_allclose(ends[:, 0], turn[0, 0] * np.array([100.0, -100.0]), atol=15.0)
+
+
+def test_landmarks_of_another_size_than_their_scan_are_named() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
+    bench, places = _bench(mesh)
+    placed = bench.place(
+        PlaceTask(0, mesh, None, None, QUICK, marks=Marks(places, places.at(mesh.vertices) / 1000, 0.02))
+    )
+    assert "look at their unit" in placed.reason
+
+
+def test_a_scan_not_reached_from_the_pose_of_its_landmarks_says_so(blobs: list[RawBlob]) -> None:
+    three = [
+        replace(scan, landmarks={name: scan.landmarks[name] for name in ("nose", "left", "top")})
+        for scan in map(marked, blobs[:3])
+    ]
+    points = three[1].landmarks
+    three[1] = replace(three[1], landmarks={**points, "left": points["top"], "top": points["left"]})
+    made = correspond(three, SETTINGS, template=three[0])
+    assert ["have wrong names" in scan.reason for scan in made.scans] == [False, True, False]
+
+
 def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     directions, faces = sphere(300)
     shapes = [blob(directions, z) for z in np.eye(5)]
@@ -104,6 +204,30 @@ def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     told = [(x, {"a": x[7], "b": x[90]} if k else {"a": x[40]}) for k, x in enumerate(shapes)]
     places = agreed(mean, told)
     np.testing.assert_allclose(places.of(["a", "b"]).at(mean.vertices), mean.vertices[[7, 90]], atol=1e-6)
+
+
+def test_landmarks_in_one_place_that_are_quite_sure_pull_as_one(blobs: list[RawBlob]) -> None:
+    directions, faces = sphere(300)
+    mesh = Mesh(blob(directions, np.zeros(5)), faces)
+    harmonics, at = Harmonics.of(mesh, 60), mesh.vertices[5]
+    twice = Marks(Places.on(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
+    once = Marks(Places.on(mesh, {"a": at}), at[None] + 1.0, 1e-300)
+    x = mesh.vertices
+    np.testing.assert_allclose(twice.pull(x, harmonics, 20.0, 80.0), once.pull(x, harmonics, 20.0, 80.0), atol=1e-3)
+    for uncertainty in (0.0, np.nan, -1.0):
+        with pytest.raises(InputError, match="above 0"):
+            correspond([blobs[0].scan, blobs[1].scan], replace(SETTINGS, landmark_uncertainty=uncertainty))
+
+
+def test_shapes_that_are_wrongly_placed_do_not_move_landmarks() -> None:
+    directions, faces = sphere(300)
+    shapes = [blob(directions, z) for z in np.eye(5)]
+    mean = Mesh(np.mean(shapes, axis=0), faces)
+    right, wrong = {"a": 7, "b": 150}, [{"a": 290, "b": 20}, {"a": 60, "b": 250}]
+    marks = [*wrong, right, right, {"c": 30}]
+    told = [(x, {name: x[k] for name, k in one.items()}) for x, one in zip(shapes, marks, strict=True)]
+    places = agreed(mean, told)
+    np.testing.assert_allclose(places.of(["a", "b", "c"]).at(mean.vertices), mean.vertices[[7, 150, 30]], atol=1e-6)
 
 
 def test_a_model_to_begin_with_gives_its_triangles_and_what_it_knows(blobs: list[RawBlob]) -> None:
@@ -117,11 +241,39 @@ def test_a_model_to_begin_with_gives_its_triangles_and_what_it_knows(blobs: list
         correspond(scans, SETTINGS, model=model, template=scans[0])
 
 
+def test_a_model_of_splines_guides_with_its_shapes_and_one_of_points_is_refused(blobs: list[RawBlob]) -> None:
+    meshes = [bowl(mesh) for mesh in training_meshes()]
+    splines = ss.ShapeModel.fit(meshes, representation="bspline", control_points=(8, 8))
+    scans = [one.scan for one in blobs[:2]]
+    first = first_template(scans, None, SETTINGS, splines)
+    assert first.guide is not None
+    T = fit_similarity(splines.mean_vertices, first.mesh.vertices)
+    b = 0.5 * splines.stddev
+    np.testing.assert_allclose(first.guide.reconstruct(T.scale * b), T.apply(splines.reconstruct(b)), atol=1e-6)
+    points = ss.ShapeModel.fit([Mesh(mesh.vertices, None, name=mesh.name) for mesh in meshes])
+    with pytest.raises(MeshError, match="no triangles"):
+        first_template(scans, None, SETTINGS, points)
+
+
 def test_a_mirrored_scan_is_named(blobs: list[RawBlob]) -> None:
     scans = [one.scan for one in blobs]
     scans[3] = mirrored(scans[3])
     made = correspond(scans, SETTINGS)
     assert [scan.reason.startswith("mirrored") for scan in made.scans] == [k == 3 for k in range(6)]
+
+
+def test_no_scan_of_a_symmetric_object_is_mirrored() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(even(directions), faces, name="even")
+    scans = [Mesh(mesh.vertices * (1 + 0.1 * k), np.roll(faces, k, axis=1), name=str(k)) for k in range(2)]
+
+    def run(bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
+        return [replace(bench.place(task), mirrored=0.5) for task in tasks]
+
+    made = correspond(scans, replace(SETTINGS, symmetric=True), template=mesh, run=run)
+    assert not any(scan.reason for scan in made.scans)
+    with pytest.raises(InputError, match="mirrored"):
+        correspond(scans, SETTINGS, template=mesh, run=run)
 
 
 def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
@@ -133,6 +285,15 @@ def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
     flipped = Mesh(other * FLIP, faces[:, ::-1])
     off = build_engine(flipped).query(mirror.image(other)).distance.mean()
     assert off < 0.5 * build_engine(flipped).query(other).distance.mean()
+
+
+def test_what_a_scan_lacks_its_mirror_image_lacks_on_the_other_side() -> None:
+    directions, faces = sphere(900)
+    mesh = Mesh(even(directions), faces)
+    mirror = Mirror.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
+    seen = (directions[:, 0] < 0.3).astype(np.float64)
+    shown = mirror.shown(seen[None])[0]
+    assert shown[directions[:, 0] > -0.1].all() and not shown[directions[:, 0] < -0.5].any()
 
 
 def test_an_object_that_is_not_symmetric_is_refused_as_such() -> None:

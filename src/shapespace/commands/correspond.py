@@ -18,6 +18,7 @@ from shapespace.batch.rounds import KeptRounds
 from shapespace.batch.workers import cores
 from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.commands.landmark_files import LandmarkFiles
+from shapespace.correspondence.landmarks import astray, without_astray
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.rounds import (
     Correspondence,
@@ -97,19 +98,24 @@ def correspond_files(
     names = names_for(paths, None)
     make_folder(folder)
     marks = LandmarkFiles.of(files.landmarks)
+    marks.refuse_shared(paths)
     scans, unread, notes = _read_all(paths, names, marks, quiet=quiet)
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     marks.tell(say)
+    if template is not None:
+        for sentence in _told_astray(template):
+            say(f"{template.name}: {sentence}")
     model = None if files.model is None else ShapeModel.load(files.model)
     rounds = _Rounds(folder / _KEPT, files.jobs or cores(), quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings, model)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
     _note_copies(scans, notes)
-    if template is None or made.moved[0] < _ANOTHER_SHAPE:
+    given = template.name if template is not None else "" if model is None else "The model's mean"
+    if not given or made.moved[0] < _ANOTHER_SHAPE:
         _note_other_objects(made, notes)
     records = _records(made, scans, notes, names, paths, unread, folder)
-    _tell(records, made, template, say)
+    _tell(records, made, given, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
@@ -169,7 +175,22 @@ def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
         mesh, findings = repair(scan)
     except MeshError:
         return scan, []  # it is set aside with that reason
-    return mesh, [f"{one.what} {one.action}" for one in findings if one.level == "note"]
+    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note"]
+    return without_astray(mesh), [*notes, *_told_astray(mesh)]
+
+
+def _told_astray(scan: Mesh) -> list[str]:
+    """Return a sentence on landmarks that are none of `scan`, where it has such."""
+    off = astray(scan)
+    if not off:
+        return []
+    if len(off) == len(scan.landmarks):
+        return [
+            f"Its landmarks are left out: they lie {min(off.values()):.2g} times its size off its surface, or more; "
+            "look at their unit and frame."
+        ]
+    named = ", ".join(f"{name} ({share:.2g} times its size)" for name, share in list(off.items())[:_LISTED])
+    return [f"Landmarks that lie far off its surface are left out: {named}."]
 
 
 def _note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
@@ -191,12 +212,12 @@ def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> No
             )
 
 
-def _tell(records: Sequence[CorrespondRecord], made: Correspondence, template: Mesh | None, say: _Say) -> None:
-    """Say what should be known before the results are used."""
-    if template is not None and made.moved[0] >= _ANOTHER_SHAPE:
+def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str, say: _Say) -> None:
+    """Say what should be known before the results are used; `given` is what the template given is called, if one is."""
+    if given and made.moved[0] >= _ANOTHER_SHAPE:
         say(
-            f"{template.name} had to change by {100 * made.moved[0]:.0f} % of its size to become these scans, so it is "
-            "hardly an object of their kind; look at the surfaces, or leave --template out."
+            f"{given} had to change by {100 * made.moved[0]:.0f} % of its size to become these scans, so it is "
+            "hardly an object of their kind; look at the surfaces, or leave it out."
         )
     noted = [record for record in records if record.notes]
     for record in noted[:_LISTED]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,13 +42,27 @@ class LandmarkFiles:
             raise FileError(f"{folder} is no folder; give one with landmarks in files named as the scans.")
         endings = sorted([*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS], key=len, reverse=True)
         found: dict[str, Path] = {}
+        unread: list[str] = []
         for file in sorted(folder.iterdir()):
             ending = next((one for one in endings if file.name.lower().endswith(one)), None)
-            if ending is not None and file.is_file():
-                found.setdefault(file.name[: -len(ending)], file)
+            if ending is None or not file.is_file():
+                continue
+            first = found.setdefault(file.name[: -len(ending)], file)
+            if first is not file:
+                unread.append(f"{file.name} is not read, since {first.name} has landmarks of the same scan.")
         if not found:
             raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
-        return LandmarkFiles(folder, found)
+        return LandmarkFiles(folder, found, unread=unread)
+
+    def refuse_shared(self, scans: Sequence[Path]) -> None:
+        """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""
+        owner: dict[str, Path] = {}
+        for path in scans:
+            if path.stem in self.files and owner.setdefault(path.stem, path) != path:
+                raise InputError(
+                    f"{owner[path.stem]} and {path} would both take the landmarks in {self.files[path.stem]}; rename "
+                    "one of the scans."
+                )
 
     def onto(self, mesh: Mesh, path: Path) -> Mesh:
         """Return `mesh`, read from `path`, with the landmarks that the folder has for it."""

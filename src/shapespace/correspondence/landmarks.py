@@ -11,8 +11,8 @@ h is the mean of the kernel's diagonal, s the uncertainty, a = r / 2 how far a s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from shapespace.correspondence.harmonics import Harmonics
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import faces_of
+from shapespace.geometry.surface import faces_of, rms_size
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 FEWEST = 3
@@ -29,6 +29,12 @@ _OFF_SHARE = 0.5
 _AGREE = 0.2
 """Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
 _MIRROR_SHARE = 0.5
+_FIRMEST = 1e-3
+"""Two landmarks in one place leave (2) without a solution where s / a is 0."""
+_SURE = 3.0
+"""Landmarks on a line, but for less than this many times their uncertainty, do not tell how a shape is turned."""
+_ASTRAY = 0.25
+"""A landmark that lies farther than this share of a scan's size off its surface is none of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +101,7 @@ class Marks:
         return Marks(self.places, T.apply(self.points), self.uncertainty)
 
     def pose(self, vertices: FloatArray) -> Similarity | None:
-        """Return T_scan_template by the landmarks, or None where they are too few or on a line.
+        """Return T_scan_template by the landmarks, or None where they are too few, or as good as on a line.
 
         Raises:
             InputError: they are those of a mirror image, or of something else.
@@ -103,6 +109,9 @@ class Marks:
         if len(self.points) < FEWEST:
             return None
         own = self.places.at(vertices)
+        across = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(own))
+        if across < _SURE * self.uncertainty * rms_size(vertices):
+            return None
         try:
             T = fit_similarity(own, self.points)
             mirrored = fit_similarity(own * [-1.0, 1.0, 1.0], self.points)
@@ -113,7 +122,10 @@ class Marks:
         other = _rms(mirrored.apply(own * [-1.0, 1.0, 1.0]) - self.points) / spread
         if len(self.points) > FEWEST and off > _AGREE:
             if other < _MIRROR_SHARE * off:
-                raise InputError("mirrored: its landmarks are those of a mirror image of the other scans")
+                raise InputError(
+                    "mirrored: its landmarks are those of a mirror image of the other scans; turn it over, or check "
+                    "their names"
+                )
             raise InputError(
                 f"its landmarks lie {100 * off:.0f} % of their spread from those of the others; check their names"
             )
@@ -124,7 +136,7 @@ class Marks:
         functions = self.places.at(harmonics.functions)
         spread = functions * harmonics.kept(range_mm)
         kernel = spread @ functions.T
-        ratio = self.uncertainty * size_mm / (_OFF_SHARE * range_mm)
+        ratio = max(self.uncertainty * size_mm / (_OFF_SHARE * range_mm), _FIRMEST)
         loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
         pulled: FloatArray = np.asarray(np.linalg.solve(loaded, self.points - self.places.at(x)), dtype=np.float64)
         return harmonics.functions @ (spread.T @ pulled)
@@ -142,21 +154,57 @@ def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     return np.asarray(faces_of(mesh)[near.triangle], dtype=np.int32), near.barycentric
 
 
+def astray(scan: Mesh) -> dict[str, float]:
+    """Return the landmarks of `scan` that are none of it: name -> distance off its surface, as a share of its size."""
+    if not scan.landmarks:
+        return {}
+    off = build_engine(scan).query(np.stack(list(scan.landmarks.values()))).distance / rms_size(scan.vertices)
+    return {name: float(share) for name, share in zip(scan.landmarks, off, strict=True) if share > _ASTRAY}
+
+
+def without_astray(scan: Mesh) -> Mesh:
+    """Return `scan` without the landmarks that are `astray`."""
+    off = astray(scan)
+    return replace(scan, landmarks={name: point for name, point in scan.landmarks.items() if name not in off})
+
+
+def unlike_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:
+    """Return whether most of the `scans` whose landmarks can be compared with those of `template` contradict them."""
+    places = Places.on(template, template.landmarks)
+    told = [marks for scan in scans if (marks := Marks.shared(places, scan, uncertainty)) is not None]
+    refused, agreeing = 0, 0
+    for marks in told:
+        try:
+            agreeing += marks.pose(template.vertices) is not None
+        except InputError:
+            refused += 1
+    return refused > agreeing
+
+
 def _rms(difference: FloatArray) -> float:
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
 def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> Places:
-    """Return where on `mean` the landmarks of shapes lie: the middle of where each has them.
+    """Return where on `mean` the landmarks of shapes lie: the middle of where those have them that agree with most.
 
     Args:
         mean: with triangles.
         shapes: (V, 3) vertices of each, and its landmarks in the same frame.
     """
-    found: dict[str, list[FloatArray]] = {}
-    for vertices, points in shapes:
-        if points:
-            places = Places.on(mean.with_vertices(vertices), points)
-            for name, point in zip(places.names, places.at(mean.vertices), strict=True):
-                found.setdefault(name, []).append(point)
-    return Places.on(mean, {name: np.median(points, axis=0) for name, points in found.items()})
+    told = [(Places.on(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
+    names = list(dict.fromkeys(name for _, points in told for name in points))
+    if not names:
+        return Places.nowhere()
+    at = np.full((len(told), len(names), 3), np.nan)
+    for own, (places, points) in zip(at, told, strict=True):
+        own[[names.index(name) for name in points]] = places.at(mean.vertices)
+    off = np.sqrt(np.array([np.nansum((at - own) ** 2, axis=(1, 2)) for own in at]))
+    shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])
+    contrary = off > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
+    kept = ~contrary[((shared > 0) & ~contrary).sum(axis=1).argmax()]
+    middle: dict[str, FloatArray] = {}
+    for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True):
+        if np.isfinite(points).any():
+            middle[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
+    return Places.on(mean, middle)

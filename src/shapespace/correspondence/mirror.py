@@ -57,3 +57,7 @@ class Mirror:
         """Return the mirror image (V, 3) of a shape (V, 3) in correspondence with it, in the pose of the shape."""
         flipped = np.einsum("vc,vcd->vd", self.weights, vertices[self.corners]) * _FLIP
         return fit_similarity(flipped, vertices).apply(flipped)
+
+    def shown(self, seen: FloatArray) -> FloatArray:
+        """Return (N, V) how much each vertex counts of the images of shapes of which `seen` (N, V) counts."""
+        return seen[:, self.corners].min(axis=2)

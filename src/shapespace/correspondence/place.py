@@ -22,7 +22,7 @@ from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start
 from shapespace.geometry.closest import build_engine, on_boundary
-from shapespace.geometry.surface import boundary_edges, boundary_vertices, vertex_normals
+from shapespace.geometry.surface import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
@@ -34,6 +34,10 @@ _AS_GOOD = 0.8
 _LEFT_OVER = 0.05
 _OTHERS_SAY = 0.95
 """A pose that the other shapes make likelier than all others is tried beside the one there is."""
+_OTHER_SIZE = 8.0
+"""Units differ by more, and what a scan shows beside the object hardly does."""
+_CONTRADICTED = 2.0
+"""Landmarks too few for a pose rule poses out in which they lie this many times as far off as in another."""
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
@@ -139,10 +143,19 @@ class Workbench:
         T = task.T_scan_template
         marked = None if task.marks is None else task.marks.pose(self.mesh.vertices)
         if marked is not None:
-            return self._from(task, T) if T is not None else self._from(*self._guided(task, marked))
+            ratio = marked.scale * rms_size(self.mesh.vertices) / rms_size(task.scan.vertices)
+            if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
+                raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; look at their unit")
+            if T is not None and _is_same_turn(T, marked):
+                return self._from(task, T)
+            return self._from(*self._guided(replace(task, expected=None), marked))
         glance, vertices = self.glances[task.glance], np.array(task.scan.vertices)
         start = glance.start(vertices, self.seed)
         mirrored = glance.start(vertices * _FLIP, self.seed).score_mm / max(start.score_mm, 1e-12)
+        if self.guide is not None and mirrored < 1.0:  # what a model does not hold it holds of no mirror image either
+            bare = Glance.of(self.mesh)
+            scores = [bare.start(points, self.seed).score_mm for points in (vertices, vertices * _FLIP)]
+            mirrored = max(mirrored, scores[1] / max(scores[0], 1e-12))
         return replace(self._unmarked(task, start), mirrored=mirrored)
 
     def _unmarked(self, task: PlaceTask, start: Start) -> Placed:
@@ -151,9 +164,14 @@ class Workbench:
             placed = self._from(task, T)
             if start.score_mm > _OTHERS_SAY * start.runner_up_score_mm or _is_same_turn(T, start.T_scan_model):
                 return placed
+            if self._off(task, start.T_scan_model) > _CONTRADICTED * self._off(task, T):
+                return placed
             rival = self._tried(replace(task, expected=None), start)
             return placed if rival is None else replace(placed, rivals=(rival,))
-        tries = [self._tried(task, one) for one in likely(start)]
+        starts = likely(start)
+        nearest = min(self._off(task, one.T_scan_model) for one in starts)
+        told = [one for one in starts if self._off(task, one.T_scan_model) <= _CONTRADICTED * nearest]
+        tries = [self._tried(task, one) for one in told]
         good = [placed for placed in tries if placed is not None]
         if not good:
             raise FitError("surface not reached: too little of the scan matches the template from any pose")
@@ -161,6 +179,10 @@ class Workbench:
         most = max(placed.covered for placed in good)
         first, *others = [placed for placed in good if placed.covered > most - _LEFT_OVER]
         return replace(first, rivals=tuple(others))
+
+    def _off(self, task: PlaceTask, T: Similarity) -> float:
+        """Return how far, RMS in the template's unit, the landmarks lie off in a pose; 0 where there are none."""
+        return 0.0 if task.marks is None else task.marks.moved(T.inverse()).rms(self.mesh.vertices)
 
     def _tried(self, task: PlaceTask, start: Start) -> Placed | None:
         try:

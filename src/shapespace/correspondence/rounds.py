@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.correspondence.guide import Others, aligned, told_by_others
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places, agreed
+from shapespace.correspondence.landmarks import Marks, Places, agreed, unlike_most, without_astray
 from shapespace.correspondence.mirror import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
@@ -174,10 +174,12 @@ def first_template(
 
     Raises:
         InputError: fewer than two scans, scans that are all equal, or both a template and a model.
-        MeshError: no scan can be a template, or the template is none.
+        MeshError: no scan can be a template, or the template or model has no triangles.
     """
     if len(scans) < FEWEST:
         raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
+    if not 0 < settings.landmark_uncertainty < np.inf:
+        raise InputError(f"Landmarks have an uncertainty above 0, not {settings.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
         raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
     good, broken = _repaired(scans)
@@ -185,20 +187,26 @@ def first_template(
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     _refuse_equal(list(good.values()))
     if model is not None:
+        if model.faces is None:
+            raise MeshError("The model has no triangles, and a template needs them; leave it out, or give another.")
         points = {name: model.mean_vertices[vertex] for name, vertex in model.landmarks.items()}
         mesh, why = (
             Mesh(model.mean_vertices, model.faces, points, "mean"),
             "The template is the mean of the model given.",
         )
     elif template is not None:
-        mesh, why = given(template), f"{template.name} was given as the template."
+        mesh, why = without_astray(given(template)), f"{template.name} was given as the template."
     else:
-        mesh, why = _chosen(scans, good, settings)
+        mesh, why = _chosen(good, settings)
     scale = SIZE / rms_size(mesh.vertices)
     T = Similarity(scale, np.eye(3), -scale * mesh.vertices.mean(axis=0))
     points = {name: T.apply(point) for name, point in mesh.landmarks.items()}
+    mesh = mesh.with_vertices(T.apply(mesh.vertices), points)
+    if unlike_most(mesh, good.values(), settings.landmark_uncertainty):
+        mesh = mesh.with_vertices(mesh.vertices, {})
+        why += " Its landmarks contradict those of most scans, so the first round goes without them."
     return First(
-        mesh.with_vertices(T.apply(mesh.vertices), points),
+        mesh,
         why,
         good,
         broken,
@@ -206,10 +214,10 @@ def first_template(
     )
 
 
-def _chosen(scans: Sequence[Mesh], good: Mapping[int, Mesh], settings: CorrespondSettings) -> tuple[Mesh, str]:
+def _chosen(good: Mapping[int, Mesh], settings: CorrespondSettings) -> tuple[Mesh, str]:
     """Return the scan nearest to the others, meshed evenly, and why it is that one."""
     choice = choose(list(good.values()), settings.seed)
-    chosen = scans[list(good)[choice.index]]
+    chosen = good[list(good)[choice.index]]
     even = resampled(clean(chosen), settings.vertices)
     why = (
         f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
@@ -221,8 +229,8 @@ def _chosen(scans: Sequence[Mesh], good: Mapping[int, Mesh], settings: Correspon
 def _moved(model: ShapeModel, T: Similarity) -> ShapeModel:
     """Return `model` with its frame moved by `T`, which does not turn."""
     return ShapeModel(
-        T.apply(model.mean_vertices).ravel(), model.basis, T.scale * model.stddev, T.scale**2 * model.total_variance,
-        model.n_training, faces=model.faces,
+        T.apply(model.mean_vertices).ravel(), model.vertex_basis, T.scale * model.stddev,
+        T.scale**2 * model.total_variance, model.n_training, faces=model.faces,
     )  # fmt: skip
 
 
@@ -238,7 +246,7 @@ def correspond(
     """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
 
     Args:
-        scans: of one kind of object; landmarks that they have are soft constraints.
+        scans: of one kind of object; landmarks that they have are soft constraints, but for those far off the scan.
         settings: how.
         template: the surface that the first round goes by, as it is; None chooses a scan and meshes it evenly.
         model: of such objects; its mean is the template, and its fit to a scan is where the first round begins.
@@ -263,7 +271,7 @@ def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
     broken: dict[int, str] = {}
     for i, scan in enumerate(scans):
         try:
-            good[i] = repair(scan)[0]
+            good[i] = without_astray(repair(scan)[0])
         except MeshError as error:
             broken[i] = f"broken: {error}"
     return good, broken
@@ -300,8 +308,8 @@ class _State:
         """Return what its tasks share."""
         order = sorted(self.placed)
         if len(order) < _ENOUGH_TO_JUDGE:
-            glance = Glance.of(self.template) if self.guide is None else Glance(self.guide)
             guide = None if self.placed else self.guide
+            glance = Glance.of(self.template) if guide is None else Glance(guide)
             return Workbench(self.template, self.harmonics, (glance,), self.settings.seed, guide)
         shapes, parts = self._stacked(order)[0], np.array([self._part(i) for i in order])
         glances = tuple(Glance.of(self.template, shapes[parts != part]) for part in range(_PARTS))
@@ -360,7 +368,7 @@ class _State:
         s = self.settings
         if placed.reason:
             return placed.reason
-        if first and placed.mirrored < _MIRRORED:
+        if first and not s.symmetric and placed.mirrored < _MIRRORED:
             return (
                 f"mirrored: its mirror image lies {placed.mirrored:.2f} times as far from the template as itself; turn "
                 "it over, or do such scans on their own"
@@ -368,11 +376,16 @@ class _State:
         if placed.covered < s.fewest_covered:
             return (
                 f"surface not reached: the template covers {100 * placed.covered:.0f} % of it; another object, or "
-                "one with much beside it"
+                f"one with much beside it{self._doubt(placed)}"
             )
         if placed.seen.mean() < s.fewest_seen:
             return f"half missing: it shows {100 * placed.seen.mean():.0f} % of the template"
         return ""
+
+    def _doubt(self, placed: Placed) -> str:
+        """Return what else may be wrong with a scan whose pose its landmarks tell."""
+        told = bool(self.scans[placed.index].landmarks) and np.isnan(placed.mirrored)
+        return "; or its landmarks, which tell its pose, have wrong names" if told else ""
 
     def _settle_rivals(self) -> None:
         """Where several poses were about as likely, take the one whose shape the scans of sure pose tell best."""
@@ -401,7 +414,7 @@ class _State:
             if value > self.settings.strange * usual:
                 self.reasons[i] = (
                     f"another object, or wrongly placed: {value / usual:.1f} times as far as usual from what the other "
-                    "scans say of it"
+                    f"scans say of it{self._doubt(self.placed[i])}"
                 )
                 del self.placed[i]
 
@@ -414,9 +427,11 @@ class _State:
         order = sorted(self.placed)
         shapes, seen = self._stacked(order)
         shapes, mean = aligned(shapes, seen, self.template.vertices)
-        images = None if self.mirror is None else np.stack([self.mirror.image(shape) for shape in shapes])
-        if images is not None:
-            both, mean = aligned(np.concatenate([shapes, images]), np.concatenate([seen, seen]), mean)
+        images = None
+        if self.mirror is not None:
+            images = np.stack([self.mirror.image(shape) for shape in shapes])
+            shown = np.concatenate([seen, self.mirror.shown(seen)])
+            both, mean = aligned(np.concatenate([shapes, images]), shown, mean)
             shapes, images = np.split(both, 2)
         squares: list[float] = []
         for i, shape in zip(order, shapes, strict=True):
