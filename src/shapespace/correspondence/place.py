@@ -210,7 +210,7 @@ class Workbench:
         )  # fmt: skip
         start = found.T_scan_template.apply(found.vertices)
         dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
-        seen = dense.seen & self._reached(dense.vertices_scan_mm, target)
+        seen = self._shown(dense.vertices_scan_mm, dense.seen, target, task.settings.normal_cosine)
         covered, distance = self._judged(dense.vertices_scan_mm, seen, target)
         back = found.T_scan_template.inverse()
         mean, p95, p99, largest = (back.scale * length for length in distance)
@@ -219,11 +219,18 @@ class Workbench:
             (mean, p95, p99, largest), 0.0,
         )  # fmt: skip
 
-    def _reached(self, vertices: FloatArray, target: ScanTarget) -> BoolArray:
-        """Return (V,) which vertices lie on the scan; what is seen on a rim goes on for a little beyond it."""
+    def _shown(self, vertices: FloatArray, believed: BoolArray, target: ScanTarget, cosine: float) -> BoolArray:
+        """Return (V,) which vertices the scan shows: those that lie on it, believed by the dense stage or on no rim.
+
+        On a clean scan that stage drops what lies off it by little; what it believes on a rim goes on beyond it.
+        """
         if target.mesh.faces is None:
-            return np.ones(len(vertices), dtype=np.bool_)
-        return target.engine.query(vertices).distance < REACHED * self.template.size_mm
+            return believed
+        near = target.engine.query(vertices)
+        reached = near.distance < REACHED * self.template.size_mm
+        alike = np.einsum("vd,vd->v", vertex_normals(self.mesh.with_vertices(vertices)), target.normals[near.vertex])
+        inside = (alike > cosine) & ~on_boundary(near, target.mesh, target.rim)
+        return np.asarray(reached & (believed | inside))
 
     def _judged(
         self, vertices: FloatArray, seen: BoolArray, target: ScanTarget
