@@ -167,10 +167,11 @@ def test_two_landmarks_tell_which_end_of_a_smooth_object_is_which() -> None:
     directions, faces = sphere(900)
     mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
     bench, places = _bench(mesh)
+    other, triangles = sphere(1100, 0.8)  # its own vertices would tell the pose
     two = places.of(["left", "low"])
     for turn in (np.eye(3), np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0])):
         T = Similarity(1.0, turn, np.zeros(3))
-        scan = Mesh(T.apply(mesh.vertices), mesh.faces)
+        scan = Mesh(T.apply(other * [100.0, 30.0, 45.0]), triangles)
         placed = bench.place(
             PlaceTask(0, scan, None, None, SHORT, marks=Marks(two, T.apply(two.at(mesh.vertices)), 0.5))
         )
