@@ -55,7 +55,7 @@ class ElasticSettings:
     points: int = 2500
     fine: float = 0.15
     normal_cosine: float = 0.3
-    inliers: float = 3.0
+    inliers: float = 6.0
     borders: bool = False
     floor: float = 0.05
     turn: float = 0.1
