@@ -203,7 +203,8 @@ def _write(file: Path, placed: Placed) -> None:
         told: Arrays = {
             "vertices": one.vertices, "seen": one.seen, "covered": np.array(one.covered),
             "distance": np.array(one.distance), "seconds": np.array(one.seconds), "reason": np.array(one.reason),
-            "mirrored": np.array(one.mirrored), **_pose_arrays(one.T_scan_template),
+            "mirrored": np.array(one.mirrored), "by_landmarks": np.array(one.by_landmarks),
+            **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in told.items()}
     with atomic_path(file) as path, path.open("wb") as stream:
@@ -230,5 +231,5 @@ def _kept_one(kept: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> 
     return Placed(
         index, np.asarray(of("vertices"), dtype=np.float64), T, np.asarray(of("seen"), dtype=np.bool_),
         float(of("covered")), (mean, p95, p99, largest), float(of("seconds")), str(of("reason")),
-        mirrored=float(of("mirrored")),
+        mirrored=float(of("mirrored")), by_landmarks=bool(of("by_landmarks")),
     )  # fmt: skip

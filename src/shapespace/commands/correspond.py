@@ -21,6 +21,7 @@ from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.rounds import (
+    ENOUGH_TO_JUDGE,
     Correspondence,
     Corresponding,
     CorrespondSettings,
@@ -44,8 +45,8 @@ from shapespace.version import __version__
 
 _KEPT = ".rounds"
 _LISTED = 10
-_ENOUGH_TO_JUDGE, _ANOTHER_SHAPE = 6, 0.25
-"""With so many scans the rounds find other objects themselves; the mean change of one, as a share of its size."""
+_ANOTHER_SHAPE = 0.25
+"""The mean change of another object, as a share of its size."""
 _OTHER_SIZE = 2.0
 _ENOUGH_TO_COMPARE, _FAR = 4, 3.0
 """Times the usual distance (95 % of both directions), sizes divided out."""
@@ -202,7 +203,7 @@ def _note_copies(scans: dict[str, Mesh], notes: dict[str, list[str]]) -> None:
 def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> None:
     """Where too few scans are there to tell an object of another kind, say which one is quite another shape."""
     there = [scan for scan in made.scans if not scan.reason]
-    if len(there) >= _ENOUGH_TO_JUDGE:
+    if len(there) >= ENOUGH_TO_JUDGE:
         return
     for scan in there:
         if scan.moved and scan.moved[0] > _ANOTHER_SHAPE:

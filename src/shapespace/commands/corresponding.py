@@ -90,11 +90,20 @@ def _summary_of(folder: Path) -> CorrespondenceRecord | None:
         if folder.is_dir() and any(folder.glob(f"*{RECORD}")):
             raise InputError(f"{folder}: the correspondence in it is not finished; {CORRESPOND_AGAIN}.")
         return None
+    return CorrespondenceRecord.from_json(json_of(file), str(file))
+
+
+def json_of(file: Path) -> object:
+    """Return what a JSON file that `correspond` wrote holds.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is not JSON.
+    """
     try:
-        content = json.loads(read_bytes(file))
+        return json.loads(read_bytes(file))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{file} is not JSON, or it is cut short; {CORRESPOND_AGAIN}.") from error
-    return CorrespondenceRecord.from_json(content, str(file))
 
 
 def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,14 +11,14 @@ import numpy as np
 
 from shapespace.batch.results import read_record
 from shapespace.batch.run import naming
-from shapespace.errors import FileError, FileFormatError, ShapespaceError
+from shapespace.commands.corresponding import json_of
+from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.surface import faces_of
-from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, read, to_json
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 
 
 def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
@@ -55,7 +54,7 @@ def info(path: Path) -> dict[str, Any]:
     if path.is_dir() or path.name == CorrespondenceRecord.FILE:
         return {"kind": "correspondence", **correspondence_facts(path if path.is_dir() else path.parent)}
     if path.name.endswith(CorrespondRecord.ENDING):
-        record = read(CorrespondRecord, _json(path), path.name, "run shapespace correspond again")
+        record = read(CorrespondRecord, json_of(path), path.name, CORRESPOND_AGAIN)
         return {"kind": "scan in correspondence", **to_json(record)}
     if path.name.endswith(".json"):
         record = read_record(path)
@@ -110,13 +109,6 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
         "cpu_s": sum(sum(record.cpu_s) for record in records),
         "version": at.run.version,
     }
-
-
-def _json(path: Path) -> object:
-    try:
-        return json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short; run shapespace correspond again.") from error
 
 
 def model_facts(model: ShapeModel) -> dict[str, Any]:

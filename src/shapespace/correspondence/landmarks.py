@@ -19,6 +19,7 @@ import numpy as np
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.mirror import FLIP
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import faces_of, rms_size
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
@@ -114,12 +115,12 @@ class Marks:
             return None
         try:
             T = fit_similarity(own, self.points)
-            mirrored = fit_similarity(own * [-1.0, 1.0, 1.0], self.points)
+            mirrored = fit_similarity(own * FLIP, self.points)
         except InputError:
             return None
         spread = float(np.sqrt(((self.points - self.points.mean(axis=0)) ** 2).sum(axis=1).mean()))
         off = _rms(T.apply(own) - self.points) / spread
-        other = _rms(mirrored.apply(own * [-1.0, 1.0, 1.0]) - self.points) / spread
+        other = _rms(mirrored.apply(own * FLIP) - self.points) / spread
         if len(self.points) > FEWEST and off > _AGREE:
             if other < _MIRROR_SHARE * off:
                 raise InputError(

@@ -12,13 +12,13 @@ from shapespace.correspondence.register import ElasticSettings, Template, regist
 from shapespace.correspondence.template import Glance
 from shapespace.errors import InputError
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.mirror import FLIP
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import faces_of, rms_size
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _UNLIKE = 0.1
 """A template that is this far (RMS, share of its size) from its mirror image is not symmetric."""
-_FLIP = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Mirror:
         Raises:
             InputError: it is nowhere near its mirror image.
         """
-        image = Mesh(mesh.vertices * _FLIP, faces_of(mesh)[:, ::-1], name=mesh.name)
+        image = Mesh(mesh.vertices * FLIP, faces_of(mesh)[:, ::-1], name=mesh.name)
         T = Glance.of(mesh).start(np.array(image.vertices), seed).T_scan_model
         found = register(Template.of(mesh, harmonics), ScanTarget(image), T, settings, seed=seed)
         mirror = Mirror(*on_triangles(image, found.T_scan_template.apply(found.vertices)))
@@ -55,7 +55,7 @@ class Mirror:
 
     def image(self, vertices: FloatArray) -> FloatArray:
         """Return the mirror image (V, 3) of a shape (V, 3) in correspondence with it, in the pose of the shape."""
-        flipped = np.einsum("vc,vcd->vd", self.weights, vertices[self.corners]) * _FLIP
+        flipped = np.einsum("vc,vcd->vd", self.weights, vertices[self.corners]) * FLIP
         return fit_similarity(flipped, vertices).apply(flipped)
 
     def shown(self, seen: FloatArray) -> FloatArray:

@@ -16,12 +16,13 @@ from shapespace.correspondence.landmarks import Marks
 from shapespace.correspondence.register import ElasticSettings, Template, register
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FitError, InputError, ShapespaceError
-from shapespace.fit.dense import dense_surface
+from shapespace.fit.dense import DenseSurface, dense_surface
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start
-from shapespace.geometry.closest import build_engine, on_boundary
+from shapespace.geometry.closest import ClosestPoints, build_engine, on_boundary
+from shapespace.geometry.mirror import FLIP
 from shapespace.geometry.surface import boundary_edges, boundary_vertices, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
@@ -42,7 +43,6 @@ _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
 _FEW_HARMONICS = 4
-_FLIP = np.array([-1.0, 1.0, 1.0])
 _GUIDING = FitConfig(unit="mm", scale="free")
 _MEASURED = 20_000
 _FAR = (np.inf, np.inf, np.inf, np.inf)
@@ -86,7 +86,8 @@ class Placed:
         reason: why there is nothing, where there is nothing; the arrays are then those of the template.
         rivals: what came of other poses that are about as likely.
         mirrored: how far from the template the scan's mirror image lies, as a share of how far the scan does, by what
-            is known for a pose; not-a-number where the pose is told by landmarks.
+            is known for a pose; not-a-number where the pose is known or told by landmarks.
+        by_landmarks: whether they tell the pose.
     """
 
     index: int
@@ -99,6 +100,7 @@ class Placed:
     reason: str = ""
     rivals: tuple[Placed, ...] = ()
     mirrored: float = np.nan
+    by_landmarks: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,11 @@ class Workbench:
         """The template as a shape model, of which the dense stage uses the mean alone."""
         return generic_model(self.mesh, self.harmonics.slowest(_FEW_HARMONICS))
 
+    @cached_property
+    def bare(self) -> Glance:
+        """The template with few vertices, with generic modes alone."""
+        return Glance.of(self.mesh)
+
     def place(self, task: PlaceTask) -> Placed:
         """Return the template on the task's scan; a scan that cannot be reached gives a reason."""
         begun = time.process_time()
@@ -146,15 +153,15 @@ class Workbench:
             ratio = marked.scale * rms_size(self.mesh.vertices) / rms_size(task.scan.vertices)
             if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
                 raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; look at their unit")
-            if T is not None and _is_same_turn(T, marked):
-                return self._from(task, T)
-            return self._from(*self._guided(replace(task, expected=None), marked))
+            told = (task, T) if T is not None and _is_same_turn(T, marked) else None
+            return replace(self._from(*(told or self._guided(replace(task, expected=None), marked))), by_landmarks=True)
         glance, vertices = self.glances[task.glance], np.array(task.scan.vertices)
         start = glance.start(vertices, self.seed)
-        mirrored = glance.start(vertices * _FLIP, self.seed).score_mm / max(start.score_mm, 1e-12)
+        if T is not None:
+            return self._unmarked(task, start)
+        mirrored = glance.start(vertices * FLIP, self.seed).score_mm / max(start.score_mm, 1e-12)
         if self.guide is not None and mirrored < 1.0:  # what a model does not hold it holds of no mirror image either
-            bare = Glance.of(self.mesh)
-            scores = [bare.start(points, self.seed).score_mm for points in (vertices, vertices * _FLIP)]
+            scores = [self.bare.start(points, self.seed).score_mm for points in (vertices, vertices * FLIP)]
             mirrored = max(mirrored, scores[1] / max(scores[0], 1e-12))
         return replace(self._unmarked(task, start), mirrored=mirrored)
 
@@ -210,8 +217,9 @@ class Workbench:
         )  # fmt: skip
         start = found.T_scan_template.apply(found.vertices)
         dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
-        seen = self._shown(dense.vertices_scan_mm, dense.seen, target, task.settings.normal_cosine)
-        covered, distance = self._judged(dense.vertices_scan_mm, seen, target)
+        near = target.engine.query(dense.vertices_scan_mm)
+        seen = self._shown(dense, near, target, task.settings.normal_cosine)
+        covered, distance = self._judged(dense.vertices_scan_mm, near.distance[seen], target)
         back = found.T_scan_template.inverse()
         mean, p95, p99, largest = (back.scale * length for length in distance)
         return Placed(
@@ -219,23 +227,29 @@ class Workbench:
             (mean, p95, p99, largest), 0.0,
         )  # fmt: skip
 
-    def _shown(self, vertices: FloatArray, believed: BoolArray, target: ScanTarget, cosine: float) -> BoolArray:
+    def _shown(self, dense: DenseSurface, near: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
         """Return (V,) which vertices the scan shows: those that lie on it, believed by the dense stage or on no rim.
 
         On a clean scan that stage drops what lies off it by little; what it believes on a rim goes on beyond it.
         """
         if target.mesh.faces is None:
-            return believed
-        near = target.engine.query(vertices)
+            return dense.seen
         reached = near.distance < REACHED * self.template.size_mm
-        alike = np.einsum("vd,vd->v", vertex_normals(self.mesh.with_vertices(vertices)), target.normals[near.vertex])
+        normals = vertex_normals(self.mesh.with_vertices(dense.vertices_scan_mm))
+        alike = np.einsum("vd,vd->v", normals, target.normals[near.vertex])
         inside = (alike > cosine) & ~on_boundary(near, target.mesh, target.rim)
-        return np.asarray(reached & (believed | inside))
+        return np.asarray(reached & (dense.seen | inside))
 
     def _judged(
-        self, vertices: FloatArray, seen: BoolArray, target: ScanTarget
+        self, vertices: FloatArray, forward: FloatArray, target: ScanTarget
     ) -> tuple[float, tuple[float, float, float, float]]:
-        """Return the share of the scan that is reached, and distances both ways over what both show."""
+        """Return the share of the scan that is reached, and distances both ways over what both show.
+
+        Args:
+            vertices: (V, 3) of the surface.
+            forward: of those that are seen, to the scan.
+            target: the scan.
+        """
         surface = Mesh(vertices, self.mesh.faces)
         rng = np.random.default_rng(self.seed)
         points = target.mesh.vertices
@@ -245,7 +259,6 @@ class Workbench:
         beyond = on_boundary(back, surface, boundary_vertices(surface))
         limit = REACHED * self.template.size_mm
         covered = float((back.distance[~beyond] < limit).mean()) if not beyond.all() else 0.0
-        forward = target.engine.query(vertices[seen]).distance if seen.any() else np.empty(0)
         both = np.concatenate([forward, back.distance[~beyond]])
         if not len(both):
             return 0.0, _FAR

@@ -32,7 +32,7 @@ from shapespace.types import FloatArray, Mesh, Similarity
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
 FEWEST = 2
-_ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
+ENOUGH_TO_JUDGE, _ENOUGH_TO_SETTLE = 6, 4
 _PARTS = 4
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
 """Who shows more than this share of the template tells what size is usual; the least standard deviation of sizes; and
@@ -307,7 +307,7 @@ class _State:
     def bench(self) -> Workbench:
         """Return what its tasks share."""
         order = sorted(self.placed)
-        if len(order) < _ENOUGH_TO_JUDGE:
+        if len(order) < ENOUGH_TO_JUDGE:
             guide = None if self.placed else self.guide
             glance = Glance.of(self.template) if guide is None else Glance(guide)
             return Workbench(self.template, self.harmonics, (glance,), self.settings.seed, guide)
@@ -339,7 +339,7 @@ class _State:
         return i % _PARTS
 
     def _task(self, i: int) -> PlaceTask:
-        part = self._part(i) if len(self.placed) >= _ENOUGH_TO_JUDGE else 0
+        part = self._part(i) if len(self.placed) >= ENOUGH_TO_JUDGE else 0
         marks = Marks.shared(self.places, self.scans[i], self.settings.landmark_uncertainty)
         if i not in self.placed:
             return PlaceTask(i, self.scans[i], None, None, self.settings.first, part, marks)
@@ -384,8 +384,7 @@ class _State:
 
     def _doubt(self, placed: Placed) -> str:
         """Return what else may be wrong with a scan whose pose its landmarks tell."""
-        told = bool(self.scans[placed.index].landmarks) and np.isnan(placed.mirrored)
-        return "; or its landmarks, which tell its pose, have wrong names" if told else ""
+        return "; or its landmarks, which tell its pose, have wrong names" if placed.by_landmarks else ""
 
     def _settle_rivals(self) -> None:
         """Where several poses were about as likely, take the one whose shape the scans of sure pose tell best."""
@@ -402,7 +401,7 @@ class _State:
 
     def _set_strange_aside(self, order: Sequence[int]) -> None:
         """Set aside what is like no other in `order`, measured by what the others say of it."""
-        if len(order) < _ENOUGH_TO_JUDGE:
+        if len(order) < ENOUGH_TO_JUDGE:
             return
         shapes, seen = self._stacked(order)
         shapes, _ = aligned(shapes, seen, self.template.vertices)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapespace.geometry.mirror import FLIP
 from shapespace.types import FloatArray, IntArray
 
 _WAVES = 96
-_FLIP = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Warp:
         out = x * (stretch / stretch.prod() ** (1 / 3) - 1.0)
         for length_mm, stddev_mm in self.fields:
             one = _field(x, length_mm, rng)
-            other = one[mirror] * _FLIP
+            other = one[mirror] * FLIP
             out += stddev_mm / np.sqrt(2.0) * (one + other + self.lopsided * (one - other))
         return out
 

@@ -10,6 +10,8 @@ from shapespace.types import FloatArray, IntArray
 
 _OFF = 0.01
 """A surface whose mirror image lies within this share of its size is taken for symmetric."""
+FLIP = np.array([-1.0, 1.0, 1.0])
+"""What turns points (..., 3) into their mirror images about x = 0."""
 
 
 def mirror_vertices(vertices: FloatArray) -> IntArray:
@@ -22,7 +24,7 @@ def mirror_vertices(vertices: FloatArray) -> IntArray:
         InputError: the surface is not its own mirror image, or its vertices do not pair up.
     """
     centred = vertices - vertices.mean(axis=0) * [0.0, 1.0, 1.0]
-    found = cKDTree(centred).query(centred * [-1.0, 1.0, 1.0])
+    found = cKDTree(centred).query(centred * FLIP)
     distance, other = np.asarray(found[0]), np.asarray(found[1], dtype=np.int32)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))
     if distance.max() > _OFF * size or (other[other] != np.arange(len(other))).any():
@@ -37,4 +39,4 @@ def mirrored(vertices: FloatArray, other: IntArray) -> FloatArray:
         vertices: of the surfaces.
         other: (V,) from `mirror_vertices`.
     """
-    return vertices[..., other, :] * [-1.0, 1.0, 1.0]
+    return vertices[..., other, :] * FLIP

@@ -18,10 +18,9 @@ from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.report.saved import Folder
 from shapespace.report.wording import printable, without_folders
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, read
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
-_AGAIN = "run shapespace correspond again"
 _FEWEST_VERTICES = 3
 _ONE_UNIT = 5.0
 _POSED_ALIKE = 0.8
@@ -75,12 +74,12 @@ class Corresponded:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = Folder(folder, _AGAIN)
+        self.folder = Folder(folder, CORRESPOND_AGAIN)
         summary = CorrespondenceRecord.FILE
-        self.run = read(CorrespondenceRecord, self.folder.json(summary), summary, _AGAIN)
+        self.run = read(CorrespondenceRecord, self.folder.json(summary), summary, CORRESPOND_AGAIN)
         self._mean = self.folder.mesh(CorrespondenceRecord.MEAN)
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
-            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {_AGAIN}.")
+            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
         found = [record for file in self._record_files() if (record := self._record(file)) is not None]
         self.records = {record.name: record for record in found}
@@ -127,10 +126,12 @@ class Corresponded:
         """
         mesh = self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}")
         if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
-            raise FileFormatError(f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {_AGAIN}.")
+            raise FileFormatError(
+                f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."
+            )
         if there_are(mesh.vertices).sum() < _FEWEST_VERTICES:
             raise FileFormatError(
-                f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {_AGAIN}."
+                f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
             )
         return mesh
 
@@ -147,7 +148,7 @@ class Corresponded:
             T = fit_similarity(self.mean.vertices[seen], own[seen])
         except ShapespaceError as error:
             raise FileFormatError(
-                f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {_AGAIN}."
+                f"{name}{CorrespondRecord.SURFACE} cannot be laid onto the mean shape; {CORRESPOND_AGAIN}."
             ) from error
         return Placed(np.where(seen[:, None], T.inverse().apply(own), np.nan), T)
 
@@ -220,9 +221,9 @@ class Corresponded:
     def _record(self, file: str) -> CorrespondRecord | None:
         name = file.removesuffix(CorrespondRecord.ENDING)
         try:
-            record = read(CorrespondRecord, self.folder.json(file), file, _AGAIN)
+            record = read(CorrespondRecord, self.folder.json(file), file, CORRESPOND_AGAIN)
             if record.name != name:
-                raise FileFormatError(f"{file} is the record of another scan, {record.name}; {_AGAIN}.")
+                raise FileFormatError(f"{file} is the record of another scan, {record.name}; {CORRESPOND_AGAIN}.")
         except ShapespaceError as error:
             self.unread[printable(name)] = str(error)
             return None

@@ -38,7 +38,7 @@ from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder
 from shapespace.report.staged import nice_ceiling
 from shapespace.report.wording import DASH, counted, listed, percent, plain, setting, words
-from shapespace.schemas import CorrespondRecord, Quality, read
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
@@ -71,7 +71,7 @@ class CorrespondencePage:
     def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
         self.at = Corresponded(folder.root)
         if not self.at.records:
-            raise FileFormatError(f"{folder.root} holds no record of a scan; run shapespace correspond again.")
+            raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
         together = len(self.at.corresponding)
         self.page = Page(together + min(len(self.at.records), MOST_CARDS) + 5, on_step)
         self.all = self.at.population(self.page.step)
