@@ -1,6 +1,5 @@
 import csv
 from collections.abc import Mapping
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch import run
-from shapespace.batch.run import EXECUTORS, Job, fit_files, make_executor, make_jobs
-from shapespace.errors import FileError, FitError
+from shapespace.batch import fit_work
+from shapespace.batch.executors import Local
+from shapespace.batch.fit_work import Job
+from shapespace.batch.run import fit_files, make_jobs
+from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -69,7 +70,9 @@ def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: li
     assert not [name for name in written if name.startswith(".")]
 
 
-def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+def test_an_interruption_loses_nothing_that_was_done(
+    model: ShapeModel, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(job: Job, record: Mapping[str, Any]) -> None:
         raise KeyboardInterrupt
 
@@ -79,12 +82,8 @@ def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: l
     assert row["scan"] == "scan0"
     assert np.isfinite(float(row["b1"]))
 
-    again: list[str] = []
-    original, run.fit_file = run.fit_file, lambda job, *a, **k: (again.append(job.name), original(job, *a, **k))[1]
-    try:
-        records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
-    finally:
-        run.fit_file = original
+    again = count_fits(monkeypatch)
+    records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
     assert again == ["scan1", "scan2"]
     assert [r["scan"]["name"] for r in records] == ["scan0.ply", "scan1.ply", "scan2.ply"]
     assert [r["scan"] for r in table(tmp_path)] == ["scan0", "scan1", "scan2"]
@@ -107,35 +106,9 @@ def test_resume_keeps_what_still_holds_and_only_that(
         (out / "s.fit.json").write_text('{"format": "shapespace fit"')
     elif changed == "surface":
         (out / "s.fitted.ply").unlink()
-    calls: list[str] = []
-    original = run.fit_file
-    monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
+    calls = count_fits(monkeypatch)
     fit_files(make_jobs([scan]), model, Path("m"), out, config, resume=True)
     assert calls == ([] if changed == "nothing" else ["s"])
-
-
-@pytest.mark.parametrize("kind", EXECUTORS)
-def test_every_executor_gives_what_one_after_the_other_gives(
-    kind: str, model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
-) -> None:
-    jobs = make_jobs(with_a_bad_one(scans, tmp_path))
-    here = fit_files(jobs, model, Path("blob.h5"), tmp_path / "here", CONFIG)
-    done: list[str] = []
-    with make_executor(model_path, 2, kind) as executor:
-        there = fit_files(
-            jobs, model, Path("blob.h5"), tmp_path / "there", CONFIG, executor=executor,
-            on_done=lambda job, _: done.append(job.name),
-        )  # fmt: skip
-    assert [without_times(r) for r in there] == [without_times(r) for r in here]
-    assert sorted(done) == sorted(job.name for job in jobs)
-    for name in ("coefficients.csv", "scan0.fitted.ply", "scan2.fitted.ply"):
-        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
-
-
-def test_a_worker_without_a_model_says_so(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
-    run._model = None
-    with ThreadPoolExecutor(1) as executor, pytest.raises(FileError, match="no model"):
-        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, executor=executor)
 
 
 def test_each_scan_is_called_by_its_file_where_no_other_has_that_name() -> None:
@@ -205,8 +178,8 @@ def test_a_scan_given_twice_is_fitted_once(
 
 def count_fits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
-    original = run.fit_file
-    monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
+    original = fit_work.fit_file
+    monkeypatch.setattr(fit_work, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
     return calls
 
 
@@ -259,31 +232,11 @@ def test_an_interruption_waits_for_what_runs_and_the_table_has_it(
     for k, path in enumerate(many):
         path.write_bytes(scans[k % 3].read_bytes())
     out = tmp_path / "out"
-    with make_executor(model_path, 3, "threads") as executor, pytest.raises(KeyboardInterrupt):
-        fit_files(make_jobs(many), model, model_path, out, CONFIG, executor=executor, on_done=stop)
+    with pytest.raises(KeyboardInterrupt):
+        fit_files(make_jobs(many), model, model_path, out, CONFIG, executor=Local(3), on_done=stop)
     records = {path.name.removesuffix(".fit.json") for path in out.glob("*.fit.json")}
     assert 2 <= len(records) < 12, "the others were running when it stopped"
     assert {row["scan"] for row in table(out)} == records
-
-
-class KillsOne(ThreadPoolExecutor):
-    """Runs all fits, and then has lost the first worker."""
-
-    def submit(self, *arguments: Any, **options: Any) -> Any:
-        future = super().submit(*arguments, **options)
-        future.result()
-        lost: Future[Any] = Future()
-        lost.set_exception(BrokenExecutor("A process was terminated abruptly."))
-        return lost
-
-
-def test_what_was_written_before_a_worker_was_killed_is_in_the_table(
-    model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
-) -> None:
-    run._load_model(model_path)
-    with KillsOne(1) as executor, pytest.raises(FitError, match="--resume"):
-        fit_files(make_jobs(scans), model, model_path, tmp_path, CONFIG, executor=executor)
-    assert [row["scan"] for row in table(tmp_path)] == ["scan0", "scan1", "scan2"]
 
 
 DENSE = replace(CONFIG, dense=True)

@@ -17,7 +17,7 @@ from shapespace.io.meshes import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
 # Buffered output, as users have it, meets a full disk only when it is flushed.
-STOPPED = "shapespace: stopped; the files written so far are whole; the same command with --resume goes on from there."
+STOPPED = "shapespace: stopped; the files written so far are whole; the same command goes on from there."
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from viewer_world import Start, drop, model, scan_file, sentence, start, told
 
-from shapespace.batch.run import Job, fit_file
+from shapespace.batch.fit_work import Job, fit_file
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import read_mesh
