@@ -12,12 +12,13 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from viewer_world import served
+from viewer_world import enter, served
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
 from shapespace.viewer import surfaces as module
-from shapespace.viewer.guard import SECURITY_HEADERS
+from shapespace.viewer.guard import SECURITY_HEADERS, Access
+from shapespace.viewer.limits import Limits
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
@@ -46,9 +47,12 @@ def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 @contextmanager
-def opened(surfaces: Surfaces, token: str | None = None) -> Iterator[httpx.Client]:
-    app = make_surfaces_app(surfaces, token=token)
+def opened(surfaces: Surfaces, token: str = "secret", *, known: bool = True) -> Iterator[httpx.Client]:
+    access = Access(Limits(), token)
+    app = make_surfaces_app(surfaces, access=access)
     with served(app) as address, httpx.Client(base_url=address, timeout=60) as client:
+        if known:
+            enter(client, access)
         yield client
 
 
@@ -131,10 +135,10 @@ def test_only_its_own_page_may_ask_and_only_read(client: httpx.Client) -> None:
 
 
 def test_with_a_token_nothing_is_answered_without_it(template: Path) -> None:
-    with opened(Surfaces(template), token="secret") as stranger:
+    with opened(Surfaces(template), token="secret", known=False) as stranger:
         for path in ("/", "/api/about", "/api/mean", "/api/surfaces", "/api/surfaces/able", "/assets/surfaces.js"):
             assert stranger.get(path).status_code == 401
-        assert stranger.get("/?token=secret").status_code == 200
+        assert stranger.get("/?token=secret").status_code == 303
         assert stranger.get("/api/about").status_code == 200  # the cookie
 
 
