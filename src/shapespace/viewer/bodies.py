@@ -60,10 +60,10 @@ class Bodies:
                     raise HTTPException(408, _SLOW) from None
                 if piece is None:
                     return
-                size += len(piece)
-                if size > most:
+                if size + len(piece) > most:
                     raise HTTPException(413, too_large)
                 self.check_room(len(piece))
+                size += len(piece)
                 self._coming_bytes += len(piece)
                 yield piece
         finally:
