@@ -134,6 +134,30 @@ def test_only_its_own_page_may_ask_and_only_read(client: httpx.Client) -> None:
         assert client.request(method, "/api/surfaces").status_code == 405
 
 
+def test_nonsense_in_a_header_is_refused_in_a_sentence(client: httpx.Client) -> None:
+    for origin in ("http://[", "http://", "[", "null"):
+        refused = client.get("/api/mean", headers={"origin": origin})
+        assert refused.status_code == 403 and refused.json()["error"].endswith(".")
+    assert client.get("/", headers={"range": "bytes=x"}).status_code == 200
+
+
+def test_a_bad_record_is_listed_with_its_reason_and_hides_no_other(template: Path, tmp_path: Path) -> None:
+    shutil.copytree(template.parent, tmp_path / "w")
+    folder = tmp_path / "w" / "same"
+    record = json.loads((folder / "able.correspond.json").read_text())
+    bad = {"area_factor": -1.0, "seen_share": 1e999, "distance_p99": -1e999, "unit_ratio": "one"}
+    for key, value in bad.items():
+        text = json.dumps(record | {"name": key, key: value}).replace("Infinity", "1e999")
+        (folder / f"{key}.correspond.json").write_text(text)
+        shutil.copy(folder / "able.corresponding.ply", folder / f"{key}.corresponding.ply")
+    with opened(Surfaces(folder)) as one:
+        rows = {row["name"]: row for row in one.get("/api/surfaces").json()}
+        assert one.get("/api/mean").status_code == 200
+    assert {*NAMES, *bad} <= {*rows}
+    for key in ("area_factor", "unit_ratio"):
+        assert rows[key]["status"] == "unreadable" and f"{key}.correspond.json" in rows[key]["told"]
+
+
 def test_with_a_token_nothing_is_answered_without_it(template: Path) -> None:
     with opened(Surfaces(template), token="secret", known=False) as stranger:
         for path in ("/", "/api/about", "/api/mean", "/api/surfaces", "/api/surfaces/able", "/assets/surfaces.js"):

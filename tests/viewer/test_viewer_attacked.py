@@ -147,16 +147,14 @@ def test_a_bad_record_is_listed_with_its_reason_and_hides_no_other(
         assert 400 <= visitor.post("/api/export?format=ply", json={"fit": name}).status_code < 500
 
 
-def test_numbers_that_are_none_are_sent_as_none(start: Start, model: ShapeModel, tmp_path: Path) -> None:
-    results = fits(tmp_path, model)
-    far = {"mean": float("inf"), "p95": float("-inf")}
-    write(
-        results,
-        "odd",
-        {"evidence": {"expected_error_mm": float("inf")}, "distances_mm": {"final": {"scan_to_model": far}}},
-    )
+def test_numbers_that_are_none_are_sent_as_none_or_refused(start: Start, model: ShapeModel, tmp_path: Path) -> None:
+    results, inf = fits(tmp_path, model), float("inf")
+    far = {"final": {"scan_to_model": {"mean": inf, "p95": -inf}}}
+    write(results, "odd", {"evidence": {"expected_error_mm": inf}, "distances_mm": far})
+    write(results, "shape", {"z": [inf]})
     rows = {row["name"]: row for row in start(Shown.open(results)).visitor().get("/api/fits").json()}
     assert rows["odd"]["expected_error_mm"] is None and rows["odd"]["scan_to_model_mm"] is None
+    assert rows["shape"]["status"] == "unreadable" or rows["shape"]["z"] == [None]
 
 
 def test_whatever_goes_wrong_with_one_fit_stays_with_it(
