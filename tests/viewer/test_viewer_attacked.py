@@ -1,6 +1,7 @@
 """The viewer under attack: nonsense in headers and records, visitors that crowd others out, requests without an end."""
 
 import json
+import re
 import socket
 import time
 import webbrowser
@@ -289,6 +290,32 @@ def test_an_answer_that_nobody_takes_is_neither_held_nor_kept(connect: Any) -> N
         time.sleep(1.2)
         assert len(ended(stuck, 3)) < len(whole)
         assert httpx.get(address).content == whole
+
+
+def test_the_document_tells_the_limits() -> None:
+    limits = Limits()
+    text = (Path(__file__).parents[2] / "docs" / "viewer.md").read_text(encoding="utf-8")
+    _, _, told = text.partition("## What it takes of the machine")
+    cells = [
+        [cell.strip() for cell in line.split("|")[2:3]]
+        for line in told.split("\n## ")[0].splitlines()
+        if line[:1] == "|"
+    ]
+    numbers = [re.findall(r"\d+", cell.replace(",", "")) for (cell,) in cells[2:]]
+    assert [[int(number) for number in row] for row in numbers] == [
+        [limits.upload_bytes // 2**20],
+        [limits.all_bytes // 2**30],
+        [limits.body_s, limits.stalled_s],
+        [limits.visitors],
+        [limits.onlookers],
+        [limits.unfinished],
+        [limits.kept],
+        [limits.fit_s, limits.unwatched_s],
+        [limits.connections],
+        [limits.quiet_s],
+    ]
+    assert f"After {limits.guesses} wrong tokens one a second" in text and limits.guess_s == 1
+    assert "within a minute" in text and limits.ticket_s == 60
 
 
 def test_the_browser_is_started_with_a_ticket_and_the_token_is_only_printed(
