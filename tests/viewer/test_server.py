@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from http.client import HTTPConnection
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
@@ -18,6 +19,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer import guard
 from shapespace.viewer.fitting import Upload
 from shapespace.viewer.serve import listen, page_address, serve
 from shapespace.viewer.shown import Shown, without_folders
@@ -233,25 +235,34 @@ def test_nothing_is_answered_without_the_token(start: Start, local: bool) -> Non
     assert invited.get("/api/about").status_code == 200 and drop(invited, b"").status_code == 201
 
 
-def test_wrong_tokens_are_looked_at_slowly_and_hold_nobody_up_who_is_in(start: Start) -> None:
-    viewer = start(guesses=3, guess_s=0.5)
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What the guard takes for the time, in seconds."""
+    now = [1000.0]
+    monkeypatch.setattr(guard, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
+
+
+def test_wrong_tokens_are_looked_at_slowly_and_hold_nobody_up_who_is_in(start: Start, clock: list[float]) -> None:
+    viewer = start(guesses=3, guess_s=1.0)
     visitor, stranger = viewer.visitor(), viewer.outsider()
     answers = [stranger.get(f"/?token={k}") for k in range(8)]
     assert [answer.status_code for answer in answers] == [401] * 3 + [429] * 5
     right = stranger.get("/", params={"token": viewer.access.token})
     assert right.status_code == 429 and "wait" in sentence(right)  # or guesses would tell by it
     assert visitor.get("/").status_code == 200 and visitor.get("/api/about").status_code == 200
-    time.sleep(0.6)
+    clock[0] += 1.1
+    assert [stranger.get("/?token=x").status_code for _ in range(2)] == [401, 429]
+    clock[0] += 1.1
     assert stranger.get("/", params={"token": viewer.access.token}).status_code == 303
 
 
-def test_the_ticket_that_opens_the_browser_is_good_once_and_for_a_while(start: Start) -> None:
-    viewer = start(ticket_s=0.2)
+def test_the_ticket_that_opens_the_browser_is_good_once_and_for_a_while(start: Start, clock: list[float]) -> None:
+    viewer = start(ticket_s=60.0)
     ticket = viewer.access.ticket()
-    assert viewer.outsider().get(f"/?token={ticket}").status_code == 303
-    assert viewer.outsider().get(f"/?token={ticket}").status_code == 401
+    assert [viewer.outsider().get(f"/?token={ticket}").status_code for _ in range(2)] == [303, 401]
     late = viewer.access.ticket()
-    time.sleep(0.3)
+    clock[0] += 61
     assert viewer.outsider().get(f"/?token={late}").status_code == 401
 
 

@@ -34,7 +34,7 @@ MANY = settings(
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 LIMITS = Limits(
-    upload_bytes=5000, all_bytes=20_000, stalled_s=0.05, body_s=0.2, quiet_s=0.05, visitors=50, guesses=10**6
+    upload_bytes=5000, all_bytes=20_000, stalled_s=0.05, body_s=0.2, quiet_s=0.3, visitors=50, guesses=10**6
 )
 
 

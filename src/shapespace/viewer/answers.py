@@ -52,19 +52,22 @@ def answer(content: object, status: int = 200) -> Response:
     return JSONResponse(to_json(content), status)
 
 
-def binary(content: bytes) -> Response:
-    """Return `content`, handed on as it is taken, so that who takes none of it holds next to nothing."""
+def binary(content: bytes, name: str | None = None) -> StreamingResponse:
+    """Return `content`, handed on as it is taken, so that who takes none of it holds next to nothing.
+
+    Args:
+        content: of the answer.
+        name: of the file that it is to be saved as; None for what the page itself takes.
+    """
+    headers = {"Content-Length": str(len(content))}
+    if name is not None:
+        headers["Content-Disposition"] = f'attachment; filename="{name}"'
 
     async def pieces() -> AsyncGenerator[bytes]:
         for start in range(0, len(content), _PIECE):
             yield content[start : start + _PIECE]
 
-    return StreamingResponse(pieces(), media_type=BINARY, headers={"Content-Length": str(len(content))})
-
-
-def download(content: bytes, name: str) -> Response:
-    """Return `content` as a file to be saved as `name`."""
-    return Response(content, media_type=BINARY, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    return StreamingResponse(pieces(), media_type=BINARY, headers=headers)
 
 
 def application(routes: list[Route], lifespan: Any, told: Callable[[str], str]) -> Starlette:

@@ -27,6 +27,7 @@ def server_config(app: object, limits: Limits) -> uvicorn.Config:
         log_level="error",
         access_log=False,
         server_header=False,
+        proxy_headers=False,
         timeout_graceful_shutdown=3,
         timeout_keep_alive=round(limits.quiet_s) or 1,
         ws="none",

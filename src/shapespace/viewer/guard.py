@@ -46,8 +46,8 @@ class Access:
     """What lets a visitor in: a token or a ticket in the address, which are exchanged for a cookie.
 
     The token is in the address that is printed. The browser is started with a ticket, which is good for one use: other
-    users of the machine can see what a program is started with. The cookie is a secret of its own, so that whoever has
-    it is not held up by the wrong guesses of others.
+    users of the machine can see what a program is started with. The cookie is a secret of its own and is
+    looked at every time, so that whoever has it is not held up by the wrong guesses of others.
 
     Args:
         limits: how many wrong guesses are looked at, and how long a ticket is good for.

@@ -29,7 +29,7 @@ from shapespace.report import colours
 from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.version import __version__
-from shapespace.viewer.answers import PAGES, answer, application, asset, binary, download
+from shapespace.viewer.answers import PAGES, answer, application, asset, binary
 from shapespace.viewer.bodies import Bodies
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
 from shapespace.viewer.guard import Access, Guard, cookie
@@ -191,7 +191,7 @@ class _Viewer:
             raise HTTPException(400, f"There is no export as {kind[:20]!r}; choose one of {', '.join(EXPORTS)}.")
         question = await self._question(request)
         content = await asyncio.to_thread(self._exported, kind, question, self._session(request))
-        return download(content, f"shape.{kind}")
+        return binary(content, f"shape.{kind}")
 
     def _exported(self, kind: str, question: Mapping[str, Any], session: Session | None) -> bytes:
         mesh = self._asked_mesh(question, session)
@@ -283,7 +283,7 @@ class _Viewer:
         path = self._own_scan(request).folder / f"{NAME}.fit.json"
         if not path.is_file():
             raise HTTPException(404, "This scan has no result yet.")
-        return download(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
+        return binary(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
 
     async def landmarks(self, request: Request) -> Response:
         session, scan = self._own_session(request), self._own_scan(request)

@@ -14,7 +14,7 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from shapespace.viewer.answers import PAGES, answer, application, asset, binary, download
+from shapespace.viewer.answers import PAGES, answer, application, asset, binary
 from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.surfaces import Surfaces
 
@@ -93,4 +93,4 @@ class _Viewer:
         if not all(part.isascii() and part.isdigit() for part in given):
             raise HTTPException(400, "Give the numbers of vertices with commas between them.")
         text = await asyncio.to_thread(self._surfaces.places, [int(part) for part in given])
-        return download(text.encode(), "places.csv")
+        return binary(text.encode(), "places.csv")
