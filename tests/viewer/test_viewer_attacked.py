@@ -1,5 +1,6 @@
 """The viewer under attack: nonsense in headers and records, visitors that crowd others out, requests without an end."""
 
+import errno
 import json
 import re
 import socket
@@ -204,6 +205,26 @@ def until(true: Callable[[], object], seconds: float = 15) -> None:
     while not true():
         assert time.monotonic() < ends
         time.sleep(0.02)
+
+
+def test_a_full_disk_is_one_sentence_and_takes_nobodys_place(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = start(worker=agrees, unfinished=1)
+    visitor = viewer.visitor()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(viewer.root))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Sessions, "new_folder", full)
+        patch.setattr("tempfile.mkdtemp", full)
+        for answer in (
+            drop(visitor, b"x"),
+            drop(visitor, b"x"),
+            visitor.post("/api/export?format=ply", json={"z": []}),
+        ):
+            assert answer.status_code == 507 and "No space left" in sentence(answer)
+            assert str(viewer.root) not in answer.text
+    assert drop(visitor, b"x").status_code == 201
 
 
 @pytest.mark.parametrize("trickle", [b"", b"x"])

@@ -35,6 +35,7 @@ ASSETS: Mapping[str, tuple[Path, str]] = {
 BINARY = "application/octet-stream"
 _PLAIN = {"Not Found": "There is nothing at this address.", "Method Not Allowed": "This cannot be done here."}
 _PIECE = 2**18
+_DISK = "The server could not store what this needs: {}; free some space there and try again."
 _BROKEN = "The server met an error of its own; look at the terminal where it runs, and reload the page."
 
 
@@ -83,7 +84,13 @@ def _handlers(told: Callable[[str], str]) -> dict[Any, Callable[[Request, Except
     async def sentence(_: Request, error: Exception) -> Response:
         return refusal(422, told(str(error)))
 
-    return {HTTPException: _http, ShapespaceError: sentence, ClientDisconnect: _left, Exception: _broken}
+    return {
+        HTTPException: _http,
+        ShapespaceError: sentence,
+        ClientDisconnect: _left,
+        OSError: _disk,
+        Exception: _broken,
+    }
 
 
 async def _http(_: Request, error: Exception) -> Response:
@@ -93,6 +100,11 @@ async def _http(_: Request, error: Exception) -> Response:
 
 async def _left(_: Request, error: Exception) -> Response:
     return refusal(400, "The upload ended early.")
+
+
+async def _disk(_: Request, error: Exception) -> Response:
+    assert isinstance(error, OSError)
+    return refusal(507, _DISK.format(error.strerror or "its disk failed"))
 
 
 async def _broken(_: Request, error: Exception) -> Response:

@@ -43,7 +43,6 @@ _LONGEST_NAME = 120
 _FEWEST_LANDMARKS = 3
 _NO_SCAN = "There is no such scan; it was removed, or it never was yours."
 _NO_SESSION = "This visit has ended, and its scans were removed; reload the page."
-_DISK = "The server could not store the scan: {}; free some space there and drop it again."
 
 Endpoint: TypeAlias = Callable[[Request], Coroutine[Any, Any, Response]]
 
@@ -244,8 +243,8 @@ class _Viewer:
         self._bodies.check_room(int(announced))
         if not self._sessions.has_room(session):
             raise HTTPException(503, f"{limits.visitors} visitors have scans here, as many as may; try again later.")
-        session.uploading += 1
         folder = self._sessions.new_folder()
+        session.uploading += 1
         try:
             # A name of our own: what the visitor calls the file never becomes a path.
             path = folder / f"upload-{secrets.token_hex(4)}{ending}"
@@ -330,15 +329,11 @@ class _Viewer:
     async def _receive(self, request: Request, path: Path, too_large: str) -> int:
         """Write the body of `request` to `path`, and return how many bytes it has."""
         size = 0
-        try:
-            with path.open("xb") as file:
-                async with aclosing(
-                    self._bodies.pieces(request, self._sessions.limits.upload_bytes, too_large)
-                ) as pieces:
-                    async for piece in pieces:
-                        size += file.write(piece)
-        except OSError as error:
-            raise HTTPException(507, _DISK.format(error.strerror or error)) from error
+        most = self._sessions.limits.upload_bytes
+        with path.open("xb") as file:
+            async with aclosing(self._bodies.pieces(request, most, too_large)) as pieces:
+                async for piece in pieces:
+                    size += file.write(piece)
         return size
 
     async def _question(self, request: Request) -> Mapping[str, Any]:
