@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol, TypeVar
@@ -29,6 +29,7 @@ ATTEMPTS = 2
 GRACE_S = 5.0
 """What runs when a run is stopped may end within this; a second Ctrl-C ends it at once."""
 _STARTS = 3
+_NO_START = "The system ends worker processes as they start; use --jobs 1, or free some memory."
 
 
 class Work(Protocol[TaskT, AnswerT]):
@@ -175,7 +176,7 @@ class _Team:
     def _not_started(self) -> None:
         self._failed_starts += 1
         if self._failed_starts >= _STARTS:
-            raise FitError("The system ends worker processes as they start; use --jobs 1, or free some memory.")
+            raise FitError(_NO_START)
 
     def stop(self) -> None:
         """Let what runs end for a moment, then end every worker."""
@@ -187,6 +188,63 @@ class _Team:
         finally:
             while self._doing:
                 self._dismiss(next(iter(self._doing)))
+
+
+class Child:
+    """One worker that is given tasks one at a time, and started again when it dies.
+
+    Args:
+        work: what it does.
+        timeout_s: a task that takes longer is given up; None for no limit.
+    """
+
+    def __init__(self, work: Work[Any, Any], timeout_s: float | None) -> None:
+        self._work, self._timeout_s = work, timeout_s
+        self._worker: Worker | None = None
+        self._life = ExitStack()
+        self._line = self._life.enter_context(life_line())
+
+    def do(self, task: Any) -> Any:
+        """Return what comes of a task.
+
+        Raises:
+            FitError: no process can be started.
+            ShapespaceError: that `work` raised.
+        """
+        for attempt in range(1, ATTEMPTS + 1):
+            worker = self._started()
+            worker.give(task)
+            late = not worker.line.poll(self._timeout_s)
+            answer = worker.answer()
+            if answer is not None:
+                return _value(answer)
+            self._worker = None
+            death = _Death(worker.stop(), self._timeout_s if late else None)
+            if late or attempt == ATTEMPTS:
+                return self._work.give_up(task, str(death))
+        raise AssertionError
+
+    def stop(self) -> None:
+        """End the worker."""
+        if self._worker is not None:
+            self._worker.stop()
+        self._life.close()
+
+    def _started(self) -> Worker:
+        for _ in range(_STARTS):
+            if self._worker is not None:
+                return self._worker
+            start_loading(tell=False)
+            wait_until_loaded()
+            worker = Worker(_serve, (self._work,), self._line)
+            worker.line.poll(None)
+            if worker.answer() is None:
+                worker.stop()
+            else:
+                self._worker = worker
+        if self._worker is None:
+            raise FitError(_NO_START)
+        return self._worker
 
 
 @dataclass(frozen=True)

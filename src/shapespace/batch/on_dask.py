@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from threadpoolctl import threadpool_limits
-
+from shapespace.batch.executors import Child
 from shapespace.errors import FitError, InputError, ShapespaceError
 
 if TYPE_CHECKING:
@@ -28,6 +26,8 @@ LARGEST_CHUNK = 50
 AHEAD = 2
 """Chunks that wait at each worker beside the one that it does."""
 FINDS_S = 30.0
+WORKERS_S = 600.0
+"""A queue may take so long to start the first worker."""
 _LOST = "its workers ended again and again, most likely for lack of memory; thin it"
 
 
@@ -38,8 +38,7 @@ class OnDask:
     Args:
         cluster: address of the scheduler, path of its scheduler file, a `distributed.Client` that is open already, or
             empty for a cluster of this machine as Dask's configuration has it.
-        timeout_s: a task that takes longer is given up, and its worker, which a nanny starts again, ended; None for no
-            limit.
+        timeout_s: a task that takes longer is given up; None for no limit.
     """
 
     cluster: str | Client = ""
@@ -107,8 +106,11 @@ class _Run:
         left = iter(chunks)
         ended: Any = as_completed(self._submit(left, at_a_time), raise_errors=False)
         for future in ended:
+            if future.status == "lost":  # its worker died with the answer, and another one does it again
+                ended.add(future)
+                continue
             numbers = self._flying.pop(future)
-            if future.status in ("cancelled", "lost"):
+            if future.status == "cancelled":
                 raise FitError("The Dask scheduler is gone; start it and run the same command again: it goes on.")
             error = future.exception() if future.status == "error" else None
             if isinstance(error, KilledWorker):
@@ -132,37 +134,22 @@ class _Run:
 
     def _workers(self) -> int:
         try:
-            self._client.wait_for_workers(1, timeout=FINDS_S)
+            self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
-            raise FitError(f"The Dask cluster has no worker after {FINDS_S:g} s; start some and run again.") from error
+            raise FitError(
+                f"The Dask cluster has no worker after {WORKERS_S:g} s; start some and run again."
+            ) from error
         return max(1, len(self._client.nthreads()))
 
 
-def do_chunk(work: Work[T, R], tasks: Sequence[T], timeout_s: float | None) -> list[R]:
-    """Do some tasks in a worker of Dask, on one thread of BLAS."""
-    with threadpool_limits(1):
-        answers: list[R] = []
-        for task in tasks:
-            with _no_longer_than(timeout_s, work, task):
-                answers.append(work.do(task))
-        return answers
+def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None) -> list[R]:
+    """Do some tasks at a worker of Dask, in a process below it that may die without it."""
+    if getattr(_here, "work", None) != (work, timeout_s):
+        if (earlier := getattr(_here, "child", None)) is not None:
+            earlier.stop()
+        _here.work, _here.child = (work, timeout_s), Child(work, timeout_s)
+    return [_here.child.do(task) for task in tasks]
 
 
-@contextmanager
-def _no_longer_than(timeout_s: float | None, work: Work[T, R], task: T) -> Generator[None]:
-    """Give `task` up and end this process, which alone stops compiled code, where the block takes longer."""
-
-    def end() -> None:
-        work.give_up(task, f"it took more than the {timeout_s:g} s of --timeout")
-        os._exit(1)
-
-    if timeout_s is None:
-        yield
-        return
-    timer = threading.Timer(timeout_s, end)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+_here = threading.local()
+"""Of each thread of a worker: its child, and what that does."""

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from shapespace.errors import FitError
 
@@ -77,7 +77,8 @@ def wait_until_loaded() -> None:
         return
     try:
         first = context().Process(target=_nothing)
-        first.start()
+        with _children_allowed():
+            first.start()
         first.join()
     except (EOFError, OSError) as error:
         raise FitError("The system does not let worker processes start; fit with --jobs 1.") from error
@@ -103,7 +104,7 @@ class Worker:
         self.line, theirs = context().Pipe()
         self._process = context().Process(target=_live, args=(serve, theirs, life, arguments), daemon=True)
         try:
-            with interrupts_ignored():
+            with interrupts_ignored(), _children_allowed():
                 self._process.start()
         except (EOFError, OSError) as error:
             raise FitError("The system does not let worker processes start; use --jobs 1.") from error
@@ -141,6 +142,18 @@ def life_line() -> Generator[Connection]:
     finally:
         ours.close()
         life.close()
+
+
+@contextlib.contextmanager
+def _children_allowed() -> Generator[None]:
+    """Let workers of Dask, which are daemons, have children too: the life line ends those with them."""
+    told: dict[str, Any] = cast(Any, multiprocessing.current_process())._config
+    daemon = told.pop("daemon", None)
+    try:
+        yield
+    finally:
+        if daemon is not None:
+            told["daemon"] = daemon
 
 
 def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
