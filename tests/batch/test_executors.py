@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,17 +44,6 @@ class Letters:
     def give_up(self, task: str, reason: str) -> tuple[str, int]:
         (self.folder / f"{task}.given_up").write_text(reason)
         return reason, 0
-
-
-@pytest.fixture(scope="session")
-def cluster() -> Iterator[Any]:
-    """A scheduler and two workers in processes of their own, as `--executor dask` makes them."""
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield client
 
 
 @pytest.fixture(params=EXECUTORS)

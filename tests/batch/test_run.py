@@ -1,4 +1,7 @@
 import csv
+import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +13,11 @@ import pytest
 from shapespace.batch import fit_work
 from shapespace.batch.executors import Local
 from shapespace.batch.fit_work import Job
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.on_dask import OnDask
+from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
+from shapespace.io.files import atomic_path
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model, raw_scan, similarity
@@ -109,6 +114,31 @@ def test_resume_keeps_what_still_holds_and_only_that(
     calls = count_fits(monkeypatch)
     fit_files(make_jobs([scan]), model, Path("m"), out, config, resume=True)
     assert calls == ([] if changed == "nothing" else ["s"])
+
+
+@pytest.mark.parametrize("kind", ["local", "dask"])
+def test_every_executor_gives_what_one_after_the_other_gives(
+    kind: str, model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    executor = Local(2) if kind == "local" else OnDask(request.getfixturevalue("cluster"))
+    jobs = make_jobs(with_a_bad_one(scans, tmp_path))
+    here = fit_files(jobs, model, Path("blob.h5"), tmp_path / "here", CONFIG)
+    done: list[str] = []
+    there = fit_files(
+        jobs, model, model_path, tmp_path / "there", CONFIG, executor=executor, on_done=lambda j, _: done.append(j.name)
+    )
+    told = [{**without_times(r), "model": r["model"]["hash"]} for r in there]
+    assert told == [{**without_times(r), "model": r["model"]["hash"]} for r in here]
+    assert sorted(done) == sorted(job.name for job in jobs)
+    for name in ("coefficients.csv", "scan0.fitted.ply", "scan2.fitted.ply"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_a_model_that_is_another_one_by_now_is_not_fitted(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "model.h5"
+    model.truncate(3).save(file)
+    with pytest.raises(FileError, match=r"model\.h5 is not the model that this run began with"):
+        fit_files(make_jobs(scans), model, file, tmp_path / "out", CONFIG, executor=Local(2))
 
 
 def test_each_scan_is_called_by_its_file_where_no_other_has_that_name() -> None:
@@ -281,3 +311,57 @@ def test_all_states_are_told_when_fits_run_here(model: ShapeModel, scans: list[P
         make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_state=lambda s: told.append(s.phase)
     )
     assert len(told) == len(record["history"])
+
+
+def test_a_second_run_into_the_same_folder_is_refused(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    def another(*_: object) -> None:
+        with pytest.raises(FileError, match="another run of shapespace"):
+            fit_files(make_jobs(scans[1:]), model, Path("m"), tmp_path, CONFIG)
+
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_done=another)
+    fit_files(make_jobs(scans[1:]), model, Path("m"), tmp_path, CONFIG)
+    assert len(table(tmp_path)) == 3 and not list(tmp_path.glob(".*"))
+
+
+def test_a_surface_of_another_fit_is_not_kept(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    """As a run that was killed between two files, or two runs at once, may leave it."""
+    other = tmp_path / "other"
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG)
+    fit_files(make_jobs(scans[:1]), model, Path("m"), other, replace(CONFIG, max_iterations=2))
+    good = (tmp_path / "scan0.fitted.ply").read_bytes()
+    (other / "scan0.fitted.ply").replace(tmp_path / "scan0.fitted.ply")
+    (record,) = fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, resume=True)
+    assert (tmp_path / "scan0.fitted.ply").read_bytes() == good
+    assert record["id"].encode() in good[:300]
+
+
+def test_a_folder_that_goes_away_is_one_sentence(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    def gone(*_: object) -> None:
+        shutil.rmtree(tmp_path / "out")
+
+    with pytest.raises(FileError, match=r"Cannot write .*the folder cannot be made there"):
+        fit_files(make_jobs(scans), model, Path("m"), tmp_path / "out", CONFIG, on_done=gone)
+
+
+def test_half_written_files_of_killed_runs_go(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    code = f"""
+import os, pathlib
+from shapespace.io.files import atomic_path
+with atomic_path(pathlib.Path({str(tmp_path)!r}) / "scan0.fitted.ply") as path:
+    path.write_bytes(b"half")
+    os._exit(9)
+"""
+    subprocess.run([sys.executable, "-c", code])
+    assert len(list(tmp_path.glob(".shapespace-*"))) == 1
+    with atomic_path(tmp_path / "live.ply") as writing:
+        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG)
+        assert [path.name for path in tmp_path.glob(".*")] == [writing.name], "of a process that lives it stays"
+
+
+def test_a_run_tells_what_is_kept_and_what_is_done_anew(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    plans: list[Plan] = []
+    for given, config in ((scans[:1], CONFIG), (scans, CONFIG), (scans[1:], FitConfig(max_iterations=2))):
+        fit_files(make_jobs(given), model, Path("m"), tmp_path, config, resume=True, on_plan=plans.append)
+    assert plans == [Plan(0, 0, 1), Plan(1, 0, 2), Plan(0, 2, 0)]
+    assert not list(plans[0].sentences())
+    assert "1 of 3" in next(plans[1].sentences()) and "2 of 2" in next(plans[2].sentences())
