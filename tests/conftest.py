@@ -117,3 +117,14 @@ def shared_data() -> Path:
     if not (folder / "james" / "james.obj").is_file():
         pytest.skip("real data absent: set SHAPESPACE_DATA to a folder holding james/ and ict-facekit/")
     return folder
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Any]:
+    """A client of a Dask scheduler and two workers in processes of their own, for the contracts of executors."""
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client

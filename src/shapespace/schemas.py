@@ -93,6 +93,7 @@ class File(Struct, frozen=True, kw_only=True):
     Args:
         size_bytes: of a scan, and
         modified_ns: when it was last written (ns since 1970), by which it is known again without reading it.
+        remote_version: of a scan that lies elsewhere, at the address `path`, a word that changes with it.
     """
 
     name: str = ""
@@ -100,6 +101,7 @@ class File(Struct, frozen=True, kw_only=True):
     path: str = ""
     size_bytes: int | None = None
     modified_ns: int | None = None
+    remote_version: str = ""
 
 
 class Distances(Struct, frozen=True, kw_only=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,9 @@ from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.state import IcpState
 from shapespace.io.files import sha256_of_file, write_together
 from shapespace.io.landmarks import read_landmarks
+from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.meshes import read_mesh
+from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -39,15 +41,49 @@ class Job:
 
     Args:
         name: NAME of its result files, unique in the folder.
-        scan: path of the scan.
+        scan: path of the scan; of one that lies elsewhere, what it would be, for its name.
         landmarks: path of its landmarks, or None.
         metadata: what is known of it, by the columns of a list of scans; carried to its record.
+        address: of a scan that lies elsewhere, as fsspec knows it; else empty.
     """
 
     name: str
     scan: Path
     landmarks: Path | None = None
     metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    address: str = ""
+
+    @property
+    def called(self) -> str:
+        """What sentences call the scan: its address or path."""
+        return self.address or str(self.scan)
+
+    @contextlib.contextmanager
+    def readable(self) -> Generator[Path]:
+        """Yield a file with the scan, which is a copy during the block where the scan lies elsewhere.
+
+        Raises:
+            FileError: it cannot be fetched.
+        """
+        if not self.address:
+            yield self.scan
+            return
+        with fetched(self.address, LARGEST_MESH_FILE_BYTES) as file:
+            yield file
+
+    def source(self, folder: Path) -> Source:
+        """Return what results in `folder` say of where the scan is, without reading it."""
+        return Source(self.scan.name, "", self.address) if self.address else Source.at(self.scan, "", folder)
+
+    def read_source(self, file: Path, folder: Path) -> Source:
+        """Return the same, with what the scan is known again by; `file` is that of `readable`.
+
+        Raises:
+            FileError: it cannot be read.
+        """
+        if not self.address:
+            return Source.hashed(file, folder)
+        return replace(self.source(folder), content_hash=sha256_of_file(file), remote_version=version_of(self.address))
 
 
 def fit_file(
@@ -69,23 +105,24 @@ def fit_file(
         FileError: the results cannot be written.
     """
     model_source = Source.at(model_file, model.content_hash, folder)
-    scan_source = Source.at(job.scan, "", folder)
+    scan_source = job.source(folder)
     marks_source: Source | None = None
     try:
-        scan_source = Source.hashed(job.scan, folder)
-        scan = read_mesh(job.scan)
+        with job.readable() as file:
+            scan_source = job.read_source(file, folder)
+            scan = read_mesh(file)
         landmarks: Mapping[str, FloatArray] | None = None
         if job.landmarks is not None:
             marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except MemoryError:
-        short = f"{job.scan}: not enough memory to fit it; thin the scan first."
+        short = f"{job.called}: not enough memory to fit it; thin the scan first."
         return _write_failed(
             failed_record(scan_source, model_source, short, config.as_dict(), job.metadata), job, folder
         )
     except ShapespaceError as error:
-        reason = naming(job.scan, str(error))
+        reason = naming(job.called, str(error))
         return _write_failed(
             failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata), job, folder
         )
@@ -130,13 +167,14 @@ class _Files:
         return [*left, self.stages] if stages else left
 
 
-def naming(scan: Path, sentence: str) -> str:
-    """Return `sentence` about the mesh in `scan` with its path in it, not just its name."""
-    if str(scan) in sentence:
+def naming(called: Path | str, sentence: str) -> str:
+    """Return `sentence` about a mesh with its path or address in it, not just its file's name."""
+    if str(called) in sentence:
         return sentence
-    if sentence.startswith(f"{scan.name}: "):
-        return f"{scan}{sentence.removeprefix(scan.name)}"
-    return f"{scan}: {sentence[:1].lower()}{sentence[1:]}"
+    name = name_of(called) if isinstance(called, str) and is_address(called) else Path(called).name
+    if sentence.startswith(f"{name}: "):
+        return f"{called}{sentence.removeprefix(name)}"
+    return f"{called}: {sentence[:1].lower()}{sentence[1:]}"
 
 
 @dataclass(frozen=True)
@@ -185,10 +223,11 @@ class FitWork:
     def give_up(self, task: FitTask, reason: str) -> dict[str, Any]:
         """Write and return the record of a scan whose workers were lost."""
         model = Source.at(self.model_file, self.model_hash, self.folder)
-        scan = Source.at(task.job.scan, "", self.folder)
-        with contextlib.suppress(ShapespaceError):
-            scan = Source.hashed(task.job.scan, self.folder)
-        told = f"{task.job.scan}: {reason}."
+        scan = task.job.source(self.folder)
+        if not task.job.address:
+            with contextlib.suppress(ShapespaceError):
+                scan = Source.hashed(task.job.scan, self.folder)
+        told = f"{task.job.called}: {reason}."
         record = failed_record(scan, model, told, task.config.as_dict(), task.job.metadata)
         return _write_failed(record | {"given_up": self.run}, task.job, self.folder)
 
@@ -239,7 +278,7 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None
     if enough and whole and record["status"] != "failed":
-        return task, record | ({"metadata": dict(task.job.metadata)} if task.job.metadata else {})
+        return task, record
     also = replace(task.config, dense=task.config.dense or dense)
     return replace(task, config=also, stages=task.stages or staged), None
 
@@ -255,11 +294,16 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
         record["model"]["hash"] == model_hash
         and record.get("landmarks") == marks
         and all(record["config"].get(key) == value for key, value in settings.items())
-        and _is_same_scan(record["scan"], job.scan, folder)
+        and (_is_same_there(record["scan"], job.address) if job.address else _is_same(record["scan"], job.scan, folder))
     )
 
 
-def _is_same_scan(told: Mapping[str, Any], scan: Path, folder: Path) -> bool:
+def _is_same_there(told: Mapping[str, Any], address: str) -> bool:
+    """Return whether what lies at `address` is what the record tells, by what its store says of its version."""
+    return bool(told.get("path") == address and told.get("remote_version") == version_of(address))
+
+
+def _is_same(told: Mapping[str, Any], scan: Path, folder: Path) -> bool:
     """Return whether `scan` is what the record tells: by place, size and time if they agree, else by its content."""
     with contextlib.suppress(OSError):
         there = scan.stat()

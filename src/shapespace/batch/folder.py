@@ -46,7 +46,9 @@ class _Scan:
         return _Scan(str(source.get("name", "")), str(source.get("path", "")))
 
 
-def names_for(scans: Sequence[Path], folder: Path | None = None) -> list[str]:
+def names_for(
+    scans: Sequence[Path], folder: Path | None = None, addresses: Mapping[Path, str] | None = None
+) -> list[str]:
     """Return NAME of the result files of each scan: its file name without its ending, where that is free.
 
     A scan that has results in `folder` keeps their name. Scans that share a name, with each other or with results of
@@ -55,6 +57,7 @@ def names_for(scans: Sequence[Path], folder: Path | None = None) -> list[str]:
     Args:
         scans: paths; one that is given twice has one name.
         folder: where results go; None if nothing can be there.
+        addresses: of scans that lie elsewhere, by what their paths would be.
     """
     taken: dict[str, _Scan] = {}
     hashes: dict[str, str] = {}
@@ -64,7 +67,7 @@ def names_for(scans: Sequence[Path], folder: Path | None = None) -> list[str]:
             taken[name] = _Scan.of(source)
             hashes[name] = str(source.get("hash", ""))
     own = {scan: name for name, scan in reversed(taken.items())}
-    keys = {scan: _key(scan, folder) for scan in scans}
+    keys = {scan: _key(scan, folder, (addresses or {}).get(scan, "")) for scan in scans}
     names = {key: own[key] for key in keys.values() if key in own}
     groups: dict[str, dict[_Scan, Path]] = {}
     for scan, key in keys.items():
@@ -82,7 +85,9 @@ def names_for(scans: Sequence[Path], folder: Path | None = None) -> list[str]:
     return [names[keys[scan]] for scan in scans]
 
 
-def _key(scan: Path, folder: Path | None) -> _Scan:
+def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
+    if address:
+        return _Scan(scan.name, address)
     if folder is None:
         return _Scan(scan.name, str(scan.parent.resolve()))
     return _Scan(scan.name, Source.at(scan, "", folder).path)

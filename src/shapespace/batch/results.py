@@ -25,6 +25,8 @@ from shapespace.schemas import FitRecord, to_json
 from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
+META = "meta_"
+"""Begins the names of columns that the list of scans had."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -54,6 +56,7 @@ class Source:
         path: where it was, relative to the folder of the results where there is such a path; empty if not known.
         size_bytes: of the file, and
         modified_ns: when it was last written, by which it is known again without reading it; None if not known.
+        remote_version: of a scan that lies elsewhere, a word that changes with it; else empty.
     """
 
     name: str
@@ -61,6 +64,7 @@ class Source:
     path: str = ""
     size_bytes: int | None = None
     modified_ns: int | None = None
+    remote_version: str = ""
 
     @staticmethod
     def at(file: Path, content_hash: str, folder: Path) -> Source:
@@ -88,6 +92,8 @@ class Source:
         known: dict[str, Any] = {"path": self.path} if self.path else {}
         if self.size_bytes is not None:
             known |= {"size_bytes": self.size_bytes, "modified_ns": self.modified_ns}
+        if self.remote_version:
+            known |= {"remote_version": self.remote_version}
         return {"name": self.name, "hash": self.content_hash, **known}
 
 
@@ -254,6 +260,7 @@ def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers."""
     row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
     row |= {"model_hash": record["model"]["hash"], "path": record["scan"].get("path", "")}
+    row |= {f"{META}{column}": value for column, value in record.get("metadata", {}).items()}
     if "b" not in record:
         return row
     for letter in ("b", "z"):
@@ -304,7 +311,8 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
     every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
     columns += [column for column in every if column not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS, "model_hash"]
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS]
+    columns += [*dict.fromkeys(column for row in rows for column in row if column.startswith(META)), "model_hash"]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
     writer.writeheader()

@@ -12,8 +12,9 @@ from typing import Any
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, resumed
-from shapespace.batch.folder import CoefficientTable, names_for
+from shapespace.batch.folder import RECORD, CoefficientTable, names_for
 from shapespace.batch.lock import only_writer
+from shapespace.batch.results import write_record
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder
@@ -23,9 +24,16 @@ _SAVE_EVERY_S = 5.0
 _SAVES_APART = 20.0
 
 
-def make_jobs(scans: Sequence[Path], landmarks: Path | None = None, folder: Path | None = None) -> list[Job]:
+def make_jobs(
+    scans: Sequence[Path],
+    landmarks: Path | None = None,
+    folder: Path | None = None,
+    addresses: Mapping[Path, str] | None = None,
+) -> list[Job]:
     """Return one job a scan, named by `names_for` for results in `folder`; a scan given twice is one job twice."""
-    return [Job(name, scan, landmarks) for name, scan in zip(names_for(scans, folder), scans, strict=True)]
+    there = addresses or {}
+    names = names_for(scans, folder, there)
+    return [Job(name, scan, landmarks, address=there.get(scan, "")) for name, scan in zip(names, scans, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -106,7 +114,7 @@ def fit_files(
             if earlier is None:
                 tasks.append(task)
             else:
-                kept.add(job, earlier)
+                kept.add(job, _with_metadata(earlier, job, folder))
         if on_plan is not None:
             before = sum(has_surface(task.job, folder) for task in tasks)
             on_plan(Plan(len(kept.records), before, len(tasks) - before))
@@ -118,6 +126,14 @@ def fit_files(
             kept.table.catch_up([task.job.name for task in tasks if task.job.name not in kept.records])
             kept.table.save()
     return [kept.records[job.name] for job in jobs]
+
+
+def _with_metadata(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
+    if not job.metadata or record.get("metadata") == job.metadata:
+        return record
+    record = record | {"metadata": dict(job.metadata)}
+    write_record(folder / f"{job.name}{RECORD}", record)
+    return record
 
 
 class _Kept:

@@ -127,7 +127,8 @@ def _add_correspond(commands: Any) -> None:
     sub = _add(commands, "correspond", "raw scans to the same surfaces in correspondence, with no model to begin with",
                "shapespace correspond scans -o same\n"
                "         shapespace build same -o model.h5")  # fmt: skip
-    sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans of one kind of object, or folders")
+    sub.add_argument("scans", nargs="+", metavar="SCAN",
+                     help="scans of one kind of object, folders, patterns, or lists (.csv, .txt) of these")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
@@ -221,7 +222,8 @@ def _add_fit(commands: Any) -> None:
                "         shapespace fit model.h5 scans -o out --dense\n"
                "         shapespace build out/*.dense.ply -o new.h5")  # fmt: skip
     sub.add_argument("model", type=Path, metavar="MODEL.h5")
-    sub.add_argument("scans", nargs="+", type=Path, metavar="SCAN", help="scans, or folders of them")
+    sub.add_argument("scans", nargs="+", metavar="SCAN",
+                     help="scans, folders, patterns, addresses such as s3://bucket/x, or lists of these")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
                      help="where to write; results that are there already stay")  # fmt: skip
     _add_recursive(sub)

@@ -338,7 +338,7 @@ def info(arguments: argparse.Namespace) -> int:
 
 def fit(arguments: argparse.Namespace) -> int:
     """Fit a model to scans."""
-    several = len(arguments.scans) > 1 or arguments.scans[0].is_dir()
+    several = len(arguments.scans) > 1 or not Path(arguments.scans[0]).is_file()
     if several and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
 

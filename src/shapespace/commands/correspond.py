@@ -18,6 +18,7 @@ from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
+from shapespace.commands.inputs import files_of
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
@@ -36,7 +37,6 @@ from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import face_areas
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
-from shapespace.io.folders import mesh_files
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -59,7 +59,7 @@ class CorrespondFiles:
     """What is brought into correspondence, and how.
 
     Args:
-        scans: files and folders.
+        scans: files, folders, patterns and lists of these.
         template: a mesh to begin with, or None.
         model: to begin with, or None.
         landmarks: a folder of files that are named as the scans, or None.
@@ -67,7 +67,7 @@ class CorrespondFiles:
         recursive: take scans in folders below those given too.
     """
 
-    scans: Sequence[Path]
+    scans: Sequence[str | Path]
     template: Path | None = None
     model: Path | None = None
     landmarks: Path | None = None
@@ -91,12 +91,10 @@ def correspond_files(
         FileError: the results cannot be written.
         InputError: fewer than two scans, or too few that can be reached.
     """
-    found = mesh_files(files.scans, recursive=files.recursive, apart_from=folder)
-    for sentence in found.left_out:
-        say(sentence)
-    paths = list(dict.fromkeys(path for path in found.files if not path.name.endswith(SURFACE)))
-    if len(paths) < len(set(found.files)):
-        say(f"{len(set(found.files)) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
+    found = list(dict.fromkeys(files_of(files.scans, folder, recursive=files.recursive, say=say)))
+    paths = [path for path in found if not path.name.endswith(SURFACE)]
+    if len(paths) < len(found):
+        say(f"{len(found) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
     make_folder(folder)
     with only_writer(folder):
         return _corresponding(paths, files, folder, settings, quiet=quiet, say=say)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,16 @@ from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
+from shapespace.commands.inputs import Given, given_scans
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder, remove_file, write_bytes
-from shapespace.io.folders import mesh_files
+from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
 
 _SURFACES = (".fitted.ply", ".dense.ply")
+_ROOT = "/"
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class BatchSettings:
 
 def fit_scans(
     model_path: Path,
-    scans: Sequence[Path],
+    scans: Sequence[str | Path],
     folder: Path,
     settings: BatchSettings,
     *,
@@ -58,7 +60,7 @@ def fit_scans(
 
     Args:
         model_path: the model's file.
-        scans: files and folders.
+        scans: files, folders, patterns, addresses and lists, as `given_scans` takes them.
         folder: where results go.
         settings: how.
         quiet: no progress.
@@ -68,16 +70,16 @@ def fit_scans(
         FileError: the model cannot be read, or the results not written.
         InputError: landmarks for more than one scan, or no scans.
     """
-    files = _scans(scans, folder, recursive=settings.recursive, say=say)
-    if settings.landmarks is not None and len(files) > 1:
+    given = _scans(scans, folder, recursive=settings.recursive, say=say)
+    if settings.landmarks is not None and len(given) > 1:
         raise InputError("--landmarks belongs to one scan, but several were given; fit them one at a time.")
     model = ShapeModel.load(model_path)
     make_folder(folder)
     write_bytes(folder / ".writable", b"")
     remove_file(folder / ".writable")
-    work = list({job.name: job for job in make_jobs(files, settings.landmarks, folder)}.values())
-    if len(work) < len(files):
-        say(f"Scans given more than once are fitted once: {len(work)} of {len(files)}.")
+    work = list({job.name: job for job in _jobs(given, settings.landmarks, folder)}.values())
+    if len(work) < len(given):
+        say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
     with progress(len(work), "fitting", "scan", quiet=quiet) as bar:
         records = _fit(work, model, model_path, folder, settings, _Watch(bar, say), quiet=quiet)
     return {job.name: record for job, record in zip(work, records, strict=True)}
@@ -104,7 +106,7 @@ class _Watch:
         self.bar.clear()
         # The reason of a failure names the file already.
         failed = record["status"] == "failed"
-        self.say(record["reason"] if failed else f"{job.scan}: {record['status']}: {record['reason']}")
+        self.say(record["reason"] if failed else f"{job.called}: {record['status']}: {record['reason']}")
 
 
 def _fit(
@@ -125,25 +127,50 @@ def _fit(
         )  # fmt: skip
 
 
-def _scans(scans: Sequence[Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:
-    """Return the files to fit: without the surfaces that earlier runs left, where scans and results mix."""
-    found = mesh_files(scans, recursive=recursive, apart_from=folder)
-    for sentence in found.left_out:
-        say(sentence)
-    here = folder.resolve()
-    given = {path.resolve() for path in scans}
+def _jobs(given: Sequence[Given], landmarks: Path | None, folder: Path) -> list[Job]:
+    """Return a job for each scan; one that lies elsewhere is named by its address as by a path."""
+    addresses: dict[Path, str] = {}
+    paths: list[Path] = []
+    for one in given:
+        path = Path(_ROOT, *_parts(one.place)) if isinstance(one.place, str) else one.place
+        paths.append(path)
+        if isinstance(one.place, str):
+            addresses[path] = one.place
+    jobs = [
+        replace(job, name=one.called or job.name, metadata=one.metadata)
+        for job, one in zip(make_jobs(paths, landmarks, folder, addresses), given, strict=True)
+    ]
+    seen: dict[str, Job] = {}
+    for job in jobs:
+        if seen.setdefault(job.name.casefold(), job).called != job.called:
+            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
+    return jobs
 
-    def is_result(scan: Path) -> bool:
+
+def _parts(address: str) -> Sequence[str]:
+    head = address.split("::", 1)[0].partition("?")[0]
+    return [part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")]
+
+
+def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:
+    """Return the files to fit: without the surfaces that earlier runs left, where scans and results mix."""
+    found = given_scans(scans, folder, recursive=recursive, say=say)
+    here = folder.resolve()
+    given = {Path(one).resolve() for one in scans if not is_address(str(one))}
+
+    def is_result(scan: Path | str) -> bool:
+        if isinstance(scan, str):
+            return False
         name = next((scan.name.removesuffix(ending) for ending in _SURFACES if scan.name.endswith(ending)), None)
         if name is None or not scan.with_name(f"{name}{RECORD}").is_file():
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 
-    left = [scan for scan in found.files if not is_result(scan)]
+    left = [one for one in found if not is_result(one.place)]
     if not left:
         raise InputError(f"{folder} holds only results of earlier fits; give the scans, or another folder for results.")
-    if len(left) < len(found.files):
-        results = len(found.files) - len(left)
+    if len(left) < len(found):
+        results = len(found) - len(left)
         what = "1 surface of an earlier fit is" if results == 1 else f"{results} surfaces of earlier fits are"
         say(f"{what} not taken for a scan." if results == 1 else f"{what} not taken for scans.")
     return left

@@ -1,0 +1,154 @@
+"""The scans that a command is given: files, folders, patterns, addresses, and lists of any of these."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shapespace.errors import InputError
+from shapespace.io.files import read_bytes
+from shapespace.io.folders import mesh_files
+from shapespace.io.meshes import MESH_ENDINGS
+from shapespace.io.remote import addresses, is_address
+
+_LISTS = (".csv", ".tsv", ".txt")
+_PLACES = ("scan", "file", "path")
+_LONGEST = 200
+
+
+@dataclass(frozen=True)
+class Given:
+    """A scan as it was given.
+
+    Args:
+        place: path of the scan, or its address.
+        called: by the column `id` of a list, or empty.
+        metadata: the other columns of the list.
+    """
+
+    place: Path | str
+    called: str = ""
+    metadata: dict[str, str] = field(default_factory=dict[str, str])
+
+
+def given_scans(
+    scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]
+) -> list[Given]:
+    """Return the scans that `scans` stand for.
+
+    Args:
+        scans: paths of scans and of folders, patterns, addresses, and lists: a text file with one of these in a line,
+            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id`, and others that are kept.
+        folder: of the results, not looked into.
+        recursive: whether to take what lies in folders below too.
+        say: told what was not taken.
+
+    Raises:
+        InputError: there is nothing, or a list is not one.
+        FileError: a folder, a list or an address cannot be read.
+    """
+    found: list[Given] = []
+    for one in scans:
+        text = str(one)
+        if not is_address(text) and text.lower().endswith(_LISTS) and Path(text).is_file():
+            for row in _rows(Path(text)):
+                there = _expanded(row.place, folder, recursive=recursive, say=say)
+                if row.called and len(there) > 1:
+                    raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
+                found += [Given(place, row.called, row.metadata) for place in there]
+        else:
+            found += [Given(place) for place in _expanded(text, folder, recursive=recursive, say=say)]
+    _refuse_doubles(found)
+    return found
+
+
+def files_of(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:
+    """Return the same where only files can be read.
+
+    Raises:
+        InputError: there is nothing, or an address among them.
+        FileError: a folder or a list cannot be read.
+    """
+    found = given_scans(scans, folder, recursive=recursive, say=say)
+    if there := [one.place for one in found if not isinstance(one.place, Path)]:
+        raise InputError(f"{there[0]} is an address, and this command reads files; copy the scans to a folder first.")
+    return [Path(one.place) for one in found]
+
+
+def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]) -> Sequence[Path | str]:
+    if isinstance(text, str) and is_address(text):
+        return addresses(text, MESH_ENDINGS, recursive=recursive)
+    path = Path(text)
+    if glob.has_magic(str(path)) and not path.exists():
+        matched = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+        if not matched:
+            raise InputError(f"No file matches {path}; check the pattern.")
+        # A pattern that ends in an ending names scans; another one may take what is none.
+        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(tuple(MESH_ENDINGS))]
+        paths = files or matched
+    else:
+        paths = [path]
+    listed = mesh_files(paths, recursive=recursive, apart_from=folder)
+    for sentence in listed.left_out:
+        say(sentence)
+    return listed.files
+
+
+def _rows(file: Path) -> list[Given]:
+    """Return the rows of a list, with places relative to its folder."""
+    try:
+        text = read_bytes(file).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is not text in UTF-8; save it as such.") from error
+    if file.suffix.lower() == ".txt":
+        lines = [line.strip() for line in text.splitlines()]
+        rows = [Given(_beside(file, line)) for line in lines if line and not line.startswith("#")]
+    else:
+        rows = _table(file, text)
+    if not rows:
+        raise InputError(f"{file} lists no scans; write one in a line.")
+    return rows
+
+
+def _table(file: Path, text: str) -> list[Given]:
+    if "\0" in text:
+        raise InputError(f"{file} is not a table but binary; save it as CSV.")
+    delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    try:
+        lines = [line for line in reader if any(cell.strip() for cell in line)]
+    except csv.Error as error:
+        raise InputError(f"{file} is not a table ({error}); save it as CSV.") from error
+    header = [cell.strip() for cell in lines[0]] if lines else []
+    column = next((name for name in _PLACES if name in header), None)
+    if column is None or len(set(header)) < len(header):
+        raise InputError(
+            f"{file} needs a column named scan, file or path, and no name twice; it has {', '.join(header)}."
+        )
+    rows: list[Given] = []
+    for number, line in enumerate(lines[1:], 2):
+        if len(line) > len(header):
+            raise InputError(f"{file}: row {number} has {len(line)} cells, and the table {len(header)} columns.")
+        cells = dict(zip(header, (cell.strip() for cell in line), strict=False))
+        place, called = cells.pop(column, ""), cells.pop("id", "")
+        if not place:
+            raise InputError(f"{file}: row {number} names no scan in the column {column}.")
+        if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
+            raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
+        rows.append(Given(_beside(file, place), called, cells))
+    return rows
+
+
+def _beside(file: Path, text: str) -> Path | str:
+    return text if is_address(text) else file.parent / text
+
+
+def _refuse_doubles(found: Sequence[Given]) -> None:
+    named: dict[str, Given] = {}
+    for one in found:
+        if one.called and named.setdefault(one.called.casefold(), one).place != one.place:
+            raise InputError(f"Two scans have the id {one.called}; give each one of its own.")

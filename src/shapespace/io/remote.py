@@ -1,0 +1,136 @@
+"""Scans that lie elsewhere, at any address that fsspec knows, such as s3://bucket/scan.ply: fetched for a fit."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+import time
+from collections.abc import Generator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from shapespace.errors import FileError, InputError, ShapespaceError
+
+TRIES = 3
+"""Times that a download is tried."""
+_WAIT_S = 0.5
+_PIECE = 1 << 20
+_GLOB = frozenset("*?[")
+
+
+def is_address(text: str) -> bool:
+    """Return whether `text` is an address and not a path."""
+    return "://" in text
+
+
+def name_of(address: str) -> str:
+    """Return the name of the file at an address, of an archive that of the file in it."""
+    inside = address.split("::", 1)[0].split("://", 1)[1]
+    return PurePosixPath(inside.partition("?")[0]).name
+
+
+def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[str]:
+    """Return the files that an address stands for: itself, those of a pattern, or those of a folder.
+
+    Args:
+        address: a file, a folder, or a pattern with * or ?.
+        endings: of the files that are taken from patterns and folders, in small letters.
+        recursive: whether to take those in folders below too.
+
+    Raises:
+        InputError: there are none.
+        FileError: the place cannot be reached.
+        ShapespaceError: what reads such addresses is not installed.
+    """
+    with _told(address):
+        files, path = _files(address)
+        head, sep, chain = address.partition("::")
+        scheme = head.split("://", 1)[0]
+        if _GLOB & set(path):
+            found = files.glob(path)
+        elif head.lower().endswith(tuple(endings)):
+            return [address]
+        else:
+            found = files.find(path, maxdepth=None if recursive else 1)
+        named = [f"{scheme}://{str(one).removeprefix(f'{scheme}://')}{sep}{chain}" for one in sorted(found)]
+    taken = [one for one in named if name_of(one).lower().endswith(tuple(endings))]
+    if not taken:
+        raise InputError(f"{address} holds no meshes; shapespace reads {', '.join(endings)}.")
+    return taken
+
+
+def version_of(address: str) -> str:
+    """Return a word that changes with the file at an address, without reading it.
+
+    Raises:
+        FileError: it cannot be reached.
+        ShapespaceError: what reads such addresses is not installed.
+    """
+    with _told(address):
+        files, path = _files(address)
+        return hashlib.sha256(str(files.ukey(path)).encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def fetched(address: str, most_bytes: int) -> Generator[Path]:
+    """Yield a copy of the file at an address, of the same name, which is there during the block.
+
+    Raises:
+        FileError: it cannot be had, after some tries, or is larger than `most_bytes`.
+        ShapespaceError: what reads such addresses is not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix="shapespace-") as folder:
+        file = Path(folder) / name_of(address)
+        for number in range(1, TRIES + 1):
+            try:
+                _copy(address, file, most_bytes)
+                break
+            except FileError:
+                if number == TRIES:
+                    raise
+                time.sleep(_WAIT_S * 2**number)
+        yield file
+
+
+def _copy(address: str, file: Path, most_bytes: int) -> None:
+    with _told(address):
+        files, path = _files(address)
+        with files.open(path, "rb") as source, file.open("wb") as copy:
+            count = 0
+            while piece := source.read(_PIECE):
+                count += len(piece)
+                if count > most_bytes:
+                    raise InputError(f"{address} is larger than {most_bytes:,} bytes; thin the scan.")
+                copy.write(piece)
+
+
+def _files(address: str) -> tuple[Any, str]:
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError as error:
+        raise _missing("remote") from error
+    return url_to_fs(address)
+
+
+@contextlib.contextmanager
+def _told(address: str) -> Generator[None]:
+    """Turn what the many libraries below fsspec raise into one sentence."""
+    try:
+        yield
+    except ShapespaceError:
+        raise
+    except ImportError as error:
+        raise _missing("remote") from error
+    except FileNotFoundError as error:
+        raise FileError(f"Cannot read {address}: there is no such file; check the address.") from error
+    except Exception as error:
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise FileError(f"Cannot read {address}: {why}; check the address and the connection.") from error
+
+
+def _missing(extra: str) -> ShapespaceError:
+    return ShapespaceError(
+        f"Addresses need the extra '{extra}', and s3:// and gs:// need s3fs and gcsfs too; run "
+        f"pip install 'shapespace[{extra}]' s3fs gcsfs, or give files."
+    )
