@@ -217,7 +217,7 @@ def test_damage_gives_one_sentence_or_landmarks(sample: tuple[str, bytes], cut: 
     ending, data = sample
     data = (data[:at] + patch + data[at + len(patch) :])[: len(data) - cut % len(data) // 2]
     with pytest.MonkeyPatch.context() as monkey:
-        monkey.setattr(module, "read_bytes", lambda path: data)
+        monkey.setattr(module, "read_bytes", lambda path, most: data)
         try:
             marks = read_landmarks(Path(f"bad{ending}"))
         except FileError as error:

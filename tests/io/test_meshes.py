@@ -691,7 +691,7 @@ def test_random_bytes_give_one_sentence_or_a_mesh(ending: str, data: bytes):
 
 def judge(ending: str, data: bytes) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meshes, "read_bytes", lambda path: data)
+        patch.setattr(meshes, "read_bytes", lambda path, most: data)
         try:
             mesh = read_mesh(Path(f"bad{ending}"))
         except (FileError, MeshError) as error:

@@ -469,7 +469,7 @@ def test_random_bytes_give_one_sentence_or_a_mesh(ending: str, data: bytes):
 
 def judge(ending: str, data: bytes) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meshes, "read_bytes", lambda path: data)
+        patch.setattr(meshes, "read_bytes", lambda path, most: data)
         try:
             mesh = read_mesh(Path(f"bad{ending}"))
         except (FileError, MeshError) as error:
@@ -538,7 +538,7 @@ def test_damaged_landmarks_give_one_sentence_or_points(
         data = data[:at] + patch + data[at + len(patch) :]
     data = data if cut is None else data[: cut % len(data)]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(landmarks, "read_bytes", lambda path: data)
+        patched.setattr(landmarks, "read_bytes", lambda path, most: data)
         try:
             marks = read_landmarks(Path(f"bad{ending}"))
         except FileError as error:
