@@ -9,8 +9,8 @@ import os
 import stat
 import tempfile
 from collections.abc import Generator
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from shapespace.errors import FileError
 
@@ -44,7 +44,7 @@ def read_error(path: Path, error: OSError) -> FileError:
     return FileError(f"Cannot read {path}: {error.strerror or error}.")
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BufferedReader:
     """Open the regular file `path` for reading; a pipe or a device, which may give nothing or never end, is refused.
 
     Raises:

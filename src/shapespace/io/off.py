@@ -49,7 +49,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
     if keyword[1] or first[-1].upper() == b"BINARY":
         raise damaged(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
     head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
-    counts = ints((head or next(rows, []))[:2], path).tolist()
+    counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
     if len(counts) < 2:
         raise damaged(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
     n, m = counts

@@ -37,8 +37,8 @@ def plain_text(data: bytes) -> bytes:
     return data.removeprefix(_BYTE_ORDER_MARK)
 
 
-def _block(text: bytes, at: int, end: re.Pattern[bytes]) -> tuple[bytes, int]:
-    found = end.search(text, at + _BLOCK_BYTES)
+def _block(text: bytes, at: int, end: re.Pattern[bytes], size: int = _BLOCK_BYTES) -> tuple[bytes, int]:
+    found = end.search(text, at + min(size, _BLOCK_BYTES))
     stop = found.end() if found else len(text)
     return text[at:stop], stop
 
@@ -51,9 +51,9 @@ def line_blocks(text: bytes) -> Iterator[list[bytes]]:
         yield block.splitlines()
 
 
-def word_block(text: bytes, at: int) -> tuple[list[bytes], int]:
-    """Return some thousand words of `text` from byte `at`, and where the next begin."""
-    block, stop = _block(text, at, _SPACE)
+def word_block(text: bytes, at: int, size: int = _BLOCK_BYTES) -> tuple[list[bytes], int]:
+    """Return the words in about `size` bytes of `text` from byte `at`, and where the next begin."""
+    block, stop = _block(text, at, _SPACE, size)
     return block.split(), stop
 
 
@@ -192,7 +192,7 @@ class _Plain(ET.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:  # pyright: ignore[reportIncompatibleMethodOverride]
         self.elements += 1
         if self.elements > MOST_PARTS:
-            raise ValueError(f"it has more than {MOST_PARTS} elements")
+            raise ValueError(f"it has more than {MOST_PARTS} elements, which no such file needs")
         return super().start(tag, attrs)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:

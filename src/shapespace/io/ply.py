@@ -312,8 +312,7 @@ def _binary_lists(
         count_bytes = 0 if p.count is None else np.dtype(p.count).itemsize
         signed = p.count is not None and p.count[0] == "i"
         plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == wanted))
-    starts: list[int] = []
-    sizes: list[int] = []
+    starts, sizes = array("q"), array("q")
     for _ in range(element.count):
         for count_bytes, item, signed, keep in plan:
             if count_bytes == 0:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.io.limits import Allowance
 from shapespace.io.parsing import CUT_SHORT, damaged, floats, joined, line_blocks, mesh_of, plain_text
 from shapespace.io.stl import merge_equal
 from shapespace.types import FloatArray, Mesh
@@ -33,10 +34,13 @@ def read_raw(data: bytes, path: Path) -> Mesh:
         raise damaged(
             path, "it is binary, a picture or a volume perhaps; of .raw only text with 3 or 9 numbers a row is read"
         )
+    allowance = Allowance(len(data), path)
     parts: list[FloatArray] = []
     before = width = first = 0
     for lines in line_blocks(plain_text(data)):
         split = [line.partition(b"#")[0].replace(b",", b" ").split() for line in lines]
+        # To tell the name of an object from a number takes long, and a file has few.
+        allowance.part(sum(len(words) == 1 for words in split))
         rows = [(number, words) for number, words in enumerate(split, before + 1) if words and not _is_name(words)]
         before += len(lines)
         if rows and not first:
