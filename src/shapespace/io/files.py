@@ -85,7 +85,7 @@ def read_bytes(path: Path, at_most: int | None = None) -> bytes:
                     f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and files of this kind are read up to "
                     f"{at_most / 2**20:.0f} MiB; thin or split it first."
                 )
-            return stream.read() if at_most is None else stream.read(at_most)
+            return stream.read() if at_most is None else stream.read(size)
         except OSError as error:
             raise read_error(path, error) from error
 
