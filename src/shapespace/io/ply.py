@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,13 @@ class _Words:
             self.at += len(part) - 1
             count -= len(part)
             yield part
+
+    def some(self, count: int) -> list[bytes]:
+        """Return the next `count` words; fewer where the text ends."""
+        part = self.block[self.at : self.at + count]
+        self.at += len(part)
+        # The rest of a long list lies in the blocks that follow.
+        return part if len(part) == count else [*part, *chain.from_iterable(self.take(count - len(part)))]
 
     def skip(self, count: int) -> None:
         """Pass `count` words."""
@@ -258,19 +265,17 @@ def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Pat
                 size = int(next(words))
                 if size < 0:
                     raise StopIteration
-                if i != wanted:
-                    words.skip(size)
-                    continue
-                sizes.append(size)
-                corners.extend(map(int, islice(words, size)))
+                part = words.some(size)
+                if len(part) < size:
+                    raise StopIteration
+                if i == wanted:
+                    sizes.append(size)
+                    corners.extend(map(int, part))
     except (ValueError, OverflowError) as error:
         raise damaged(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
     except StopIteration as error:
         raise _ended(element, path) from error
-    counts = np.array(sizes, dtype=np.int64)
-    if counts.sum() != len(corners):
-        raise _ended(element, path)
-    return counts, np.array(corners, dtype=np.int64)
+    return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
 
 def _alike(words: _Words, count: int, path: Path) -> IndexArray | None:
