@@ -122,7 +122,11 @@ FOUND: list[tuple[str, bytes]] = [
     (".ljson", json.dumps({"version": 2, **LONG_LABEL}).encode()),
 ]
 
-NUMBERS = [*b"-1 0 1e999 nan 1e-320 4294967295 99999999999 0x7f 1_0".split(), b"9" * 25, b"9" * 5000]
+NUMBERS = [
+    *b"-1 0 1.5 1e999 nan 1e-320 4294967295 99999999999 0x7f 1_0 null {} [] true".split(),
+    b"9" * 25,
+    b"9" * 5000,
+]
 PATCHES = [b"", bytes(4), b"\xff" * 4, b"\xff\xff\xff\x7f", b"\x80", b"\n", b"\r\n", *(b"%c" % c for c in b' "[{]#')]
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 TOKEN = re.compile(rb"[^\s,]+")
