@@ -167,6 +167,8 @@ def test_movements_of_vrml_1_are_refused_by_name(write, node: str):
         ("0, 2, 3, -1", "0, 2, -1", "only 2 corners"),
         ("0, 2, 3, -1", "0, 2, 3.5, -1", "no whole number"),
         ("0, 2, 3, -1", "0, 2, 0xZ, -1", "no whole number"),
+        ("0, 2, 3, -1", "0, [], 3, -1", "brackets in it"),
+        ("1 0 0,", "1 0 {} 0,", "brackets in it"),
         ("+1 0,", "+1 ,", "not three each"),
         ("+1 0,", "+1 zero,", "text where a number"),
         ("coord Coordinate {", "other Stuff {", "has no points"),

@@ -264,6 +264,10 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
                 scene.allowance.part()
                 scene.numbers(kind, text[at:close])
                 at = close + 1
+            elif close == len(text):
+                raise damaged(path, f"a list has no end; {CUT_SHORT}")
+            elif text[close : close + 1] == b"[" or kind in (b"point", b"coordIndex"):
+                raise damaged(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
             else:
                 scene.open(b"[")
         else:
