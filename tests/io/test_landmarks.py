@@ -3,11 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.io import landmarks as module
 from shapespace.io.landmarks import (
     LANDMARK_FORMATS,
     read_landmark_indices,
@@ -205,22 +202,3 @@ def test_vertex_numbers_round_trip(tmp_path: Path):
 def test_malformed_vertex_numbers_are_refused(write, text: str):
     with pytest.raises(FileFormatError, match=r"a\.csv.*\.$"):
         read_landmark_indices(write("a.csv", text))
-
-
-TEXTS = [(ending, f.write(POINTS).encode()) for ending, f in LANDMARK_FORMATS.items()]
-TEXTS += [(".pp", MESHLAB.encode()), (".json", slicer("RAS").encode()), (".ljson", json.dumps(GROUP).encode())]
-
-
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(sample=st.sampled_from(TEXTS), cut=st.integers(0, 2000), at=st.integers(0, 2000), patch=st.binary(max_size=4))
-def test_damage_gives_one_sentence_or_landmarks(sample: tuple[str, bytes], cut: int, at: int, patch: bytes):
-    ending, data = sample
-    data = (data[:at] + patch + data[at + len(patch) :])[: len(data) - cut % len(data) // 2]
-    with pytest.MonkeyPatch.context() as monkey:
-        monkey.setattr(module, "read_bytes", lambda path: data)
-        try:
-            marks = read_landmarks(Path(f"bad{ending}"))
-        except FileError as error:
-            assert str(error).endswith(".") and "bad" in str(error)
-            return
-    assert all(np.isfinite(point).all() and point.shape == (3,) for point in marks.values())

@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hand_made import POINTS, gltf_tree, ply_header, vtp
 
 from shapespace.errors import FileError, FileFormatError, InputError, MeshError, ShapespaceError
-from shapespace.io import meshes
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
@@ -185,10 +183,6 @@ def test_obj_negative_indices_count_from_where_they_stand(write):
 # PLY
 
 
-def ply_header(form: str, *lines: str) -> bytes:
-    return "\n".join(["ply", f"format {form} 1.0", "comment made by hand", *lines, "end_header", ""]).encode()
-
-
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_ply_binary_with_extras_and_mixed_polygons(write, order: str):
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
@@ -271,7 +265,6 @@ def test_off_dialects_mean_the_same(write, head: str):
 
 # VTK
 
-POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5]])
 QUAD_AND_TRIANGLE = [[0, 1, 2], [0, 2, 3], [1, 2, 3]]
 
 
@@ -301,49 +294,6 @@ def test_vtk_legacy_of_all_ages(write, binary: bool, offsets: bool):
     np.testing.assert_array_equal(mesh.vertices, POINTS)
     strips = [] if offsets else [[0, 1, 3], [1, 2, 3]]
     np.testing.assert_array_equal(mesh.faces, QUAD_AND_TRIANGLE + strips)
-
-
-def vtp(form: str, compressed: bool, order: str, header: str) -> bytes:
-    """A quad and a triangle as VTK's own writer would encode them."""
-    word = order + {"UInt32": "u4", "UInt64": "u8"}[header]
-    appended = b""
-
-    def array(name: str, kind: str, values: object) -> bytes:
-        nonlocal appended
-        data = np.asarray(values).astype(order + {"Float64": "f8", "Int64": "i8"}[kind]).tobytes()
-        tag = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="1" format='.encode()
-        if form == "ascii":
-            return tag + b'"ascii">\n' + " ".join(map(str, np.ravel(values))).encode() + b"\n</DataArray>"
-        if compressed:
-            blocks = [data[i : i + 40] for i in range(0, len(data), 40)]
-            packed = [zlib.compress(block) for block in blocks]
-            sizes = [len(blocks), 40, len(data) % 40, *map(len, packed)]
-            head, body = np.array(sizes, word).tobytes(), b"".join(packed)
-        else:
-            head, body = np.array([len(data)], word).tobytes(), data
-        if form == "raw":
-            whole = head + body
-        elif compressed:
-            whole = base64.b64encode(head) + base64.b64encode(body)
-        else:
-            whole = base64.b64encode(head + body)
-        if form == "inline":
-            return tag + b'"binary">\n  ' + whole + b"\n</DataArray>"
-        offset = len(appended)
-        appended += whole
-        return tag + f'"appended" offset="{offset}"/>'.encode()
-
-    out = f'<?xml version="1.0"?><VTKFile type="PolyData" header_type="{header}" byte_order='.encode()
-    out += b'"LittleEndian"' if order == "<" else b'"BigEndian"'
-    out += b' compressor="vtkZLibDataCompressor"' if compressed else b""
-    out += b'><PolyData><Piece NumberOfPoints="4"><PointData>' + array("s", "Float64", [1, 2, 3, 4])
-    out += b"</PointData><Points>" + array("Points", "Float64", POINTS) + b"</Points><Polys>"
-    out += array("connectivity", "Int64", [0, 1, 2, 3, 1, 2, 3]) + array("offsets", "Int64", [4, 7])
-    out += b"</Polys></Piece></PolyData>"
-    if appended:
-        encoding = b"raw" if form == "raw" else b"base64"
-        out += b'<AppendedData encoding="' + encoding + b'">\n _' + appended + b"\n</AppendedData>"
-    return out + b"</VTKFile>"
 
 
 @pytest.mark.parametrize("header", ["UInt32", "UInt64"])
@@ -386,28 +336,6 @@ def test_a_decompression_bomb_is_refused(write):
 
 
 # glTF
-
-
-def gltf_tree(**changes: object) -> dict[str, object]:
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
-    indices = np.array([0, 1, 2], "<u2").tobytes()
-    uri = "data:application/octet-stream;base64," + base64.b64encode(points + indices).decode()
-    tree: dict[str, object] = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 6},
-        ],
-        "buffers": [{"byteLength": 42, "uri": uri}],
-    }
-    return tree | changes
 
 
 def test_gltf_nodes_move_their_meshes(write):
@@ -650,52 +578,3 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path: Path, tetrahedron: Mesh
         write_mesh(path, tetrahedron.with_vertices(tetrahedron.vertices * 2))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["out.ply"]
-
-
-def samples() -> list[tuple[str, bytes]]:
-    vertices = np.random.default_rng(1).normal(size=(5, 3))
-    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]], dtype=np.int32))
-    out = [(ending, f.write(mesh)) for ending, f in MESH_FORMATS.items()]
-    forms = [("raw", True), ("appended", False), ("ascii", False), ("inline", True)]
-    out += [(".vtp", vtp(form, compressed, "<", "UInt32")) for form, compressed in forms]
-    out.append((".gltf", json.dumps(gltf_tree()).encode()))
-    out.append((".ply", trimesh.creation.box().export(file_type="ply", encoding="ascii")))
-    out.append((".stl", trimesh.creation.box().export(file_type="stl_ascii").encode()))
-    return out
-
-
-@settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(
-    sample=st.sampled_from(samples()),
-    cut=st.one_of(st.none(), st.integers(0, 3000)),
-    edits=st.lists(
-        st.tuples(st.integers(0, 3000), st.one_of(st.binary(max_size=6), st.sampled_from([b"9" * 12, b"-1 ", b"nan"]))),
-        max_size=4,
-    ),
-)
-def test_damage_gives_one_sentence_or_a_mesh(
-    sample: tuple[str, bytes], cut: int | None, edits: list[tuple[int, bytes]]
-):
-    ending, data = sample
-    for at, patch in edits:
-        at %= len(data)
-        data = data[:at] + patch + data[at + len(patch) :]
-    judge(ending, data if cut is None else data[: cut % len(data)])
-
-
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(ending=st.sampled_from(ENDINGS), data=st.binary(max_size=300))
-def test_random_bytes_give_one_sentence_or_a_mesh(ending: str, data: bytes):
-    judge(ending, data)
-
-
-def judge(ending: str, data: bytes) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meshes, "read_bytes", lambda path: data)
-        try:
-            mesh = read_mesh(Path(f"bad{ending}"))
-        except (FileError, MeshError) as error:
-            assert one_sentence(error, "bad")
-            return
-    assert mesh.vertices.dtype == np.float64
-    assert mesh.faces is None or mesh.faces.max() < len(mesh.vertices)

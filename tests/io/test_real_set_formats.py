@@ -5,11 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hand_made import BND, FACE, LM3, NONE, bnt
 
 from shapespace.errors import FileError, FileFormatError, MeshError
-from shapespace.io import landmarks, meshes
 from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks, write_landmarks
 from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, READ_ONLY_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
@@ -31,38 +29,6 @@ def refusal(path: Path) -> str:
 
 # VRML
 
-# As BU-3DFE writes it: no comma after the last point, every face closed, texture parts after the shape.
-FACE = """#VRML V2.0 utf8
-Shape {
- appearance Appearance {
-  texture ImageTexture { url "F0001_AN01WH_F3D.bmp" }
- }
- geometry IndexedFaceSet {
-  coord Coordinate {
-   point [
-    -1.5 0.25 3.000001,
-    1 0 0,
-    1.0e0 +1 0,
-    0 1 -.5
-   ]
-  }
-  coordIndex [
-   0, 1, 2, -1,
-   0, 2, 3, -1
-  ]
-  texCoord TextureCoordinate {
-   point [
-    0.1 0.2,
-    0.3 0.4
-   ]
-  }
-  texCoordIndex [
-   0, 1, 1, -1,
-   0, 1, 0, -1
-  ]
- }
-}
-"""
 CORNERS = [[-1.5, 0.25, 3.000001], [1, 0, 0], [1, 1, 0], [0, 1, -0.5]]
 TWO = [[0, 1, 2], [0, 2, 3]]
 
@@ -201,6 +167,8 @@ def test_movements_of_vrml_1_are_refused_by_name(write, node: str):
         ("0, 2, 3, -1", "0, 2, -1", "only 2 corners"),
         ("0, 2, 3, -1", "0, 2, 3.5, -1", "no whole number"),
         ("0, 2, 3, -1", "0, 2, 0xZ, -1", "no whole number"),
+        ("0, 2, 3, -1", "0, [], 3, -1", "brackets in it"),
+        ("1 0 0,", "1 0 {} 0,", "brackets in it"),
         ("+1 0,", "+1 ,", "not three each"),
         ("+1 0,", "+1 zero,", "text where a number"),
         ("coord Coordinate {", "other Stuff {", "has no points"),
@@ -259,20 +227,6 @@ def test_other_files_of_that_ending_are_refused_by_name(write, content: str | by
 
 
 # Bosphorus
-
-NONE = -1e9
-
-
-def bnt(depth: np.ndarray, step: float = 1.0, name: bytes = b"bs000_N_N_0.png", downwards: bool = False) -> bytes:
-    """Write a grid byte by byte: rows upwards (or downwards), x and y missing too where the depth is."""
-    rows, columns = depth.shape
-    y, x = np.mgrid[0:rows, 0:columns] * step
-    x, y = (np.where(depth == NONE, NONE, value) for value in (x, -y if downwards else y))
-    out = struct.pack("<H", rows) + struct.pack("<H", columns) + struct.pack("<d", NONE)
-    out += struct.pack("<H", len(name)) + name + struct.pack("<I", 5 * rows * columns)
-    for run in (x, y, depth, x / 100, y / 100):
-        out += b"".join(struct.pack("<d", value) for value in run.ravel())
-    return out
 
 
 def towards(mesh: Mesh) -> np.ndarray:
@@ -420,69 +374,7 @@ def test_rows_of_raw_cut_short_are_refused(write):
         refusal(write("a.raw", cut))
 
 
-def samples() -> list[tuple[str, bytes]]:
-    depth = np.arange(12.0).reshape(3, 4)
-    depth[1, 1] = NONE
-    vrml_1 = b"#VRML V1.0 ascii\nSeparator { Coordinate3 { point [ 0 0 0, 1 0 0, 0 1 0 ] } IndexedFaceSet { coordIndex [ 0, 1, 2, -1 ] } }"  # fmt: skip # noqa: E501
-    moved = f"Transform {{ rotation 0 0 1 .5 scale 1 -1 2 children [ {FACE} ] }} DEF a {FACE} Group {{ USE b }}"
-    return [
-        (".wrl", FACE.encode()),
-        (".wrl", moved.encode()),
-        (".wrl", vrml_1),
-        (".bnt", bnt(depth, name=b"a")),
-        (".raw", b"0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1 -0.0\n"),
-        (".raw", b"1 2 3\n4 5 6\n7 8 9\n"),
-    ]
-
-
-@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(
-    sample=st.sampled_from(samples()),
-    cut=st.one_of(st.none(), st.integers(0, 3000)),
-    flips=st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 7)), max_size=3),
-    edits=st.lists(
-        st.tuples(
-            st.integers(0, 3000),
-            st.one_of(st.binary(max_size=6), st.sampled_from([b"9" * 12, b"-1 ", b"nan", b"]", b"{", b'"', b"USE a "])),
-        ),
-        max_size=3,
-    ),
-)
-def test_damage_gives_one_sentence_or_a_mesh(
-    sample: tuple[str, bytes], cut: int | None, flips: list[tuple[int, int]], edits: list[tuple[int, bytes]]
-):
-    ending, data = sample
-    for at, patch in edits:
-        at %= len(data)
-        data = data[:at] + patch + data[at + len(patch) :]
-    broken = bytearray(data)
-    for at, bit in flips:
-        broken[at % len(broken)] ^= 1 << bit
-    judge(ending, bytes(broken) if cut is None else bytes(broken[: cut % len(broken)]))
-
-
-@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(ending=st.sampled_from(ENDINGS), data=st.binary(max_size=300))
-def test_random_bytes_give_one_sentence_or_a_mesh(ending: str, data: bytes):
-    judge(ending, data)
-
-
-def judge(ending: str, data: bytes) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meshes, "read_bytes", lambda path: data)
-        try:
-            mesh = read_mesh(Path(f"bad{ending}"))
-        except (FileError, MeshError) as error:
-            assert one_sentence(error, "bad")
-            return
-    assert mesh.vertices.dtype == np.float64
-    assert mesh.faces is None or mesh.faces.max() < len(mesh.vertices)
-
-
 # Landmarks
-
-BND = "1123\t\t-34.11 20.5 80.25\n1200 -3.0e1 21 81\n0 1 2 3\n"
-LM3 = "# Landmark file\n\n3 landmarks\nOuter left eyebrow\n-50.5 30.25 1\nNose tip\n0 0 0\nChin middle\n1 -60.0 -2e1\n"
 
 
 def test_points_of_bu3dfe_are_named_by_their_position(write):
@@ -521,27 +413,3 @@ def test_landmarks_that_contradict_themselves_are_refused(write, name: str, cont
     with pytest.raises(FileFormatError) as caught:
         read_landmarks(write(name, content))
     assert why in str(caught.value) and one_sentence(caught.value, name)
-
-
-@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-@given(
-    sample=st.sampled_from([(".bnd", BND.encode()), (".lm3", LM3.encode())]),
-    cut=st.one_of(st.none(), st.integers(0, 200)),
-    edits=st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=4)), max_size=3),
-)
-def test_damaged_landmarks_give_one_sentence_or_points(
-    sample: tuple[str, bytes], cut: int | None, edits: list[tuple[int, bytes]]
-):
-    ending, data = sample
-    for at, patch in edits:
-        at %= len(data)
-        data = data[:at] + patch + data[at + len(patch) :]
-    data = data if cut is None else data[: cut % len(data)]
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(landmarks, "read_bytes", lambda path: data)
-        try:
-            marks = read_landmarks(Path(f"bad{ending}"))
-        except FileError as error:
-            assert one_sentence(error, "bad")
-            return
-    assert all(np.isfinite(point).all() for point in marks.values())

@@ -24,6 +24,8 @@ from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, Correspon
 def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
     """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
 
+    A file that cannot be read, or takes more memory than there is, is reported with an error, and the next one read.
+
     Args:
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
@@ -38,6 +40,10 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
             report = examine(read_mesh(path))
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
+            continue
+        except MemoryError:
+            short = f"{path}: not enough memory to read it; thin the scan first."
+            reports.append({"file": str(path), "usable": False, "error": short})
             continue
         facts = asdict(report)
         usable = not any(finding["level"] == "refused" for finding in facts["findings"])

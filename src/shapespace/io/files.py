@@ -8,9 +8,11 @@ import hashlib
 import os
 import platform
 import re
+import stat
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
+from io import BufferedReader
 from pathlib import Path
 
 from shapespace.errors import FileError
@@ -48,16 +50,50 @@ def read_error(path: Path, error: OSError) -> FileError:
     return FileError(f"Cannot read {path}: {error.strerror or error}.")
 
 
-def read_bytes(path: Path) -> bytes:
-    """Return the whole content of `path`.
+def open_file(path: Path) -> BufferedReader:
+    """Open the regular file `path` for reading; a pipe or a device, which may give nothing or never end, is refused.
 
     Raises:
-        FileError: it does not exist or cannot be read.
+        FileError: it does not exist, cannot be read, or is no file.
     """
     try:
-        return path.read_bytes()
+        # Without this flag, opening a pipe waits for somebody to write into it.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        try:
+            mode = os.fstat(handle).st_mode
+            if stat.S_ISDIR(mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            if not stat.S_ISREG(mode):
+                raise FileError(f"Cannot read {path}: it is a pipe or a device, not a file; give a file.")
+            return os.fdopen(handle, "rb")
+        except BaseException:
+            os.close(handle)
+            raise
     except OSError as error:
         raise read_error(path, error) from error
+
+
+def read_bytes(path: Path, at_most: int | None = None) -> bytes:
+    """Return the whole content of `path`.
+
+    Args:
+        path: a regular file.
+        at_most: bytes; a longer file is not read. None for any length.
+
+    Raises:
+        FileError: it does not exist, cannot be read, is no file, or is too long.
+    """
+    with open_file(path) as stream:
+        try:
+            size = os.fstat(stream.fileno()).st_size
+            if at_most is not None and size > at_most:
+                raise FileError(
+                    f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and files of this kind are read up to "
+                    f"{at_most / 2**20:.0f} MiB; thin or split it first."
+                )
+            return stream.read() if at_most is None else stream.read(size)
+        except OSError as error:
+            raise read_error(path, error) from error
 
 
 def make_folder(path: Path) -> Path:
@@ -198,8 +234,8 @@ def sha256_of_file(path: Path) -> str:
     Raises:
         FileError: it cannot be read.
     """
-    try:
-        with path.open("rb") as stream:
+    with open_file(path) as stream:
+        try:
             return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise read_error(path, error) from error
+        except OSError as error:
+            raise read_error(path, error) from error

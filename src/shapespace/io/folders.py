@@ -33,6 +33,7 @@ class _Found:
     folders: list[str] = field(default_factory=list[str])
     linked: list[str] = field(default_factory=list[str])
     broken: list[str] = field(default_factory=list[str])
+    packed: list[str] = field(default_factory=list[str])
 
 
 def mesh_files(
@@ -66,6 +67,7 @@ def mesh_files(
         _look_into(path, path, found, recursive, None if apart_from is None else apart_from.resolve())
         if not found.files:
             below = "; give --recursive for what lies in the folders below it" if found.folders else ""
+            below += "; unpack those that are compressed with gunzip" if found.packed else ""
             raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(endings)}.")
         files += found.files
         left_out += _sentences(path, found, what)
@@ -96,6 +98,8 @@ def _look_into(folder: Path, top: Path, found: _Found, recursive: bool, apart_fr
                     _look_into(path, top, found, recursive, apart_from)
             elif of_kind and path.is_file():
                 found.files.append(path)
+            elif path.name.lower().endswith(tuple(f"{ending}.gz" for ending in found.endings)):
+                found.packed.append(name)
             elif path.is_symlink() and not path.exists() and (of_kind or not path.suffix):
                 found.broken.append(name)
     except OSError as error:
@@ -107,6 +111,7 @@ def _sentences(folder: Path, found: _Found, kind: str) -> Iterator[str]:
         (found.folders, "folder", "folders", "looked into", f"--recursive takes the {kind} there"),
         (found.linked, "link to a folder", "links to folders", "followed", "give that folder too"),
         (found.broken, "broken link", "broken links", "taken", "mend or remove it"),
+        (found.packed, "compressed file", "compressed files", "taken", "unpack them with gunzip first"),
     ):
         if names:
             what = f"1 {one} is" if len(names) == 1 else f"{len(names)} {several} are"

@@ -16,8 +16,9 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import FileError, InputError
+from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes
+from shapespace.io.limits import LARGEST_MESH_FILE_BYTES, Allowance
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
@@ -33,7 +34,10 @@ from shapespace.types import FloatArray, Mesh
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-_UNREADABLE = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+_COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+# What a file may require without its points and triangles becoming others.
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
+_HARMLESS_TOO = ("KHR_mesh_quantization", "KHR_animation_pointer")
 # Far from the origin float32 is too coarse, so the centre goes into the node, which holds doubles.
 _FAR = 16.0
 
@@ -47,17 +51,52 @@ class _Gltf:
     path: Path
     tree: dict[str, Any]
     binary: bytes | None
-    buffers: dict[int, bytes] = field(default_factory=lambda: dict[int, bytes]())
+    allowance: Allowance
+    buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
 
     def buffer(self, index: int) -> bytes:
-        if index not in self.buffers:
-            entry = self.tree["buffers"][index]
-            uri = entry.get("uri")
-            data = self.binary if uri is None else _fetch(uri, self.path)
-            if data is None or len(data) < entry["byteLength"]:
-                raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
-            self.buffers[index] = data
-        return self.buffers[index]
+        entry = self.tree["buffers"][index]
+        uri = entry.get("uri")
+        if uri is None and index != 0:
+            raise self.compressed("a buffer has no data")
+        # By its name, for many buffers may be one file.
+        if uri not in self.buffers:
+            data = self.binary if uri is None else self.fetch(uri)
+            self.buffers[uri] = b"" if data is None else data
+        data = self.buffers[uri]
+        if len(data) < entry["byteLength"]:
+            raise damaged(self.path, f"its buffer {index} is shorter than declared; {CUT_SHORT}")
+        return data
+
+    def fetch(self, uri: str) -> bytes:
+        """Return the bytes of a buffer inside the JSON, or in a file beside it."""
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            if not head.endswith(";base64"):
+                raise damaged(self.path, "it has a buffer that is not base64; export it again")
+            return base64.b64decode(body, validate=True)
+        folder = self.path.parent.resolve()
+        target = (folder / unquote(uri)).resolve()
+        if "://" in uri or not target.is_relative_to(folder):
+            raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+        if not target.exists():
+            raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
+        try:
+            data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
+        except FileError as error:
+            raise damaged(
+                self.path, f"its buffer '{uri[:80]}' is no file that can be read or it is too long"
+            ) from error
+        self.allowance.more_file(len(data))
+        return data
+
+    def compressed(self, otherwise: str) -> FileFormatError:
+        """Return the error for data that are not there, by compression where the file says that it uses one."""
+        used = self.tree.get("extensionsUsed", [])
+        how = next((name for name in _COMPRESSIONS if name in used), None)
+        if how is None:
+            return damaged(self.path, f"{otherwise}; {CUT_SHORT}")
+        return damaged(self.path, f"it is compressed ({how}), so export it again without compression")
 
     def view(self, index: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> Values:
         """Return (count, width) numbers from a buffer view."""
@@ -83,12 +122,16 @@ class _Gltf:
         entry = self.tree["accessors"][index]
         kind = np.dtype(_COMPONENTS[entry["componentType"]])
         width, count = _WIDTHS[entry["type"]], int(entry["count"])
+        if count < 0:
+            raise ValueError("count")
+        # Every array becomes one of eight bytes a number.
+        self.allowance.take(count * width, 8)
         if "bufferView" in entry:
             values = self.view(entry["bufferView"], entry.get("byteOffset", 0), kind, count, width).copy()
-        else:
-            known = sum(b["byteLength"] for b in self.tree["buffers"])
-            check_count(count, 1, known, "values without data", self.path)
+        elif "sparse" in entry:
             values = np.zeros((count, width), dtype=kind)
+        else:
+            raise self.compressed("its points or triangles have no data")
         if "sparse" in entry:
             sparse = entry["sparse"]
             where, what = sparse["indices"], sparse["values"]
@@ -99,22 +142,6 @@ class _Gltf:
         if entry.get("normalized") and kind.kind in "iu":
             return np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
-
-
-def _fetch(uri: str, path: Path) -> bytes:
-    if uri.startswith("data:"):
-        head, _, body = uri.partition(",")
-        if not head.endswith(";base64"):
-            raise damaged(path, "it has a buffer that is not base64; export it again")
-        return base64.b64decode(body, validate=True)
-    folder = path.parent.resolve()
-    target = (folder / unquote(uri)).resolve()
-    if "://" in uri or not target.is_relative_to(folder):
-        raise damaged(path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
-    try:
-        return read_bytes(target)
-    except FileError as error:
-        raise damaged(path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too") from error
 
 
 def read_gltf(data: bytes, path: Path) -> Mesh:
@@ -128,7 +155,8 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
         path: its name; buffers beside it are read from its folder and from nowhere else.
 
     Raises:
-        FileFormatError: it is not glTF 2.0, is cut short, is compressed, or holds no points.
+        FileFormatError: it is not glTF 2.0, is cut short, is compressed, requires an extension that is not known,
+            holds no points, or makes more of its bytes than `io.limits` allows.
         MeshError: faces that point past the end of the vertices.
     """
     binary: bytes | None = None
@@ -141,16 +169,24 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     try:
         if not str(tree["asset"]["version"]).startswith("2"):
             raise damaged(path, "it is not glTF of version 2")
-        for extension in tree.get("extensionsRequired", []):
-            if extension in _UNREADABLE:
-                raise damaged(path, f"it is compressed ({extension}), so export it again without compression")
-        return _scene(_Gltf(path, tree, binary))
+        _refuse_unknown(tree.get("extensionsRequired", []), path)
+        return _scene(_Gltf(path, tree, binary, Allowance(len(data), path)))
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
         raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
     except ValueError as error:
         if isinstance(error, (FileError, InputError)):
             raise
         raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
+
+
+def _refuse_unknown(required: list[Any], path: Path) -> None:
+    for name in map(str, required):
+        if name in _COMPRESSIONS:
+            raise damaged(path, f"it is compressed ({name}), so export it again without compression")
+        if name not in _HARMLESS_TOO and not name.startswith(_HARMLESS):
+            raise damaged(
+                path, f"it requires the extension '{name[:60]}', which is not known here, so export it again without it"
+            )
 
 
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
@@ -194,12 +230,14 @@ def _scene(gltf: _Gltf) -> Mesh:
         if index in seen or index < 0:
             raise damaged(gltf.path, "its nodes do not form a tree; export it again")
         seen.add(index)
+        gltf.allowance.part()
         node = nodes[index]
         matrix = parent @ _local(node)
         stack += [(int(child), matrix) for child in reversed(node.get("children", []))]
         if "mesh" not in node:
             continue
         for vertices, triangles in _primitives(gltf, node):
+            gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
             if triangles is not None:
                 # A mirroring transform turns triangles inside out.
@@ -235,6 +273,7 @@ def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, Ind
     vertices: dict[int, FloatArray] = {}
     triangles: dict[int, list[IndexArray]] = {}
     for primitive in mesh["primitives"]:
+        gltf.allowance.part()
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
             continue
@@ -253,6 +292,7 @@ def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, Ind
             corners = gltf.accessor(primitive["indices"])[:, 0].astype(np.int64)
         else:
             corners = np.arange(len(vertices[key]), dtype=np.int64)
+        gltf.allowance.take(len(corners) if mode == _TRIANGLES else 3 * len(corners), 8)
         if mode == _TRIANGLES:
             if len(corners) % 3:
                 raise damaged(gltf.path, f"its triangles have {len(corners)} corners; {CUT_SHORT}")

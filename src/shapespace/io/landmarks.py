@@ -17,10 +17,13 @@ import numpy as np
 
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
+from shapespace.io.limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.parsing import damaged, json_value, xml_root
 from shapespace.types import FloatArray
 
 Pairs = list[tuple[str, FloatArray]]
+# A label names each of its points, so a long one would be there as often as it has points.
+_LONGEST_LABEL = 256
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
         name -> (3,) float64, in the file's order.
 
     Raises:
-        FileError: it does not exist or cannot be read.
+        FileError: it does not exist, cannot be read, or is longer than `LARGEST_LANDMARK_FILE_BYTES`.
         FileFormatError: it is not in that format, or has a name twice, numbers that are not finite, or no
             landmarks at all.
     """
@@ -152,7 +155,7 @@ def _format(path: Path, verb: str) -> LandmarkFormat:
 
 
 def _content(path: Path) -> bytes:
-    data = read_bytes(path)
+    data = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
     return data
@@ -194,6 +197,7 @@ def _ljson(value: Any, path: Path) -> Pairs:
     groups = value["groups"]
     out: Pairs = []
     for name, group in groups.items():
+        _label(name, path)
         out += _ljson_group(group, f"{name}_" if len(groups) > 1 else "", path)
     return out
 
@@ -202,7 +206,7 @@ def _ljson_1(value: Any, path: Path) -> Pairs:
     out: Pairs = []
     for group in value["groups"]:
         points = [entry["point"] for entry in group["landmarks"]]
-        label = str(group["label"])
+        label = _label(group["label"], path)
         for i, point in enumerate(points):
             if not _absent(point):
                 name = label if len(points) == 1 else f"{label}_{i}"
@@ -214,11 +218,11 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
     points = group["landmarks"]["points"]
     names: dict[int, str] = {}
     for entry in group.get("labels", []):
-        mask = entry["mask"]
+        mask, label = entry["mask"], _label(entry["label"], path)
         for position, index in enumerate(mask):
             if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(points):
-                raise damaged(path, f"label '{str(entry['label'])[:60]}' names a point that is not there")
-            name = str(entry["label"]) if len(mask) == 1 else f"{entry['label']}_{position}"
+                raise damaged(path, f"label '{label[:60]}' names a point that is not there")
+            name = label if len(mask) == 1 else f"{label}_{position}"
             names.setdefault(index, prefix + name)
     ordered = [*names, *(i for i in range(len(points)) if i not in names)]
     out: Pairs = []
@@ -227,6 +231,13 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
         if not _absent(points[i]):
             out.append((name, _point(points[i], f"landmark '{name[:60]}'", path)))
     return out
+
+
+def _label(value: Any, path: Path) -> str:
+    label = str(value)
+    if len(label) > _LONGEST_LABEL:
+        raise damaged(path, f"it has a label of {len(label)} characters ('{label[:60]}...'), so shorten it")
+    return label
 
 
 def _absent(point: Any) -> bool:

@@ -13,14 +13,18 @@ from shapespace.errors import FileFormatError
 from shapespace.io.bnt import read_bnt
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
+from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.obj import read_obj, write_obj
 from shapespace.io.off import read_off, write_off
+from shapespace.io.parsing import plain_text
 from shapespace.io.ply import read_ply, write_ply
 from shapespace.io.raw import read_raw
 from shapespace.io.stl import read_stl, write_stl
 from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
 from shapespace.types import Mesh
+
+_GZIP = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -57,15 +61,18 @@ def read_mesh(path: Path | str) -> Mesh:
         The mesh as the file has it, with whatever is wrong with it.
 
     Raises:
-        FileError: it does not exist or cannot be read.
-        FileFormatError: the ending is unknown, or the content is not in that format, cut short or damaged.
+        FileError: it does not exist, cannot be read, is no file, or is longer than `LARGEST_MESH_FILE_BYTES`.
+        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, compressed
+            as a whole, or out of proportion to the file (`io.limits`).
         MeshError: faces that point past the end of the vertices.
     """
     path = Path(path)
     read = READ_ONLY_FORMATS.get(path.suffix.lower()) or _format(path, "read").read
-    data = read_bytes(path)
+    data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    if data.startswith(_GZIP):
+        raise FileFormatError(f"Cannot read {path}: it is compressed by gzip, so unpack it with gunzip first.")
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
     with np.errstate(invalid="ignore", over="ignore"):
         return read(data, path)
@@ -93,6 +100,8 @@ def _format(path: Path, verb: str) -> MeshFormat:
         known = path.suffix.lower() in READ_ONLY_FORMATS
         what = "can be read, not written" if known else "is not a mesh format"
         endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
+        if verb == "read" and path.suffix.lower() == ".gz":
+            what += ", so unpack it with gunzip first"
         raise FileFormatError(
             f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}."
         )
@@ -101,6 +110,7 @@ def _format(path: Path, verb: str) -> MeshFormat:
 
 def _read_any_vtk(data: bytes, path: Path) -> Mesh:
     # Both endings are used for both formats, so the content decides.
+    data = plain_text(data)
     return read_vtp(data, path) if data.lstrip()[:1] == b"<" else read_vtk(data, path)
 
 

@@ -11,14 +11,16 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
     damaged,
-    equal_lengths,
     fan_triangles,
     floats,
     ints,
+    joined,
+    line_blocks,
     mesh_of,
     number_lines,
+    plain_text,
 )
-from shapespace.types import Mesh
+from shapespace.types import FloatArray, Mesh
 
 
 def read_obj(data: bytes, path: Path) -> Mesh:
@@ -34,43 +36,55 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
         MeshError: faces that point past the end of the vertices.
     """
+    data = plain_text(data)
     if b"\\" in data:
         data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    lines = data.splitlines()
-    points: list[list[bytes]] = []
-    polygons: list[list[bytes]] = []
-    above: list[int] = []
-    for line in lines:
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == b"v":
-            points.append(words)
-        elif words[0] == b"f":
-            polygons.append(words)
-            above.append(len(points))
-    if not points:
+    vertices: list[FloatArray] = []
+    faces: list[IndexArray] = []
+    count = polygon_count = 0
+    for lines in line_blocks(data):
+        points: list[list[bytes]] = []
+        polygons: list[list[bytes]] = []
+        above: list[int] = []
+        for line in lines:
+            words = line.split()
+            if not words:
+                continue
+            if words[0] == b"v":
+                points.append(words)
+            elif words[0] == b"f":
+                polygons.append(words)
+                above.append(count + len(points))
+        if points:
+            vertices.append(_points(points, count, path))
+            count += len(points)
+        if polygons:
+            faces.append(_faces(polygons, above, polygon_count, path))
+            polygon_count += len(polygons)
+    if not count:
         raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
-    if min(map(len, points)) < 4:
-        at = next(i for i, words in enumerate(points) if len(words) < 4)
+    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path)
+
+
+def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
+    widths = set(map(len, points))
+    if min(widths) < 4:
+        at = before + next(i for i, words in enumerate(points) if len(words) < 4)
         raise damaged(path, f"vertex {at + 1} has fewer than three numbers; {CUT_SHORT}")
-    if equal_lengths(points):
-        width = len(points[0])
+    if len(widths) == 1:
         flat = list(chain.from_iterable(points))
-        vertices = np.stack([floats(flat[axis::width], path) for axis in (1, 2, 3)], axis=1)
-    else:
-        vertices = floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
-    faces = _faces(polygons, above, path) if polygons else None
-    return mesh_of(vertices, faces, path)
+        return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
+    return floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
 
 
-def _faces(polygons: list[list[bytes]], above: list[int], path: Path) -> IndexArray:
+def _faces(polygons: list[list[bytes]], above: list[int], before: int, path: Path) -> IndexArray:
     # A comment after the corners is rare, and is looked for only where there is a mark.
     if any(b"#" in word for words in polygons for word in (words[-1], *words[4:])):
         polygons = [b" ".join(words).partition(b"#")[0].split() for words in polygons]
     counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
     if counts.min() < 3:
-        raise damaged(path, f"face {int(np.argmin(counts)) + 1} has fewer than three corners; {CUT_SHORT}")
+        at = before + int(np.argmin(counts))
+        raise damaged(path, f"face {at + 1} has fewer than three corners; {CUT_SHORT}")
     tokens = chain.from_iterable(words[1:] for words in polygons)
     corners = ints((token.partition(b"/")[0] for token in tokens), path)
     if (corners == 0).any():

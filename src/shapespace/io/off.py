@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import re
-from itertools import chain
+from collections.abc import Iterator
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 
-from shapespace.io.parsing import CUT_SHORT, check_count, damaged, fan_triangles, floats, ints, mesh_of, number_lines
-from shapespace.types import Mesh
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    floats,
+    ints,
+    joined,
+    line_blocks,
+    mesh_of,
+    number_lines,
+    plain_text,
+)
+from shapespace.types import FloatArray, Mesh
 
-_KEYWORD = re.compile(rb"(?:ST)?C?N?(4?n?)OFF")
+# Geomview writes CN, MeshLab NC.
+_KEYWORD = re.compile(rb"(?:ST)?(?:CN?|NC?)?(4?n?)OFF")
+_ROWS = 1 << 13
 
 
 def read_off(data: bytes, path: Path) -> Mesh:
-    """Read OFF (also COFF, NOFF, STOFF): polygons become fans.
+    """Read OFF (also COFF, NOFF, CNOFF, NCOFF, STOFF): polygons become fans.
 
     Args:
         data: the whole file.
@@ -25,40 +41,60 @@ def read_off(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is not text OFF in three dimensions, or it is cut short.
         MeshError: faces that point past the end of the vertices.
     """
-    if b"#" in data:
-        data = re.sub(rb"#[^\r\n]*", b"", data)
-    rows = [words for words in map(bytes.split, data.splitlines()) if words]
-    keyword = _KEYWORD.match(rows[0][0]) if rows else None
+    rows = _rows(plain_text(data))
+    first = next(rows, [b""])
+    keyword = _KEYWORD.match(first[0])
     if keyword is None:
         raise damaged(path, "it does not start with 'OFF', so it is not an OFF file")
-    if keyword[1] or rows[0][-1].upper() == b"BINARY":
+    if keyword[1] or first[-1].upper() == b"BINARY":
         raise damaged(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
-    head = [rows[0][0][keyword.end() :], *rows[0][1:]] if len(rows[0][0]) > keyword.end() else rows[0][1:]
-    rows = rows[1:]
-    if not head and rows:
-        head, rows = rows[0], rows[1:]
-    counts = ints(head[:2], path).tolist()
+    head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
+    counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
     if len(counts) < 2:
         raise damaged(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
     n, m = counts
     check_count(n, 6, len(data), "vertices", path)
     check_count(m, 2, len(data), "faces", path)
-    if len(rows) < n + m:
-        raise damaged(
-            path, f"its header declares {n} vertices and {m} faces, but {len(rows)} lines follow; {CUT_SHORT}"
-        )
-    points, polygons = rows[:n], rows[n : n + m]
-    if any(len(words) < 3 for words in points):
+    vertices = joined([_points(part, path) for part in _batches(rows, n, "vertices", path)], np.float64, 3)
+    faces = joined([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
+    return mesh_of(vertices, faces, path)
+
+
+def _rows(data: bytes) -> Iterator[list[bytes]]:
+    """Yield the words of each line that has any, without comments."""
+    comments = b"#" in data
+    for lines in line_blocks(data):
+        for line in lines:
+            words = line.partition(b"#")[0].split() if comments else line.split()
+            if words:
+                yield words
+
+
+def _batches(rows: Iterator[list[bytes]], count: int, what: str, path: Path) -> Iterator[list[list[bytes]]]:
+    left = count
+    while left:
+        part = list(islice(rows, min(left, _ROWS)))
+        if not part:
+            raise damaged(
+                path, f"its header declares {count} {what}, but only {count - left} lines follow; {CUT_SHORT}"
+            )
+        left -= len(part)
+        yield part
+
+
+def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
+    if min(map(len, rows)) < 3:
         raise damaged(path, f"a vertex has fewer than three numbers; {CUT_SHORT}")
-    vertices = floats(chain.from_iterable(words[:3] for words in points), path).reshape(-1, 3)
-    if not m:
-        return mesh_of(vertices, None, path)
-    sizes = ints((words[0] for words in polygons), path)
-    lengths = np.fromiter(map(len, polygons), dtype=np.int64, count=m)
+    return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
+
+
+def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
+    sizes = ints((words[0] for words in rows), path)
+    lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
     if (sizes < 1).any() or (lengths <= sizes).any():
         raise damaged(path, f"a face has fewer corners than it says; {CUT_SHORT}")
-    corners = ints(chain.from_iterable(w[1 : 1 + k] for w, k in zip(polygons, sizes.tolist(), strict=True)), path)
-    return mesh_of(vertices, fan_triangles(sizes, corners), path)
+    corners = ints(chain.from_iterable(w[1 : 1 + k] for w, k in zip(rows, sizes.tolist(), strict=True)), path)
+    return fan_triangles(sizes, corners)
 
 
 def write_off(mesh: Mesh) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,78 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
+from shapespace.io.limits import MOST_PARTS
 from shapespace.types import FloatArray, Mesh
 
 IndexArray = npt.NDArray[np.int64]
 
 CUT_SHORT = "the file is damaged or cut short, so export it again"
 
+# Words of text take forty times their own memory as Python objects, so only this much of it is cut at a time.
+_BLOCK_BYTES = 1 << 18
+_LINE_END = re.compile(rb"\r?\n|\r")
+_SPACE = re.compile(rb"\s")
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
 
 def damaged(path: Path, what: str) -> FileFormatError:
     """Return the one-sentence error that `path` cannot be read because of `what`."""
     return FileFormatError(f"Cannot read {path}: {what}.")
+
+
+def plain_text(data: bytes) -> bytes:
+    """Return `data` without the mark with which some programs begin text in UTF-8."""
+    return data.removeprefix(_BYTE_ORDER_MARK)
+
+
+def _block(text: bytes, at: int, end: re.Pattern[bytes], size: int = _BLOCK_BYTES) -> tuple[bytes, int]:
+    found = end.search(text, at + min(size, _BLOCK_BYTES))
+    stop = found.end() if found else len(text)
+    return text[at:stop], stop
+
+
+def line_blocks(text: bytes) -> Iterator[list[bytes]]:
+    """Yield the lines of `text` in lists of some thousand, so that cutting it takes little memory."""
+    at = 0
+    while at < len(text):
+        block, at = _block(text, at, _LINE_END)
+        yield block.splitlines()
+
+
+def word_block(text: bytes, at: int, size: int = _BLOCK_BYTES) -> tuple[list[bytes], int]:
+    """Return the words in about `size` bytes of `text` from byte `at`, and where the next begin."""
+    block, stop = _block(text, at, _SPACE, size)
+    return block.split(), stop
+
+
+def _word_blocks(text: bytes) -> Iterator[list[bytes]]:
+    at = 0
+    while at < len(text):
+        words, at = word_block(text, at)
+        yield words
+
+
+def floats_of(text: bytes, path: Path) -> FloatArray:
+    """Return the numbers in `text`, between white space, as a flat float64 array.
+
+    Raises:
+        FileFormatError: one of them is not a number.
+    """
+    return joined([floats(words, path) for words in _word_blocks(text)], np.float64)
+
+
+def ints_of(text: bytes, path: Path) -> IndexArray:
+    """Return the numbers in `text`, between white space, as a flat int64 array.
+
+    Raises:
+        FileFormatError: one of them is not a whole number, or is too large for 64 bits.
+    """
+    return joined([ints(words, path) for words in _word_blocks(text)], np.int64)
+
+
+def joined(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:
+    """Return `parts` one after another, or an empty array with rows of shape `row`."""
+    return np.concatenate(parts) if parts else np.zeros((0, *row), dtype=kind)
 
 
 def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
@@ -32,7 +94,7 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
         FileFormatError: one of them is not a number.
     """
     try:
-        return np.array(list(map(float, tokens)), dtype=np.float64)
+        return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
         raise damaged(path, f"it has text where a number should be ({_short(error)})") from error
 
@@ -44,7 +106,7 @@ def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
         FileFormatError: one of them is not a whole number, or is too large for 64 bits.
     """
     try:
-        return np.array(list(map(int, tokens)), dtype=np.int64)
+        return np.fromiter(map(int, tokens), dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise damaged(path, f"it has no whole number where one should be ({_short(error)})") from error
 
@@ -76,8 +138,14 @@ def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
     starts = np.cumsum(sizes) - sizes
     fans = np.maximum(sizes - 2, 0)
     first = np.repeat(starts, fans)
-    step = np.arange(int(fans.sum()), dtype=np.int64) - np.repeat(np.cumsum(fans) - fans, fans)
-    return np.stack([flat[first], flat[first + step + 1], flat[first + step + 2]], axis=1)
+    # The second corner of a triangle is one past the first of its polygon, and one more for each before it there.
+    at = np.arange(1, len(first) + 1, dtype=np.int64)
+    at += np.repeat(starts - (np.cumsum(fans) - fans), fans)
+    out = np.empty((len(first), 3), dtype=np.int64)
+    out[:, 0], out[:, 1] = flat[first], flat[at]
+    at += 1
+    out[:, 2] = flat[at]
+    return out
 
 
 def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
@@ -93,8 +161,10 @@ def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray
     each = np.maximum(sizes - 2, 0)
     step = np.arange(int(each.sum()), dtype=np.int64) - np.repeat(np.cumsum(each) - each, each)
     at = np.repeat(starts, each) + step
-    odd = step % 2
-    return np.stack([flat[at], flat[at + 1 + odd], flat[at + 2 - odd]], axis=1)
+    step %= 2
+    out = np.empty((len(at), 3), dtype=np.int64)
+    out[:, 0], out[:, 1], out[:, 2] = flat[at], flat[at + 1 + step], flat[at + 2 - step]
+    return out
 
 
 def mesh_of(vertices: FloatArray, faces: IndexArray | None, path: Path) -> Mesh:
@@ -116,7 +186,15 @@ def number_lines(values: npt.NDArray[Any], pattern: str) -> str:
 _BARE_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[\w:.-]{1,80}\s*>")
 
 
-class _NoDoctype(ET.TreeBuilder):
+class _Plain(ET.TreeBuilder):
+    elements = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.elements += 1
+        if self.elements > MOST_PARTS:
+            raise ValueError(f"it has more than {MOST_PARTS} elements, which no such file needs")
+        return super().start(tag, attrs)
+
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ValueError("it declares a document type, which is not allowed in such a file")
 
@@ -129,7 +207,7 @@ def xml_root(data: bytes, path: Path) -> ET.Element:
     """
     # MeshLab starts its files with a bare <!DOCTYPE name>, which declares nothing.
     data = _BARE_DOCTYPE.sub(b"", data, count=1)
-    parser = ET.XMLParser(target=_NoDoctype())
+    parser = ET.XMLParser(target=_Plain())
     try:
         parser.feed(data)
         return parser.close()
@@ -171,8 +249,3 @@ def check_count(declared: int, bytes_each: int, available: int, what: str, path:
             path,
             f"its header declares {declared} {what}, but only {max(available, 0)} bytes follow; {CUT_SHORT}",
         )
-
-
-def equal_lengths(rows: Sequence[Sequence[bytes]]) -> bool:
-    """Return whether all `rows` hold the same number of tokens."""
-    return len(set(map(len, rows))) <= 1

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, fan_triangles, floats, ints, mesh_of
+from shapespace.errors import FileFormatError
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    fan_triangles,
+    floats,
+    ints,
+    joined,
+    mesh_of,
+    plain_text,
+    word_block,
+)
 from shapespace.types import FloatArray, Mesh
 
 _SCALARS = {
@@ -52,6 +68,61 @@ class _Element:
         return None
 
 
+class _Words:
+    """The words of ascii data from byte `at`, one after another; few of them are in memory at a time."""
+
+    def __init__(self, data: bytes, at: int) -> None:
+        self.data = data
+        self.begin = self.end = at
+        self.block: list[bytes] = []
+        self.at = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes from the block of the next word on, and one for the space that the last does without."""
+        return len(self.data) - self.begin + 1
+
+    def mark(self) -> tuple[int, int, list[bytes], int]:
+        """Return where the next word is, for `back_to`."""
+        return self.begin, self.end, self.block, self.at
+
+    def back_to(self, mark: tuple[int, int, list[bytes], int]) -> None:
+        """Go back to where `mark` was taken."""
+        self.begin, self.end, self.block, self.at = mark
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self
+
+    def __next__(self) -> bytes:
+        while self.at == len(self.block):
+            if self.end >= len(self.data):
+                raise StopIteration
+            self.begin, self.at = self.end, 0
+            self.block, self.end = word_block(self.data, self.begin)
+        self.at += 1
+        return self.block[self.at - 1]
+
+    def take(self, count: int) -> Iterator[list[bytes]]:
+        """Yield the next `count` words in lists; fewer where the text ends."""
+        while count > 0 and (word := next(self, None)) is not None:
+            part = [word, *self.block[self.at : self.at + count - 1]]
+            self.at += len(part) - 1
+            count -= len(part)
+            yield part
+
+    def some(self, count: int) -> list[bytes]:
+        """Return the next `count` words; fewer where the text ends."""
+        part = self.block[self.at : self.at + count]
+        self.at += len(part)
+        # The rest of a long list lies in the blocks that follow.
+        return part if len(part) == count else [*part, *chain.from_iterable(self.take(count - len(part)))]
+
+    def skip(self, count: int) -> None:
+        """Pass `count` words."""
+        for _ in self.take(count):
+            pass
+
+
 def read_ply(data: bytes, path: Path) -> Mesh:
     """Read PLY: all scalar types, both byte orders, extra properties and elements, polygons as fans.
 
@@ -63,15 +134,15 @@ def read_ply(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is not PLY, is cut short, or holds triangle strips.
         MeshError: faces that point past the end of the vertices.
     """
+    data = plain_text(data)
     order, elements, at = _header(data, path)
     vertices: FloatArray | None = None
     faces: IndexArray | None = None
-    tokens = data[at:].split() if order == "" else []
-    at = 0 if order == "" else at
+    words = _Words(data, at)
     for element in elements:
         if element.name == "tristrips":
             raise damaged(path, "it holds triangle strips, so export it again with plain triangles")
-        available = 2 * (len(tokens) - at) if order == "" else len(data) - at
+        available = words.left if order == "" else len(data) - at
         check_count(element.count, element.least_bytes(order == ""), available, _plural(element.name), path)
         lists = any(p.count is not None for p in element.properties)
         wanted = None
@@ -80,14 +151,21 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             if wanted is None:
                 raise damaged(path, "its faces have no property vertex_indices, so export it again")
         if lists and order == "":
-            counts, corners, at = _ascii_lists(tokens, at, element, wanted, path)
+            counts, corners = _ascii_lists(words, element, wanted, path)
         elif lists:
             counts, corners, at = _binary_lists(data, at, element, order, wanted, path)
         else:
-            if element.name == "vertex":
-                vertices = _positions(data, tokens, at, element, order, path)
-            width = len(element.properties) if order == "" else element.least_bytes(False)
-            at += element.count * width
+            positions = element.name == "vertex"
+            if positions:
+                _refuse_without_xyz(element, path)
+            if order == "":
+                if positions:
+                    vertices = _ascii_positions(words, element, path)
+                else:
+                    words.skip(element.count * len(element.properties))
+            else:
+                vertices = _binary_positions(data, at, element, order) if positions else vertices
+                at += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
             raise damaged(path, "its vertices carry lists, so export it again without them")
@@ -139,54 +217,88 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     return order, elements, start
 
 
-def _positions(data: bytes, tokens: list[bytes], at: int, element: _Element, order: str, path: Path) -> FloatArray:
-    names = [p.name for p in element.properties]
-    if not {"x", "y", "z"} <= set(names):
+def _refuse_without_xyz(element: _Element, path: Path) -> None:
+    if not set("xyz") <= {p.name for p in element.properties}:
         raise damaged(path, "its vertices have no x, y and z")
-    columns = [names.index(axis) for axis in "xyz"]
-    width = len(names)
-    if order == "":
-        values = [floats(tokens[at + c : at + element.count * width : width], path) for c in columns]
-        return np.stack(values, axis=1)
+
+
+def _binary_positions(data: bytes, at: int, element: _Element, order: str) -> FloatArray:
+    names = [p.name for p in element.properties]
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
     table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
     out = np.empty((element.count, 3), dtype=np.float64)
-    for axis, column in enumerate(columns):
-        out[:, axis] = table[f"p{column}"]
+    for axis, name in enumerate("xyz"):
+        out[:, axis] = table[f"p{names.index(name)}"]
     return out
 
 
-def _ascii_lists(
-    tokens: list[bytes], at: int, element: _Element, wanted: int | None, path: Path
-) -> tuple[IndexArray, IndexArray, int]:
+def _ascii_positions(words: _Words, element: _Element, path: Path) -> FloatArray:
+    names = [p.name for p in element.properties]
+    width = len(names)
+    columns: dict[str, list[FloatArray]] = {axis: [] for axis in "xyz"}
+    taken = 0
+    for part in words.take(element.count * width):
+        for axis, parts in columns.items():
+            # A part may begin and end anywhere in a row.
+            parts.append(floats(part[(names.index(axis) - taken) % width :: width], path))
+        taken += len(part)
+    if taken < element.count * width:
+        raise _ended(element, path)
+    return np.stack([joined(parts, np.float64) for parts in columns.values()], axis=1)
+
+
+def _ended(element: _Element, path: Path) -> FileFormatError:
+    return damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+
+
+def _ascii_lists(words: _Words, element: _Element, wanted: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
     if len(element.properties) == 1 and element.count and wanted == 0:
-        first = int(ints(tokens[at : at + 1], path)[0])
-        end = at + element.count * (first + 1)
-        if first > 0 and end <= len(tokens):
-            block = tokens[at:end]
-            if block[:: first + 1].count(tokens[at]) == element.count:
-                table = ints(block, path).reshape(element.count, first + 1)
-                return table[:, 0], table[:, 1:].ravel(), end
-    sizes: list[int] = []
-    corners: list[bytes] = []
+        table = _alike(words, element.count, path)
+        if table is not None:
+            return table[:, 0], table[:, 1:].ravel()
+    sizes, corners = array("q"), array("q")
     try:
         for _ in range(element.count):
             for i, p in enumerate(element.properties):
                 if p.count is None:
-                    at += 1
+                    next(words)
                     continue
-                size = int(tokens[at])
-                if size < 0 or at + 1 + size > len(tokens):
-                    raise IndexError
+                size = int(next(words))
+                if size < 0:
+                    raise StopIteration
+                part = words.some(size)
+                if len(part) < size:
+                    raise StopIteration
                 if i == wanted:
                     sizes.append(size)
-                    corners += tokens[at + 1 : at + 1 + size]
-                at += 1 + size
-    except ValueError as error:
-        raise damaged(path, f"a list has no length; {CUT_SHORT}") from error
-    except IndexError as error:
-        raise damaged(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}") from error
-    return np.array(sizes, dtype=np.int64), ints(corners, path), at
+                    corners.extend(map(int, part))
+    except (ValueError, OverflowError) as error:
+        raise damaged(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
+    except StopIteration as error:
+        raise _ended(element, path) from error
+    return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
+
+
+def _alike(words: _Words, count: int, path: Path) -> IndexArray | None:
+    """Return (count, n + 1) the sizes and corners of lists that are all as long as the first; None if they are not."""
+    start = words.mark()
+    first = next(words, b"")
+    size = int(ints([first], path)[0])
+    words.back_to(start)
+    if size <= 0 or count * (size + 1) * 2 > words.left:
+        return None
+    taken = 0
+    parts: list[IndexArray] = []
+    for part in words.take(count * (size + 1)):
+        lengths = part[-taken % (size + 1) :: size + 1]
+        if lengths.count(first) != len(lengths):
+            break
+        parts.append(ints(part, path))
+        taken += len(part)
+    if taken == count * (size + 1):
+        return np.concatenate(parts).reshape(count, size + 1)
+    words.back_to(start)
+    return None
 
 
 def _binary_lists(
@@ -206,8 +318,7 @@ def _binary_lists(
         count_bytes = 0 if p.count is None else np.dtype(p.count).itemsize
         signed = p.count is not None and p.count[0] == "i"
         plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == wanted))
-    starts: list[int] = []
-    sizes: list[int] = []
+    starts, sizes = array("q"), array("q")
     for _ in range(element.count):
         for count_bytes, item, signed, keep in plan:
             if count_bytes == 0:

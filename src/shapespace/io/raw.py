@@ -9,9 +9,12 @@ from __future__ import annotations
 from itertools import chain
 from pathlib import Path
 
-from shapespace.io.parsing import CUT_SHORT, damaged, floats, mesh_of
+import numpy as np
+
+from shapespace.io.limits import Allowance
+from shapespace.io.parsing import CUT_SHORT, damaged, floats, joined, line_blocks, mesh_of, plain_text
 from shapespace.io.stl import merge_equal
-from shapespace.types import Mesh
+from shapespace.types import FloatArray, Mesh
 
 
 def read_raw(data: bytes, path: Path) -> Mesh:
@@ -31,22 +34,32 @@ def read_raw(data: bytes, path: Path) -> Mesh:
         raise damaged(
             path, "it is binary, a picture or a volume perhaps; of .raw only text with 3 or 9 numbers a row is read"
         )
-    lines = [line.partition(b"#")[0].replace(b",", b" ").split() for line in data.splitlines()]
-    rows = [(number, words) for number, words in enumerate(lines, start=1) if words and not _is_name(words)]
-    if not rows:
+    allowance = Allowance(len(data), path)
+    parts: list[FloatArray] = []
+    before = width = first = 0
+    for lines in line_blocks(plain_text(data)):
+        split = [line.partition(b"#")[0].replace(b",", b" ").split() for line in lines]
+        # To tell the name of an object from a number takes long, and a file has few.
+        allowance.part(sum(len(words) == 1 for words in split))
+        rows = [(number, words) for number, words in enumerate(split, before + 1) if words and not _is_name(words)]
+        before += len(lines)
+        if rows and not first:
+            first, width = rows[0][0], len(rows[0][1])
+        other = next((row for row in rows if len(row[1]) != width), None)
+        if other is not None:
+            raise damaged(
+                path, f"line {first} has {width} columns, but line {other[0]} has {len(other[1])}; {CUT_SHORT}"
+            )
+        if width not in (0, 3, 9):
+            raise damaged(
+                path,
+                f"its rows have {width} columns, but of .raw only 3 (points) and 9 (triangles) are read; convert it to "
+                "PLY",
+            )
+        parts.append(floats(chain.from_iterable(words for _, words in rows), path).reshape(-1, 3))
+    if not first:
         raise damaged(path, "it has no rows of 3 or 9 numbers")
-    width = len(rows[0][1])
-    other = next((row for row in rows if len(row[1]) != width), None)
-    if other is not None:
-        raise damaged(
-            path, f"line {rows[0][0]} has {width} columns, but line {other[0]} has {len(other[1])}; {CUT_SHORT}"
-        )
-    if width not in (3, 9):
-        raise damaged(
-            path,
-            f"its rows have {width} columns, but of .raw only 3 (points) and 9 (triangles) are read; convert it to PLY",
-        )
-    values = floats(chain.from_iterable(words for _, words in rows), path).reshape(-1, 3)
+    values = joined(parts, np.float64, 3)
     if width == 3:
         return mesh_of(values, None, path)
     vertices, index = merge_equal(values)

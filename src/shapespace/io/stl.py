@@ -9,10 +9,22 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.io.parsing import CUT_SHORT, IndexArray, check_count, damaged, floats, mesh_of
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    check_count,
+    damaged,
+    floats,
+    joined,
+    line_blocks,
+    mesh_of,
+    plain_text,
+)
 from shapespace.types import FloatArray, Mesh
 
 _ROW = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# A few corners closer than float32 can tell are noise; with more, the surface that is read is another one.
+_MOST_MERGED = 0.01
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:
@@ -26,11 +38,13 @@ def read_stl(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is not STL, holds no triangles, or is cut short.
     """
     declared = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
-    # Many binary files start with "solid" too, so the length decides.
-    if declared >= 0 and len(data) == 84 + 50 * declared:
+    # Many binary files start with "solid" too, so the length decides: text, taken for a number, declares thousands of
+    # millions of triangles.
+    if declared >= 0 and len(data) >= 84 + 50 * declared:
         binary = True
     else:
-        binary = not (data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096].lower())
+        head = plain_text(data[:4096]).lower()
+        binary = not (head.lstrip()[:5] == b"solid" and b"facet" in head)
     if not binary:
         corners = _ascii_corners(data, path)
     elif declared < 0:
@@ -46,12 +60,21 @@ def read_stl(data: bytes, path: Path) -> Mesh:
 
 
 def _ascii_corners(data: bytes, path: Path) -> FloatArray:
-    lines = [words for words in map(bytes.split, data.lower().splitlines()) if words]
-    rows = [words for words in lines if words[0] == b"vertex"]
-    facets = sum(words[0] == b"facet" for words in lines)
-    if lines[-1][0] != b"endsolid" or len(rows) != 3 * facets or any(len(words) != 4 for words in rows):
-        raise damaged(path, f"it holds {len(rows)} corners for {facets} triangles, or has no end; {CUT_SHORT}")
-    return floats(chain.from_iterable(words[1:] for words in rows), path).reshape(-1, 3)
+    corners: list[FloatArray] = []
+    count = facets = 0
+    last = b""
+    for lines in line_blocks(plain_text(data)):
+        words = [split for split in map(bytes.split, map(bytes.lower, lines)) if split]
+        rows = [split for split in words if split[0] == b"vertex"]
+        facets += sum(split[0] == b"facet" for split in words)
+        last = words[-1][0] if words else last
+        if any(len(split) != 4 for split in rows):
+            raise damaged(path, f"a corner has not three numbers; {CUT_SHORT}")
+        corners.append(floats(chain.from_iterable(split[1:] for split in rows), path).reshape(-1, 3))
+        count += len(rows)
+    if last != b"endsolid" or count != 3 * facets:
+        raise damaged(path, f"it holds {count} corners for {facets} triangles, or has no end; {CUT_SHORT}")
+    return joined(corners, np.float64, 3)
 
 
 def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
@@ -80,13 +103,22 @@ def write_stl(mesh: Mesh) -> bytes:
     """Return `mesh` as binary STL: float32, its triangles only, without their numbering of vertices.
 
     Raises:
-        InputError: it has no triangles, or coordinates too large for float32.
+        InputError: it has no triangles, coordinates too large for float32, or so far from the origin that float32
+            would make one of more than 1 % of its vertices.
     """
     if mesh.faces is None:
         raise InputError(f"{mesh.name} has no triangles, and STL holds nothing else; write it as PLY instead.")
     corners = mesh.vertices[mesh.faces]
     if (np.abs(corners) > np.finfo(np.float32).max).any():
         raise InputError(f"{mesh.name} has coordinates too large for STL; write it as PLY instead.")
+    used = np.unique(mesh.faces)
+    apart = len(merge_equal(mesh.vertices[used])[0])
+    left = len(merge_equal(mesh.vertices[used].astype(np.float32).astype(np.float64))[0])
+    if apart - left > _MOST_MERGED * apart:
+        raise InputError(
+            f"{mesh.name} lies so far from the origin, for its size, that STL's float32 would merge its {apart} "
+            f"vertices into {left}; move it to the origin, or write it as PLY."
+        )
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     table = np.zeros(len(corners), dtype=_ROW)

@@ -13,17 +13,29 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import MeshError
-from shapespace.io.parsing import CUT_SHORT, IndexArray, damaged, fan_triangles, floats, ints, mesh_of
+from shapespace.io.limits import Allowance
+from shapespace.io.parsing import (
+    CUT_SHORT,
+    IndexArray,
+    damaged,
+    fan_triangles,
+    floats,
+    floats_of,
+    ints_of,
+    mesh_of,
+    plain_text,
+)
 from shapespace.types import FloatArray, Mesh
 
 # A string without an end swallows the rest, so that no position is scanned twice.
-_SKIPPED = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*', re.DOTALL)
-_TOKEN = re.compile(rb"[{}\[\]]|[^\s,{}\[\]]+")
-# Each open bracket may cost one look over the rest of the file.
+_SKIPPED = re.compile(rb'(?:(?:"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*)[\s,]*+)++', re.DOTALL)
+_TO_BRACKET = re.compile(rb"[^{}\[\]]*+")
+_HEXADECIMAL = re.compile(rb"(?<!\S)0[xX][0-9a-fA-F]{1,16}(?!\S)")
 _DEEPEST = 500
 _POINTS = (b"Coordinate", b"Coordinate3", b"CoordinateDouble")
 _MOVES_OF_VRML_1 = (b"MatrixTransform", b"Translation", b"Rotation", b"Scale")
 _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"scaleOrientation": 4, b"center": 3}
+_KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 
 @dataclass
@@ -32,6 +44,7 @@ class _Node:
 
     kind: bytes
     name: bytes = b""
+    frame: int = 0
     first_block: int = 0
     first_set: int = 0
     outer_points: int | None = None
@@ -43,12 +56,18 @@ class _Node:
 
 @dataclass
 class _Scene:
-    """What has been read so far: blocks of points, and triangles with the block that each set points into."""
+    """What has been read so far: blocks of points, triangles with the block that each set points into, and frames.
+
+    A frame is what a Transform moves: the frame outside of it, and its (3, 4) matrix, which is only known where the
+    Transform ends. Frame 0 is the file's own.
+    """
 
     path: Path
     version_1: bool
-    blocks: list[FloatArray] = field(default_factory=lambda: list[FloatArray]())
-    sets: list[tuple[int, IndexArray]] = field(default_factory=lambda: list[tuple[int, IndexArray]]())
+    allowance: Allowance
+    blocks: list[tuple[FloatArray, int]] = field(default_factory=lambda: list[tuple[FloatArray, int]]())
+    sets: list[tuple[int, IndexArray, int]] = field(default_factory=lambda: list[tuple[int, IndexArray, int]]())
+    frames: list[tuple[int, FloatArray]] = field(default_factory=lambda: [(0, np.eye(3, 4))])
     stack: list[_Node] = field(default_factory=lambda: list[_Node]())
     named_points: dict[bytes, int] = field(default_factory=lambda: dict[bytes, int]())
     named_shapes: set[bytes] = field(default_factory=lambda: set[bytes]())
@@ -60,13 +79,24 @@ class _Scene:
     def open(self, kind: bytes, name: bytes = b"") -> None:
         if len(self.stack) >= _DEEPEST:
             raise damaged(self.path, f"its nodes are nested more than {_DEEPEST} deep")
-        node = _Node(kind, name, len(self.blocks), len(self.sets), self.last_points, clockwise=self.clockwise)
+        self.allowance.part()
+        frame = self.frame
+        if kind == b"Transform":
+            frame = len(self.frames)
+            self.frames.append((self.frame, np.eye(3, 4)))
+        node = _Node(kind, name, frame, len(self.blocks), len(self.sets), self.last_points, clockwise=self.clockwise)
         self.stack.append(node)
+
+    @property
+    def frame(self) -> int:
+        """Where one stands."""
+        return self.stack[-1].frame if self.stack else 0
 
     def words(self, words: list[bytes]) -> None:
         """Take the plain fields that stand in the innermost node."""
         node = self.stack[-1] if self.stack else _Node(b"")
-        for at, word in enumerate(words):
+        for at in [at for at, word in enumerate(words) if word in _KNOWN]:
+            word = words[at]
             after = words[at + 1 : at + 2]
             if word == b"USE" and after:
                 self.use(after[0], node)
@@ -95,10 +125,10 @@ class _Scene:
         """Take a list that holds no nodes."""
         node = self.stack[-1] if self.stack else _Node(b"")
         if name == b"point" and node.kind in _POINTS:
-            points = floats(text.replace(b",", b" ").split(), self.path)
+            points = floats_of(text.replace(b",", b" "), self.path)
             if len(points) % 3:
                 raise damaged(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
-            self.blocks.append(points.reshape(-1, 3))
+            self.blocks.append((points.reshape(-1, 3), node.frame))
             block = len(self.blocks) - 1
             if node.name:
                 self.named_points[node.name] = block
@@ -136,14 +166,14 @@ class _Scene:
         if len(counts) and counts.min() < 3:
             raise damaged(self.path, f"a face has only {int(counts.min())} corners; {CUT_SHORT}")
         corners = node.index[node.index >= 0]
-        points = len(self.blocks[block])
+        points = len(self.blocks[block][0])
         if len(corners) and corners.max() >= points:
             raise MeshError(
                 f"{self.path.name}: a face points at vertex {int(corners.max())}, but there are only {points} "
                 "vertices; the file is damaged or cut short."
             )
         faces = fan_triangles(counts, corners)
-        self.sets.append((block, faces[:, ::-1] if node.clockwise else faces))
+        self.sets.append((block, faces[:, ::-1] if node.clockwise else faces, node.frame))
 
     def move(self, node: _Node) -> None:
         """Apply a Transform to what stands in it: T C R SR S -SR -C, section 6.52 of the standard."""
@@ -159,13 +189,21 @@ class _Scene:
                 self.path, "it moves its shapes by 'Transform' of VRML 1, so export it again as VRML 2 or PLY"
             )
         self.moved = True
-        shift = given.get(b"translation", zero) + center
-        for block in range(node.first_block, len(self.blocks)):
-            self.blocks[block] = (self.blocks[block] - center) @ linear.T + shift
-        if np.linalg.det(linear) < 0:
-            for at in range(node.first_set, len(self.sets)):
-                block, faces = self.sets[at]
-                self.sets[at] = (block, faces[:, ::-1])
+        shift = given.get(b"translation", zero) + center - linear @ center
+        self.frames[node.frame] = (self.frames[node.frame][0], np.column_stack([linear, shift]))
+
+    def placed(self) -> tuple[FloatArray, IndexArray | None]:
+        """Return all points in the file's own frame, and the triangles; those that are mirrored are turned."""
+        matrices = self.frames[:1]
+        for outer, inner in self.frames[1:]:
+            # An outer frame stands before those in it, so it is in the file's own frame already.
+            of_outer = matrices[outer][1]
+            matrices.append((outer, of_outer[:, :3] @ inner + np.column_stack([np.zeros((3, 3)), of_outer[:, 3]])))
+        points = [at if not k else at @ matrices[k][1][:, :3].T + matrices[k][1][:, 3] for at, k in self.blocks]
+        starts = np.cumsum([0, *map(len, points)])
+        mirrored = np.linalg.det(np.stack([matrix[:, :3] for _, matrix in matrices])) < 0
+        faces = [(at[:, ::-1] if mirrored[k] else at) + starts[block] for block, at, k in self.sets]
+        return np.concatenate(points), np.concatenate(faces) if faces else None
 
 
 def _turn(axis_angle: FloatArray) -> FloatArray:
@@ -179,11 +217,11 @@ def _turn(axis_angle: FloatArray) -> FloatArray:
 
 
 def _corners(text: bytes, path: Path) -> IndexArray:
-    tokens = text.replace(b",", b" ").split()
+    text = text.replace(b",", b" ")
     if b"x" in text or b"X" in text:
         # VRML allows hexadecimal whole numbers.
-        tokens = [b"%d" % int(t, 16) if re.fullmatch(rb"0[xX][0-9a-fA-F]{1,16}", t) else t for t in tokens]
-    index = ints(tokens, path)
+        text = _HEXADECIMAL.sub(lambda found: b"%d" % int(found[0], 16), text)
+    index = ints_of(text, path)
     if len(index) and index.min() < -1:
         raise damaged(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
     # The last face may do without its end.
@@ -201,49 +239,53 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
         path: its name, for messages and the mesh's name.
 
     Raises:
-        FileFormatError: it holds no points, is cut short or compressed, shows a shape twice (`USE`), or moves shapes by
-            nodes of VRML 1.
+        FileFormatError: it holds no points, is cut short, has too many nodes (`io.limits`), shows a shape twice
+            (`USE`), or moves shapes by nodes of VRML 1.
         MeshError: faces that point past the end of their points.
     """
-    if data[:2] == b"\x1f\x8b":
-        raise damaged(path, "it is compressed, so unpack it with gunzip first")
-    scene = _Scene(path, version_1=data.lstrip()[:8].upper() == b"#VRML V1")
+    data = plain_text(data)
+    scene = _Scene(path, data.lstrip()[:8].upper() == b"#VRML V1", Allowance(len(data), path))
     text = _SKIPPED.sub(b" ", data)
-    words: list[bytes] = []
     at = 0
-    while match := _TOKEN.search(text, at):
-        token, at = match[0], match.end()
-        if token not in (b"{", b"}", b"[", b"]"):
-            words.append(token)
-            continue
-        if token == b"{":
+    while at < len(text):
+        stop = _to_bracket(text, at)
+        words = text[at:stop].replace(b",", b" ").split()
+        bracket, at = text[stop : stop + 1], stop + 1
+        if bracket == b"{":
             name = words[-2] if words[-3:-2] == [b"DEF"] else b""
             kind = words.pop() if words else b""
             scene.words(words)
             scene.open(kind, name)
-        elif token == b"[":
-            close = text.find(b"]", at)
-            if close < 0:
-                raise damaged(path, f"a list has no end; {CUT_SHORT}")
+        elif bracket == b"[":
             kind = words.pop() if words else b""
             scene.words(words)
-            if text.find(b"{", at, close) < 0:
+            close = _to_bracket(text, at)
+            if text[close : close + 1] == b"]":
+                scene.allowance.part()
                 scene.numbers(kind, text[at:close])
                 at = close + 1
+            elif close == len(text):
+                raise damaged(path, f"a list has no end; {CUT_SHORT}")
+            elif text[close : close + 1] == b"[" or kind in (b"point", b"coordIndex"):
+                raise damaged(path, f"a list of numbers has brackets in it; {CUT_SHORT}")
             else:
                 scene.open(b"[")
         else:
             scene.words(words)
-            if not scene.stack or (scene.stack[-1].kind == b"[") != (token == b"]"):
-                raise damaged(path, f"its brackets do not match; {CUT_SHORT}")
-            scene.close()
-        words.clear()
+            if bracket:
+                if not scene.stack or (scene.stack[-1].kind == b"[") != (bracket == b"]"):
+                    raise damaged(path, f"its brackets do not match; {CUT_SHORT}")
+                scene.close()
     if scene.stack:
         raise damaged(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
-    if not sum(map(len, scene.blocks)):
+    if not sum(len(points) for points, _ in scene.blocks):
         raise damaged(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
     if scene.shared and scene.moved:
         raise damaged(path, "shapes that are moved share their points (USE), so export it again as plain triangles")
-    starts = np.cumsum([0, *map(len, scene.blocks)])
-    faces = [triangles + starts[block] for block, triangles in scene.sets]
-    return mesh_of(np.concatenate(scene.blocks), np.concatenate(faces) if faces else None, path)
+    return mesh_of(*scene.placed(), path)
+
+
+def _to_bracket(text: bytes, at: int) -> int:
+    """Return where the next bracket is, or the end."""
+    found = _TO_BRACKET.match(text, at)
+    return found.end() if found else len(text)

@@ -9,13 +9,15 @@ import base64
 import re
 import xml.etree.ElementTree as ET
 import zlib
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.io.limits import Allowance
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
@@ -23,15 +25,20 @@ from shapespace.io.parsing import (
     damaged,
     fan_triangles,
     floats,
+    floats_of,
     ints,
+    ints_of,
+    joined,
     mesh_of,
+    plain_text,
     strip_triangles,
+    word_block,
     xml_root,
 )
 from shapespace.types import FloatArray, Mesh
 
 _LEGACY = {
-    "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2",
+    "unsigned_char": "u1", "char": "i1", "signed_char": "i1", "unsigned_short": "u2", "short": "i2",
     "unsigned_int": "u4", "int": "i4", "unsigned_long": "u8", "long": "i8",
     "vtktypeint64": "i8", "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
     "vtkidtype": "i4", "float": "f4", "double": "f8",
@@ -40,67 +47,94 @@ _XML = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-_SECTIONS = {b"POINTS", b"VERTICES", b"LINES", b"POLYGONS", b"TRIANGLE_STRIPS", b"POINT_DATA", b"CELL_DATA"}
+# Fields may hold these too, which no surface needs, so they are passed over.
+_TEXTS = ("string", "utf8_string")
+_LINES = ("variant",)
+_BITS = ("bit",)
+_WORD = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
+_OFFSETS = re.compile(rb"\s*OFFSETS\s")
+_BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 # zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
 _MAX_INFLATION = 1040
 
 Values = npt.NDArray[Any]
 
 
-class _Cursor(Protocol):
-    def word(self) -> bytes:
-        """Return the next word, or nothing at the end."""
-        ...
+class _Cursor(ABC):
+    """Where a legacy file is being read: words here, and numbers as ascii or binary makes them."""
 
-    def array(self, count: int, kind: str) -> Values:
-        """Return the next `count` numbers of the numpy `kind`."""
-        ...
-
-    def skip_metadata(self) -> None:
-        """Move past a METADATA section."""
-        ...
-
-    def skip_if_offsets(self) -> bool:
-        """Move past the word OFFSETS if it comes next, and return whether it did."""
-        ...
-
-
-class _TextCursor:
-    def __init__(self, data: bytes, path: Path) -> None:
-        self.tokens, self.at, self.path = data.split(), 0, path
-
-    def word(self) -> bytes:
-        self.at += 1
-        return self.tokens[self.at - 1] if self.at <= len(self.tokens) else b""
-
-    def array(self, count: int, kind: str) -> Values:
-        check_count(count, 2, 2 * (len(self.tokens) - self.at), "numbers", self.path)
-        block = self.tokens[self.at : self.at + count]
-        self.at += count
-        return floats(block, self.path) if kind[0] == "f" else ints(block, self.path)
-
-    def skip_metadata(self) -> None:
-        while self.at < len(self.tokens) and self.tokens[self.at] not in _SECTIONS:
-            self.at += 1
-
-    def skip_if_offsets(self) -> bool:
-        found = self.tokens[self.at : self.at + 1] == [b"OFFSETS"]
-        self.at += found
-        return found
-
-
-class _BinaryCursor:
     def __init__(self, data: bytes, path: Path) -> None:
         self.data, self.at, self.path = data, 0, path
-        self.pattern = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
 
     def word(self) -> bytes:
-        match = self.pattern.match(self.data, self.at)
+        """Return the next word, or nothing at the end."""
+        match = _WORD.match(self.data, self.at)
         if match is None:
             return b""
         self.at = match.end()
         return match[1]
 
+    @abstractmethod
+    def array(self, count: int, kind: str) -> Values:
+        """Return the next `count` numbers of the numpy `kind`."""
+
+    @abstractmethod
+    def skip_texts(self, count: int) -> None:
+        """Move past `count` pieces of text."""
+
+    @abstractmethod
+    def skip_bits(self, count: int) -> None:
+        """Move past `count` bits."""
+
+    def skip_lines(self, count: int) -> None:
+        """Move past `count` lines, which are text in binary files too."""
+        check_count(count, 1, len(self.data) - self.at + 1, "lines", self.path)
+        for _ in range(count):
+            end = self.data.find(b"\n", self.at)
+            if end < 0:
+                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
+            self.at = end + 1
+
+    def skip_metadata(self) -> None:
+        """Move past a METADATA section, which a blank line ends."""
+        blank = _BLANK_LINE.search(self.data, max(self.at - 1, 0))
+        if blank is None:
+            raise damaged(self.path, f"it ends among its METADATA; {CUT_SHORT}")
+        self.at = blank.end()
+
+    def skip_if_offsets(self) -> bool:
+        """Move past the word OFFSETS if it comes next, and return whether it did."""
+        # As a number, 'OFFS' would be a polygon of a thousand million corners.
+        found = _OFFSETS.match(self.data, self.at)
+        self.at = found.end() if found else self.at
+        return found is not None
+
+
+class _TextCursor(_Cursor):
+    def array(self, count: int, kind: str) -> Values:
+        check_count(count, 2, len(self.data) - self.at + 1, "numbers", self.path)
+        parts: list[Values] = []
+        while count:
+            words, stop = word_block(self.data, self.at, 16 * count)
+            if not words and stop == len(self.data):
+                raise damaged(self.path, f"it ends among its numbers; {CUT_SHORT}")
+            if len(words) > count:
+                # Cut again, to see where the last of them ends.
+                rest = self.data[self.at : stop].split(None, count)[count]
+                words, stop = words[:count], stop - len(rest)
+            parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
+            self.at = stop
+            count -= len(words)
+        return joined(parts, np.float64 if kind[0] == "f" else np.int64)
+
+    def skip_texts(self, count: int) -> None:
+        self.skip_lines(count)
+
+    def skip_bits(self, count: int) -> None:
+        self.array(count, "i1")
+
+
+class _BinaryCursor(_Cursor):
     def array(self, count: int, kind: str) -> Values:
         big = np.dtype(">" + kind)
         check_count(count, big.itemsize, len(self.data) - self.at, "numbers", self.path)
@@ -108,15 +142,18 @@ class _BinaryCursor:
         self.at += count * big.itemsize
         return values.astype(np.float64 if kind[0] == "f" else np.int64)
 
-    def skip_metadata(self) -> None:
-        blank = re.compile(rb"\n[ \t\r]*\n").search(self.data, self.at)
-        self.at = blank.end() if blank else len(self.data)
+    def skip_texts(self, count: int) -> None:
+        check_count(count, 1, len(self.data) - self.at, "pieces of text", self.path)
+        for _ in range(count):
+            # The two highest bits of the length tell how many bytes it has.
+            width = 8 >> (self.data[self.at] >> 6) if self.at < len(self.data) else 1
+            length = int.from_bytes(self.data[self.at : self.at + width], "big") & ((1 << (8 * width - 2)) - 1)
+            self.at += width + length
+            if self.at > len(self.data):
+                raise damaged(self.path, f"it ends among its fields; {CUT_SHORT}")
 
-    def skip_if_offsets(self) -> bool:
-        # As a number, 'OFFS' would be a polygon of a thousand million corners.
-        found = self.data.startswith(b"OFFSETS ", self.at)
-        self.at += 8 * found
-        return found
+    def skip_bits(self, count: int) -> None:
+        self.array(-(-count // 8), "u1")
 
 
 def read_vtk(data: bytes, path: Path) -> Mesh:
@@ -132,11 +169,13 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
         FileFormatError: it is not legacy VTK poly data, or it is cut short.
         MeshError: faces that point past the end of the vertices.
     """
+    data = plain_text(data)
     head = data[:1024].split(b"\n", 3)
     if len(head) < 4 or not head[0].startswith(b"# vtk DataFile"):
         raise damaged(path, "it does not start with '# vtk DataFile', so it is not a VTK file")
     encoding = head[2].strip().upper()
     body = data[sum(len(line) + 1 for line in head[:3]) :]
+    allowance = Allowance(len(data), path)
     cursor: _Cursor
     if encoding == b"ASCII":
         cursor = _TextCursor(body, path)
@@ -151,9 +190,10 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
     vertices: FloatArray | None = None
     faces: list[IndexArray] = []
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
+        allowance.part()
         if word == b"POINTS":
             count = _count(cursor, path)
-            vertices = cursor.array(3 * count, _kind(cursor, path)).astype(np.float64).reshape(-1, 3)
+            vertices = cursor.array(3 * count, _next_kind(cursor, path)).astype(np.float64).reshape(-1, 3)
         elif word in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
             counts, corners = _legacy_cells(cursor, path)
             if word == b"POLYGONS":
@@ -162,10 +202,10 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
                 faces.append(strip_triangles(counts, corners))
         elif word == b"FIELD":
             cursor.word()
-            for _ in range(_bounded(_count(cursor, path), path)):
-                cursor.word()
-                components, tuples = _count(cursor, path), _count(cursor, path)
-                cursor.array(components * tuples, _kind(cursor, path))
+            count = _count(cursor, path)
+            allowance.part(max(count, 0))
+            for _ in range(count):
+                _skip_field(cursor, path)
         elif word == b"METADATA":
             cursor.skip_metadata()
         else:
@@ -173,25 +213,33 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
             raise damaged(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
     if vertices is None:
         raise damaged(path, f"it has no POINTS; {CUT_SHORT}")
-    return mesh_of(vertices, _joined(faces), path)
+    return mesh_of(vertices, joined(faces, np.int64, 3), path)
 
 
-def _joined(faces: list[IndexArray]) -> IndexArray | None:
-    return np.concatenate(faces) if faces else None
-
-
-def _bounded(count: int, path: Path) -> int:
-    if not 0 <= count <= 10_000:
-        raise damaged(path, f"it declares {count} field arrays; {CUT_SHORT}")
-    return count
+def _skip_field(cursor: _Cursor, path: Path) -> None:
+    while cursor.word() == b"METADATA":
+        cursor.skip_metadata()
+    count = _count(cursor, path) * _count(cursor, path)
+    name = cursor.word().decode("ascii", "replace").lower()
+    if name in _TEXTS:
+        cursor.skip_texts(count)
+    elif name in _LINES:
+        cursor.skip_lines(count)
+    elif name in _BITS:
+        cursor.skip_bits(count)
+    else:
+        cursor.array(count, _kind(name, path))
 
 
 def _count(cursor: _Cursor, path: Path) -> int:
     return int(ints([cursor.word()], path)[0])
 
 
-def _kind(cursor: _Cursor, path: Path) -> str:
-    name = cursor.word().decode("ascii", "replace").lower()
+def _next_kind(cursor: _Cursor, path: Path) -> str:
+    return _kind(cursor.word().decode("ascii", "replace").lower(), path)
+
+
+def _kind(name: str, path: Path) -> str:
     if name not in _LEGACY:
         raise damaged(path, f"it has numbers of an unknown type '{name[:40]}'; {CUT_SHORT}")
     return _LEGACY[name]
@@ -200,10 +248,10 @@ def _kind(cursor: _Cursor, path: Path) -> str:
 def _legacy_cells(cursor: _Cursor, path: Path) -> tuple[IndexArray, IndexArray]:
     first, second = _count(cursor, path), _count(cursor, path)
     if cursor.skip_if_offsets():
-        offsets = cursor.array(first, _kind(cursor, path)).astype(np.int64)
+        offsets = cursor.array(first, _next_kind(cursor, path)).astype(np.int64)
         if cursor.word() != b"CONNECTIVITY":
             raise damaged(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
-        corners = cursor.array(second, _kind(cursor, path)).astype(np.int64)
+        corners = cursor.array(second, _next_kind(cursor, path)).astype(np.int64)
         return _from_offsets(offsets, corners, path)
     packed = cursor.array(second, "i4").astype(np.int64)
     if first > 0 and second and second % first == 0:
@@ -255,6 +303,7 @@ class _Xml:
     compressed: bool
     appended: bytes
     appended_base64: bool
+    allowance: Allowance
 
 
 def read_vtp(data: bytes, path: Path) -> Mesh:
@@ -285,11 +334,12 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     base = block is not None and block.get("encoding", "base64") == "base64"
     order = ">" if root.get("byte_order") == "BigEndian" else "<"
     header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
-    xml = _Xml(path, order, header, compressor != "", appended, base)
+    xml = _Xml(path, order, header, compressor != "", appended, base, Allowance(len(data), path))
     points: list[FloatArray] = []
     faces: list[IndexArray] = []
     before = 0
     for piece in root.iterfind("PolyData/Piece"):
+        xml.allowance.part()
         vertices = _piece_points(piece, xml)
         for section, cut in (("Polys", fan_triangles), ("Strips", strip_triangles)):
             arrays = {a.get("Name"): a for a in piece.iterfind(f"{section}/DataArray")}
@@ -299,6 +349,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
             corners = _data_array(arrays["connectivity"], xml).astype(np.int64)
             if not len(ends):
                 continue
+            xml.allowance.take(3 * len(corners), 8)
             triangles = cut(*_from_offsets(np.concatenate([[0], ends]), corners, path))
             # Checked piece by piece: joined, an index past one piece would point into the next.
             faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
@@ -306,7 +357,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
         before += len(vertices)
     if not points:
         raise damaged(path, f"it holds no points; {CUT_SHORT}")
-    return mesh_of(np.concatenate(points), _joined(faces), path)
+    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path)
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
@@ -336,65 +387,73 @@ def _data_array(array: ET.Element, xml: _Xml) -> Values:
     form = array.get("format", "ascii")
     text = (array.text or "").encode("ascii", "replace")
     if form == "ascii":
-        return floats(text.split(), path) if kind.kind == "f" else ints(text.split(), path)
+        return floats_of(text, path) if kind.kind == "f" else ints_of(text, path)
     if form == "binary":
-        raw = _decoded(b"".join(text.split()), True, xml)
+        raw = _decoded(b"".join(text.split()), 0, True, xml)
     elif form == "appended":
         offset = int(ints([array.get("offset", "").encode()], path)[0])
         if not 0 <= offset < len(xml.appended):
             raise damaged(path, f"it has data that start past its end; {CUT_SHORT}")
-        raw = _decoded(xml.appended[offset:], xml.appended_base64, xml)
+        raw = _decoded(xml.appended, offset, xml.appended_base64, xml)
     else:
         raise damaged(path, f"it has data of an unknown form '{form[:40]}'")
     if len(raw) % kind.itemsize:
         raise damaged(path, f"it has data that end inside a number; {CUT_SHORT}")
+    # Every array becomes one of eight bytes a number.
+    xml.allowance.take(len(raw) // kind.itemsize, 8)
     return np.frombuffer(raw, dtype=kind)
 
 
-def _decoded(data: bytes, is_base64: bool, xml: _Xml) -> bytes:
-    """Return the bytes of one array that starts at the start of `data`."""
+def _decoded(data: bytes, at: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return the bytes of one array that starts at byte `at` of `data`."""
     width = np.dtype(xml.header).itemsize
     if not xml.compressed:
-        (length,) = _words(data, 1, is_base64, xml)
+        (length,) = _words(data, at, 1, is_base64, xml)
         chars = 4 * -(-width // 3)
         # Some writers encode the length by itself, which leaves padding, and others together with the data.
-        if is_base64 and data[:chars].endswith(b"="):
-            return _stream(data[chars:], 0, length, True, xml)
-        return _stream(data, width, length, is_base64, xml)
-    (blocks,) = _words(data, 1, is_base64, xml)
-    check_count(blocks, width, len(data), "compressed blocks", xml.path)
-    _, size, last, *packed = _words(data, 3 + blocks, is_base64, xml)
+        if is_base64 and data[at : at + chars].endswith(b"="):
+            return _stream(data, at + chars, 0, length, True, xml)
+        return _stream(data, at, width, length, is_base64, xml)
+    (blocks,) = _words(data, at, 1, is_base64, xml)
+    check_count(blocks, width, len(data) - at, "compressed blocks", xml.path)
+    xml.allowance.part(blocks)
+    _, size, last, *packed = _words(data, at, 3 + blocks, is_base64, xml)
     header = (3 + blocks) * width
-    stream = _stream(data[4 * -(-header // 3) if is_base64 else header :], 0, sum(packed), is_base64, xml)
+    stream = _stream(data, at + (4 * -(-header // 3) if is_base64 else header), 0, sum(packed), is_base64, xml)
     out: list[bytes] = []
-    at = 0
+    begin = 0
     for i, length in enumerate(packed):
         want = last if i == len(packed) - 1 and last else size
         if want > _MAX_INFLATION * (length + 16):
             raise damaged(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
+        xml.allowance.take(want, 1)
         try:
-            piece = zlib.decompressobj().decompress(stream[at : at + length], max_length=want or 1)
+            piece = zlib.decompressobj().decompress(stream[begin : begin + length], max_length=want or 1)
         except zlib.error as error:
             raise damaged(xml.path, f"it has a block that cannot be unpacked; {CUT_SHORT}") from error
         if len(piece) != want:
             raise damaged(xml.path, f"it has a compressed block of the wrong length; {CUT_SHORT}")
         out.append(piece)
-        at += length
+        begin += length
     return b"".join(out)
 
 
-def _words(data: bytes, count: int, is_base64: bool, xml: _Xml) -> list[int]:
+def _words(data: bytes, at: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
     """Return the `count` whole numbers at the start of an array."""
     kind = np.dtype(xml.header)
-    return np.frombuffer(_stream(data, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
+    return np.frombuffer(_stream(data, at, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
 
 
-def _stream(data: bytes, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return `length` bytes from byte `start` of what `data` encodes."""
+def _stream(data: bytes, at: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
+    """Return `length` bytes from byte `start` of what `data` encodes from byte `at` on."""
     end = start + length
-    check_count(end, 1, len(data), "bytes of data", xml.path)
+    check_count(end, 1, len(data) - at, "bytes of data", xml.path)
+    if not is_base64:
+        return data[at + start : at + end]
+    # Arrays may lie on the same bytes, so that each counts by itself.
+    xml.allowance.take(end, 1)
     try:
-        raw = base64.b64decode(data[: 4 * -(-end // 3)], validate=True) if is_base64 else data
+        raw = base64.b64decode(data[at : at + 4 * -(-end // 3)], validate=True)
     except ValueError as error:
         raise damaged(xml.path, f"it has data that are not base64; {CUT_SHORT}") from error
     if len(raw) < end:
