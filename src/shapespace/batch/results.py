@@ -17,13 +17,15 @@ from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.surface import rms_size
-from shapespace.io.files import atomic_path, read_bytes, write_text
+from shapespace.io.files import atomic_path, write_text
+from shapespace.io.json_files import read_json
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import FitRecord, to_json
+from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
+_LARGEST_RECORD = 2**24
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -161,10 +163,7 @@ def read_record(path: Path) -> dict[str, Any]:
         FileError: it cannot be read.
         FileFormatError: it is not the record of a fit.
     """
-    try:
-        record = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
+    record = read_json(path, FIT_AGAIN, _LARGEST_RECORD)
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
         raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
     FitRecord.from_json(cast(object, record), str(path))
