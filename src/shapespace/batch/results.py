@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -20,6 +18,7 @@ from shapespace.geometry.surface import rms_size
 from shapespace.io.files import atomic_path, write_text
 from shapespace.io.json_files import read_json
 from shapespace.io.meshes import write_mesh
+from shapespace.io.tables import CHECKSUM, checked_table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.version import __version__
@@ -236,12 +235,9 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
     every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
     columns += [column for column in every if column not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS, "model_hash"]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(_safe_cells(row) for row in rows)
-    write_text(path, text.getvalue())
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS, CHECKSUM, "model_hash"]
+    cells = ([row.get(column) for column in columns] for row in map(_safe_cells, rows))
+    write_text(path, checked_table_text(columns, cells))
 
 
 def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
