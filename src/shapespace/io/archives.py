@@ -104,7 +104,7 @@ def npy_array(data: bytes) -> npt.NDArray[Any]:
         raise ValueError("is not an array") from error
     start = stream.tell()
     if dtype.kind not in _PLAIN_KINDS or math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError("is cut short or holds objects")
+        raise ValueError("is cut short or holds objects, and is not what its header says")
     flat: npt.NDArray[Any] = (
         np.frombuffer(data, dtype, math.prod(shape), start) if len(data) > start else np.empty(0, dtype)
     )
