@@ -37,7 +37,7 @@ def read(kind: type[_T], content: object, where: str, again: str) -> _T:
     """
     try:
         return msgspec.convert(content, kind)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError, OverflowError, RecursionError) as error:
         said = str(error).replace("`", "").replace("$.", "").replace("Object missing", "missing")
         raise FileFormatError(f"{where} is damaged: {said[:1].lower()}{said[1:]}; {again}.") from error
 

@@ -91,6 +91,7 @@ class StagedFit:
         return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
 
     @staticmethod
+    @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
     def from_arrays(
         arrays: Mapping[str, npt.NDArray[Any]], told: FitResult | FitRecord, *, name: str, label: str
     ) -> StagedFit:
@@ -109,7 +110,7 @@ class StagedFit:
         b, z, b_stddev, shrinkage = (
             np.array(values, dtype=np.float64) for values in (told.b, told.z, told.b_stddev, told.shrinkage)
         )
-        if np.array_equal(arrays.get("format_version", 0), STAGES_VERSION) is False:
+        if not np.array_equal(arrays.get("format_version", 0), STAGES_VERSION):
             raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
         try:
             faces = arrays.get("faces")
