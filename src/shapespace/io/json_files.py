@@ -74,8 +74,13 @@ def _plain(value: object, depth: int) -> object:
         return value
     if depth > _DEEPEST:
         raise ValueError("it is nested too deep")
+    # In place, since a large file is larger still in memory.
     if isinstance(value, list):
-        return [_plain(item, depth + 1) for item in cast(list[object], value)]
-    if isinstance(value, dict):
-        return {key: _plain(item, depth + 1) for key, item in cast(dict[str, object], value).items()}
-    return value
+        items = cast(list[object], value)
+        for at, item in enumerate(items):
+            items[at] = _plain(item, depth + 1)
+    elif isinstance(value, dict):
+        known = cast(dict[str, object], value)
+        for key, item in known.items():
+            known[key] = _plain(item, depth + 1)
+    return cast(object, value)

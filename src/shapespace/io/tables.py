@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -47,23 +47,24 @@ def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
     return f"sha256:{hashlib.sha256(said.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
 
 
-def table_rows(content: bytes) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of a CSV table in UTF-8, checked where it has a column `CHECKSUM`.
+def table_rows(content: bytes) -> Iterator[list[str]]:
+    """Yield the header and then the rows of a CSV table in UTF-8, checked where it has a column `CHECKSUM`.
 
     Raises:
         ValueError: it is none, a row has more or fewer cells than the header, or was changed; with a clause on what.
     """
     try:
-        lines = [row for row in csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True) if row]
+        lines = filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
+        header = next(lines, list[str]())
+        if len(set(header)) != len(header):
+            raise ValueError("has two columns of one name")
+        yield header
+        at = header.index(CHECKSUM) if CHECKSUM in header else None
+        for number, row in enumerate(lines, 1):
+            if len(row) != len(header):
+                raise ValueError(f"has {len(row)} cells in row {number}, and {len(header)} columns")
+            if at is not None and row_checksum(header, row) != row[at]:
+                raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
+            yield row
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"is not a CSV table in UTF-8 ({error})") from error
-    header, rows = (lines[0], lines[1:]) if lines else ([], [])
-    if len(set(header)) != len(header):
-        raise ValueError("has two columns of one name")
-    at = header.index(CHECKSUM) if CHECKSUM in header else None
-    for number, row in enumerate(rows, 1):
-        if len(row) != len(header):
-            raise ValueError(f"has {len(row)} cells in row {number}, and {len(header)} columns")
-        if at is not None and row_checksum(header, row) != row[at]:
-            raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
-    return header, rows

@@ -80,26 +80,35 @@ def read_coefficients(path: Path) -> list[ScanCoefficients]:
         FileFormatError: it is not such a table, or it does not say of which model it is.
     """
     check_file(path, _LARGEST_BYTES, _TABLE_AGAIN)
+    rows = table_rows(read_bytes(path))
     try:
-        heads, rows = table_rows(read_bytes(path))
+        heads = next(rows)
+        modes = _modes(heads, path)
+        scans = [
+            _from_row(dict(zip(heads, row, strict=True)), modes, f"{path}, row {number}")
+            for number, row in enumerate(rows, 1)
+        ]
+    except FileFormatError:
+        raise
     except ValueError as error:
         raise FileFormatError(f"{path} {error}; {_TABLE_AGAIN}.") from error
-    modes = 0
-    while f"z{modes + 1}" in heads:
+    if not scans:
+        raise FileFormatError(f"{path} has no rows; fit some scans first.")
+    return scans
+
+
+def _modes(heads: Sequence[str], path: Path) -> int:
+    known, modes = set(heads), 0
+    while f"z{modes + 1}" in known:
         modes += 1
-    if not modes or not {"scan", "status", "reason"} <= set(heads):
+    if not modes or not {"scan", "status", "reason"} <= known:
         raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
-    if "model_hash" not in heads:
+    if "model_hash" not in known:
         raise FileFormatError(
             f"{path} does not say of which model its coefficients are; run shapespace fit --resume to write it again, "
             "or give the folder of the results."
         )
-    if not rows:
-        raise FileFormatError(f"{path} has no rows; fit some scans first.")
-    return [
-        _from_row(dict(zip(heads, row, strict=True)), modes, f"{path}, row {number}")
-        for number, row in enumerate(rows, 1)
-    ]
+    return modes
 
 
 def _from_row(row: Mapping[str, str], modes: int, where: str) -> ScanCoefficients:
