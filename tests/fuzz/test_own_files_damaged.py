@@ -226,7 +226,7 @@ def other_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
         )
         array.flat[rng.randrange(array.size)] = value
         return array
-    if kind == "type":
+    if kind == "type" and array.dtype.kind != "U":
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return array.astype(rng.choice(["f2", "f8", "i8", "u1", "U7", "c16", "?", ">f4"]))

@@ -18,6 +18,7 @@ from shapespace.batch.results import read_record
 from shapespace.errors import FileError, FileFormatError
 from shapespace.io.archives import read_arrays
 from shapespace.io.json_files import plain_json, read_json
+from shapespace.io.labels import read_labels
 from shapespace.recognise.saved import load_classifier
 from shapespace.recognise.scans import read_coefficients
 from shapespace.report.saved import Folder, find_fits
@@ -149,3 +150,5 @@ def test_a_table_of_many_columns_and_many_short_rows_is_refused_before_it_is_fil
     heads = ",".join(["scan", "status", "reason", "model_hash", *(f"z{k}" for k in range(1, 10_000))])
     (tmp_path / "c.csv").write_text(heads + "\n" + "a\n" * 20_000)
     assert peak_mib(lambda: read_coefficients(tmp_path / "c.csv")) < 5
+    (tmp_path / "l.csv").write_text("file,label," + heads + "\n" + "a\n" * 20_000)
+    assert peak_mib(lambda: read_labels(tmp_path / "l.csv")) < 15

@@ -278,3 +278,17 @@ def test_words_of_any_text_come_back_and_what_is_no_text_is_refused_before_it_is
         with pytest.raises(FileFormatError, match=r"Cannot write .*licence"):
             replace(model, licence=wrong).save(tmp_path / "n.h5")
     assert not (tmp_path / "n.h5").exists()
+
+
+def test_a_model_is_written_as_it_is_read_whatever_h5py_is_set_to_and_else_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = blob_model(vertices=200)
+    monkeypatch.setattr(h5py.get_config(), "track_order", True)
+    model.save(tmp_path / "m.h5")
+    assert ShapeModel.load(tmp_path / "m.h5").content_hash == model.content_hash
+    whole = h5py.File
+    monkeypatch.setattr(h5py, "File", lambda *_, **options: whole(*_, **(options | {"libver": "latest"})))
+    with pytest.raises(FileFormatError, match=r"n\.h5 was not written: h5py .* could not be read"):
+        model.save(tmp_path / "n.h5")
+    assert not (tmp_path / "n.h5").exists()

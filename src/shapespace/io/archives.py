@@ -23,6 +23,7 @@ _MOST_PACKED = 100
 """Times its own size that an archive may unpack to; what we write unpacks to a few times."""
 _SMALL = 2**20
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_TOLD = 80
 _PLAIN_KINDS = "biufU"
 
 
@@ -87,7 +88,7 @@ def zip_members(stream: BinaryIO, size: int) -> dict[str, bytes]:
     except OSError:
         raise
     except Exception as error:  # a damaged archive may raise anything at all
-        raise ValueError(str(error) or "damaged") from error
+        raise ValueError(" ".join(str(error).split())[:_TOLD] or "it is damaged") from error
 
 
 def npy_array(data: bytes) -> npt.NDArray[Any]:

@@ -51,7 +51,7 @@ def write_hdf5(path: Path, arrays: Mapping[str, npt.NDArray[Any]], attributes: M
     memory = io.BytesIO()
     with h5py.File(memory, "w", userblock_size=_USER_BLOCK, libver="earliest", track_order=False) as file:
         for name, array in arrays.items():
-            file.create_dataset(name, data=array)
+            file.create_dataset(name, data=array, track_order=False)
         for name, value in {**attributes, _HASH_NAME: digest}.items():
             try:
                 file.attrs[name] = value
