@@ -19,6 +19,7 @@ from shapespace.errors import FileError, FileFormatError
 from shapespace.io.archives import read_arrays
 from shapespace.io.json_files import plain_json, read_json
 from shapespace.io.labels import read_labels
+from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.saved import load_classifier
 from shapespace.recognise.scans import read_coefficients
 from shapespace.report.saved import Folder, find_fits
@@ -26,7 +27,7 @@ from shapespace.report.saved import Folder, find_fits
 AGAIN = "make it again"
 READERS: list[Callable[[Path], object]] = [
     read_record, read_coefficients, load_classifier, lambda path: read_arrays(path, AGAIN),
-    lambda path: read_json(path, AGAIN),
+    lambda path: read_json(path, AGAIN), ShapeModel.load,
 ]  # fmt: skip
 
 

@@ -20,10 +20,12 @@ import numpy.typing as npt
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.hdf5_parts import SIGNATURE, Attribute, OtherHdf5Error, hdf5_parts
+from shapespace.io.json_files import check_file
 
 _USER_BLOCK = 512
 _MAGIC = b"shapespace sha256 "
 _HASH_NAME = "content_hash"
+_LARGEST_BYTES = 2**33
 
 
 def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Attribute]) -> str:
@@ -82,6 +84,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
         FileError: the file cannot be read.
         FileFormatError: it is not HDF5, was not written by `write_hdf5`, or is cut short or changed since.
     """
+    check_file(path, _LARGEST_BYTES, "give a model written by shapespace build")
     data = read_bytes(path)
     damaged = FileFormatError(
         f"{path} is damaged: its content does not match its checksum; copy it again or rebuild the model."
