@@ -24,7 +24,7 @@ TOKENS = {
 """JSON that `json.dumps` would not write."""
 VALUES: list[Any] = [
     *TOKENS, None, True, 0, 3, -1, 2**62, 1e308, -2.5, 5e-324, "", "text", "\0", "../..", [], {}, [None], [[]],
-    [1, [2]], ["a"], {"a": 1}, [{"b": [1], "z": [1]}], [1.5] * 300,
+    [1, [2]], ["a"], {"a": 1}, [{"b": [1], "z": [1]}], [1.5] * 300, "long " * 400,
 ]  # fmt: skip
 
 

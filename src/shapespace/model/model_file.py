@@ -25,6 +25,7 @@ _HELD_OUT = "held out"
 _EVERY_MODEL = ("mean", "basis", "stddev", "faces")
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3
+_TOLD = 200
 _WHOLE_NUMBERS = ("faces", "control_counts", "degree")
 
 
@@ -111,9 +112,10 @@ def load(path: Path) -> ModelFields:
         raise ModelFileError(str(error)) from error
     if attributes.get("format") != FORMAT_NAME:
         raise ModelFileError(f"{path} is HDF5 but not a shapespace model; give a file written by shapespace build.")
-    if attributes.get("format_version") != FORMAT_VERSION:
+    version = attributes.get("format_version")
+    if version != FORMAT_VERSION:
         raise ModelFileError(
-            f"{path} is a model of format version {attributes.get('format_version')}, but this shapespace reads "
+            f"{path} is a model of format version {str(version)[:40]}, but this shapespace reads "
             f"version {FORMAT_VERSION}; update shapespace."
         )
     try:
@@ -145,5 +147,5 @@ def load(path: Path) -> ModelFields:
             "held_out": told.variance_divisor == _HELD_OUT,
         }
     except (KeyError, ValueError) as error:
-        what = str(error).replace("`", "").replace("Object missing", "missing")
+        what = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {what}.") from error

@@ -29,6 +29,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
+_TOLD = 300
 _IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
@@ -381,7 +382,8 @@ class ShapeModel:
             with np.errstate(all="ignore"):  # huge numbers overflow on the way to being refused
                 model = cls(**fields)
         except InputError as error:
-            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+            said = str(error)[:_TOLD]
+            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {said}") from error
         _IN_FILES.add(model)
         return model
 

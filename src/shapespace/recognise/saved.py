@@ -298,10 +298,10 @@ def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
     if not isinstance(facts, dict) or cast(dict[str, Any], facts).get("format") != FORMAT:
         raise FileFormatError(f"{path} is not a classifier of shapespace; {_AGAIN}.")
     known = cast(dict[str, Any], facts)
-    if known.get("format_version") != FORMAT_VERSION:
+    found: Any = known.get("format_version")
+    if found != FORMAT_VERSION:
         raise FileFormatError(
-            f"{path} is of format version {known.get('format_version')!r}, and this shapespace reads {FORMAT_VERSION}; "
-            f"{_AGAIN}."
+            f"{path} is of format version {str(found)[:40]}, and this shapespace reads {FORMAT_VERSION}; {_AGAIN}."
         )
     return known
 
