@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 from reliability import Femora
 
+from shapespace.batch.executors import Where
 from shapespace.batch.rounds import KeptRounds
 from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
 from shapespace.datasets.faces import load_faces
@@ -272,7 +273,7 @@ def main() -> None:
         if arguments.jobs < 2:
             return correspond(scans, settings, template=template, run=run_here)
         with tempfile.TemporaryDirectory() as folder:
-            kept = KeptRounds(Path(folder), arguments.jobs, quiet=True, on_done=lambda: None)
+            kept = KeptRounds(Path(folder), Where(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
             return correspond(scans, settings, template=template, run=kept)
 
     for name in arguments.cases or [*SETS, *OTHERS]:

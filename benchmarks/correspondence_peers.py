@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import peers
 
+from shapespace.batch.executors import Where
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
 from shapespace.correspondence.rounds import CorrespondSettings
@@ -89,7 +90,7 @@ def by_shapespace(
     for name, scan in scans.items():
         write_mesh(turned / f"{name}.ply", scan.with_vertices(turns[name].apply(scan.vertices)))
     _, records = correspond_files(
-        CorrespondFiles([turned], jobs=jobs), folder / "same", settings, quiet=False, say=print
+        CorrespondFiles([turned], where=Where(jobs=jobs)), folder / "same", settings, quiet=False, say=print
     )
     surfaces: dict[str, Mesh] = {}
     for record in records:

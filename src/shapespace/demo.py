@@ -6,12 +6,10 @@ is written as plain files, and the report reads nothing but those.
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -21,8 +19,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from shapespace.batch.executors import Where
 from shapespace.batch.results import read_record
-from shapespace.batch.run import fit_files, make_executor, make_jobs
+from shapespace.batch.run import fit_files, make_jobs
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
@@ -338,19 +337,17 @@ def _fit_all(
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
 
-    with ExitStack() as stack:
-        workers = min(os.cpu_count() or 1, len(scans))
-        records = fit_files(
-            make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
-            model,
-            home / model_name,
-            make_folder(home / "fits"),
-            config,
-            executor=stack.enter_context(make_executor(home / model_name, workers)) if workers > 1 else None,
-            stages=True,
-            on_done=lambda job, _: clock.step(f"fitted {job.name}"),
-            on_state=show,
-        )
+    records = fit_files(
+        make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
+        model,
+        home / model_name,
+        make_folder(home / "fits"),
+        config,
+        executor=Where().executor(len(scans)),
+        stages=True,
+        on_done=lambda job, _: clock.step(f"fitted {job.name}"),
+        on_state=show,
+    )
     entries: list[FitEntry] = []
     for (name, scan), record in zip(scans.items(), records, strict=True):
         base, fitted = f"{home.name}/fits/{name}", record["status"] != "failed"

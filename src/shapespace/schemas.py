@@ -89,11 +89,18 @@ def check_format(
 
 
 class File(Struct, frozen=True, kw_only=True):
-    """A file that took part: its name, the SHA-256 of its content, and where it was, empty where that is not known."""
+    """A file that took part: its name, the SHA-256 of its content, and where it was, empty where that is not known.
+
+    Args:
+        size_bytes: of a scan, and
+        modified_ns: when it was last written (ns since 1970), by which it is known again without reading it.
+    """
 
     name: str = ""
     hash: str = ""
     path: str = ""
+    size_bytes: int | None = None
+    modified_ns: int | None = None
 
 
 class Distances(Struct, frozen=True, kw_only=True):
@@ -149,6 +156,10 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     """A NAME.fit.json.
 
     Args:
+        id: SHA-256 of scan, model, landmarks, settings and version; the fitted surface's header has it too. Empty for a
+            scan that could not be fitted, and in records of earlier versions.
+        metadata: of the scan, by the columns of the list that named it.
+        given_up: of a scan that its workers did not survive, the run that gave it up; else empty.
         status: the verdict; `unreadable` stands in place of a record that cannot be read, and in no file.
         reason: one sentence on why.
         scan: that was fitted,
@@ -174,6 +185,9 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 
     format: str = FORMAT
     format_version: int = VERSION
+    id: str = ""
+    metadata: Mapping[str, str] = {}
+    given_up: str = ""
     status: Status | Literal["unreadable"]
     reason: str = ""
     scan: File = File()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from raw_blobs import marked, raw_blob
+from shapespace.batch.executors import Where
 from shapespace.batch.rounds import KeptRounds
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
@@ -42,7 +43,7 @@ def placed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def kept(folder: Path, jobs: int = 1, on_done: Callable[[], None] = lambda: None) -> KeptRounds:
-    return KeptRounds(folder, jobs, True, on_done)
+    return KeptRounds(folder, Where(jobs=jobs), True, on_done)
 
 
 def test_what_was_done_before_an_interruption_is_not_done_again(

@@ -1,6 +1,8 @@
 import csv
+import shutil
+import subprocess
+import sys
 from collections.abc import Mapping
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,10 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.batch import run
-from shapespace.batch.run import EXECUTORS, Job, fit_files, make_executor, make_jobs
-from shapespace.errors import FileError, FitError
+from shapespace.batch import fit_work
+from shapespace.batch.executors import Local
+from shapespace.batch.fit_work import Job
+from shapespace.batch.on_dask import OnDask
+from shapespace.batch.run import Plan, fit_files, make_jobs
+from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
+from shapespace.io.files import atomic_path
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model, raw_scan, similarity
@@ -69,7 +75,9 @@ def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: li
     assert not [name for name in written if name.startswith(".")]
 
 
-def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+def test_an_interruption_loses_nothing_that_was_done(
+    model: ShapeModel, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(job: Job, record: Mapping[str, Any]) -> None:
         raise KeyboardInterrupt
 
@@ -79,12 +87,8 @@ def test_an_interruption_loses_nothing_that_was_done(model: ShapeModel, scans: l
     assert row["scan"] == "scan0"
     assert np.isfinite(float(row["b1"]))
 
-    again: list[str] = []
-    original, run.fit_file = run.fit_file, lambda job, *a, **k: (again.append(job.name), original(job, *a, **k))[1]
-    try:
-        records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
-    finally:
-        run.fit_file = original
+    again = count_fits(monkeypatch)
+    records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
     assert again == ["scan1", "scan2"]
     assert [r["scan"]["name"] for r in records] == ["scan0.ply", "scan1.ply", "scan2.ply"]
     assert [r["scan"] for r in table(tmp_path)] == ["scan0", "scan1", "scan2"]
@@ -107,35 +111,34 @@ def test_resume_keeps_what_still_holds_and_only_that(
         (out / "s.fit.json").write_text('{"format": "shapespace fit"')
     elif changed == "surface":
         (out / "s.fitted.ply").unlink()
-    calls: list[str] = []
-    original = run.fit_file
-    monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
+    calls = count_fits(monkeypatch)
     fit_files(make_jobs([scan]), model, Path("m"), out, config, resume=True)
     assert calls == ([] if changed == "nothing" else ["s"])
 
 
-@pytest.mark.parametrize("kind", EXECUTORS)
+@pytest.mark.parametrize("kind", ["local", "dask"])
 def test_every_executor_gives_what_one_after_the_other_gives(
-    kind: str, model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
+    kind: str, model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
+    executor = Local(2) if kind == "local" else OnDask(request.getfixturevalue("cluster"))
     jobs = make_jobs(with_a_bad_one(scans, tmp_path))
     here = fit_files(jobs, model, Path("blob.h5"), tmp_path / "here", CONFIG)
     done: list[str] = []
-    with make_executor(model_path, 2, kind) as executor:
-        there = fit_files(
-            jobs, model, Path("blob.h5"), tmp_path / "there", CONFIG, executor=executor,
-            on_done=lambda job, _: done.append(job.name),
-        )  # fmt: skip
-    assert [without_times(r) for r in there] == [without_times(r) for r in here]
+    there = fit_files(
+        jobs, model, model_path, tmp_path / "there", CONFIG, executor=executor, on_done=lambda j, _: done.append(j.name)
+    )
+    told = [{**without_times(r), "model": r["model"]["hash"]} for r in there]
+    assert told == [{**without_times(r), "model": r["model"]["hash"]} for r in here]
     assert sorted(done) == sorted(job.name for job in jobs)
     for name in ("coefficients.csv", "scan0.fitted.ply", "scan2.fitted.ply"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_a_worker_without_a_model_says_so(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
-    run._model = None
-    with ThreadPoolExecutor(1) as executor, pytest.raises(FileError, match="no model"):
-        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, executor=executor)
+def test_a_model_that_is_another_one_by_now_is_not_fitted(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "model.h5"
+    model.truncate(3).save(file)
+    with pytest.raises(FileError, match=r"model\.h5 is not the model that this run began with"):
+        fit_files(make_jobs(scans), model, file, tmp_path / "out", CONFIG, executor=Local(2))
 
 
 def test_each_scan_is_called_by_its_file_where_no_other_has_that_name() -> None:
@@ -205,8 +208,8 @@ def test_a_scan_given_twice_is_fitted_once(
 
 def count_fits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
-    original = run.fit_file
-    monkeypatch.setattr(run, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
+    original = fit_work.fit_file
+    monkeypatch.setattr(fit_work, "fit_file", lambda job, *a, **k: (calls.append(job.name), original(job, *a, **k))[1])
     return calls
 
 
@@ -259,31 +262,11 @@ def test_an_interruption_waits_for_what_runs_and_the_table_has_it(
     for k, path in enumerate(many):
         path.write_bytes(scans[k % 3].read_bytes())
     out = tmp_path / "out"
-    with make_executor(model_path, 3, "threads") as executor, pytest.raises(KeyboardInterrupt):
-        fit_files(make_jobs(many), model, model_path, out, CONFIG, executor=executor, on_done=stop)
+    with pytest.raises(KeyboardInterrupt):
+        fit_files(make_jobs(many), model, model_path, out, CONFIG, executor=Local(3), on_done=stop)
     records = {path.name.removesuffix(".fit.json") for path in out.glob("*.fit.json")}
     assert 2 <= len(records) < 12, "the others were running when it stopped"
     assert {row["scan"] for row in table(out)} == records
-
-
-class KillsOne(ThreadPoolExecutor):
-    """Runs all fits, and then has lost the first worker."""
-
-    def submit(self, *arguments: Any, **options: Any) -> Any:
-        future = super().submit(*arguments, **options)
-        future.result()
-        lost: Future[Any] = Future()
-        lost.set_exception(BrokenExecutor("A process was terminated abruptly."))
-        return lost
-
-
-def test_what_was_written_before_a_worker_was_killed_is_in_the_table(
-    model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
-) -> None:
-    run._load_model(model_path)
-    with KillsOne(1) as executor, pytest.raises(FitError, match="--resume"):
-        fit_files(make_jobs(scans), model, model_path, tmp_path, CONFIG, executor=executor)
-    assert [row["scan"] for row in table(tmp_path)] == ["scan0", "scan1", "scan2"]
 
 
 DENSE = replace(CONFIG, dense=True)
@@ -328,3 +311,57 @@ def test_all_states_are_told_when_fits_run_here(model: ShapeModel, scans: list[P
         make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_state=lambda s: told.append(s.phase)
     )
     assert len(told) == len(record["history"])
+
+
+def test_a_second_run_into_the_same_folder_is_refused(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    def another(*_: object) -> None:
+        with pytest.raises(FileError, match="another run of shapespace"):
+            fit_files(make_jobs(scans[1:]), model, Path("m"), tmp_path, CONFIG)
+
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_done=another)
+    fit_files(make_jobs(scans[1:]), model, Path("m"), tmp_path, CONFIG)
+    assert len(table(tmp_path)) == 3 and not list(tmp_path.glob(".*"))
+
+
+def test_a_surface_of_another_fit_is_not_kept(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    """As a run that was killed between two files, or two runs at once, may leave it."""
+    other = tmp_path / "other"
+    fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG)
+    fit_files(make_jobs(scans[:1]), model, Path("m"), other, replace(CONFIG, max_iterations=2))
+    good = (tmp_path / "scan0.fitted.ply").read_bytes()
+    (other / "scan0.fitted.ply").replace(tmp_path / "scan0.fitted.ply")
+    (record,) = fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, resume=True)
+    assert (tmp_path / "scan0.fitted.ply").read_bytes() == good
+    assert record["id"].encode() in good[:300]
+
+
+def test_a_folder_that_goes_away_is_one_sentence(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    def gone(*_: object) -> None:
+        shutil.rmtree(tmp_path / "out")
+
+    with pytest.raises(FileError, match=r"Cannot write .*the folder cannot be made there"):
+        fit_files(make_jobs(scans), model, Path("m"), tmp_path / "out", CONFIG, on_done=gone)
+
+
+def test_half_written_files_of_killed_runs_go(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    code = f"""
+import os, pathlib
+from shapespace.io.files import atomic_path
+with atomic_path(pathlib.Path({str(tmp_path)!r}) / "scan0.fitted.ply") as path:
+    path.write_bytes(b"half")
+    os._exit(9)
+"""
+    subprocess.run([sys.executable, "-c", code])
+    assert len(list(tmp_path.glob(".shapespace-*"))) == 1
+    with atomic_path(tmp_path / "live.ply") as writing:
+        fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG)
+        assert [path.name for path in tmp_path.glob(".*")] == [writing.name], "of a process that lives it stays"
+
+
+def test_a_run_tells_what_is_kept_and_what_is_done_anew(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
+    plans: list[Plan] = []
+    for given, config in ((scans[:1], CONFIG), (scans, CONFIG), (scans[1:], FitConfig(max_iterations=2))):
+        fit_files(make_jobs(given), model, Path("m"), tmp_path, config, resume=True, on_plan=plans.append)
+    assert plans == [Plan(0, 0, 1), Plan(1, 0, 2), Plan(0, 2, 0)]
+    assert not list(plans[0].sentences())
+    assert "1 of 3" in next(plans[1].sentences()) and "2 of 2" in next(plans[2].sentences())

@@ -415,3 +415,22 @@ def test_james_is_dropped_and_judged(open_tab, people: str, shared_data: Path) -
     tab.page.wait_for_timeout(1500)
     same_as_kept("viewer.png", tab.shot("readme"))
     assert tab.complaints == []
+
+
+def test_the_token_does_not_stay_in_the_address_and_a_link_from_elsewhere_leads_in(
+    open_tab, address: str, tmp_path: Path
+) -> None:
+    page_at, _, token = address.partition("?")
+    assert token.startswith("token=")
+    tab = ready(open_tab(address))
+    assert tab.page.url == page_at and "token" not in tab.page.evaluate("performance.getEntries()[0].name")
+    tab.page.reload()
+    ready(tab)
+    assert tab.page.evaluate("history.length") <= 2  # the empty page it was opened with, and this one
+    mail = tmp_path / "mail.html"
+    mail.write_text(f'<a href="{address}">The viewer</a>')
+    other = open_tab(mail.as_uri())
+    other.page.get_by_role("link").click()
+    ready(other)
+    assert other.page.url == page_at
+    assert tab.complaints == [] and other.complaints == []

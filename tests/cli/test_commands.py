@@ -288,13 +288,14 @@ def test_fit_writes_the_files_of_the_contract_and_no_others(fitted: Path, world:
 def test_the_record_holds_the_keys_of_the_contract(fitted: Path, world: World) -> None:
     record = record_of(fitted)
     model = ShapeModel.load(world.model)
-    for key, name, content_hash in (
-        ("scan", "scan_0.ply", sha256_of_file(world.scan)),
-        ("model", "model.h5", model.content_hash),
+    known = {"hash", "name", "path"}
+    for key, name, content_hash, keys in (
+        ("scan", "scan_0.ply", sha256_of_file(world.scan), known | {"size_bytes", "modified_ns"}),
+        ("model", "model.h5", model.content_hash, known),
     ):
         source = record[key]
         assert (source["name"], source["hash"]) == (name, content_hash)
-        assert sorted(source) == ["hash", "name", "path"]
+        assert source.keys() == keys
     assert record["status"] == "converged" and record["reason"].endswith(".")
     assert record["method"] == "robust"
     assert record["config"]["version"] == __version__ and "seed" in record["config"]

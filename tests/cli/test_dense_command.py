@@ -83,7 +83,7 @@ def test_resume_knows_whether_it_was_asked_for(run: Run, world: World, tmp_path:
     assert run(*command).code == 0 and surface.is_file(), "what still holds is kept"
     assert run(*command, "--stages").code == 0 and surface.is_file() and (tmp_path / "scan_0.stages.npz").is_file()
     assert json.loads((tmp_path / "scan_0.fit.json").read_text())["config"]["dense"] is True
-    anew = ("fit", world.model, world.scan, "-o", tmp_path, "--quiet")
+    anew = ("fit", world.model, world.scan, "-o", tmp_path, "--again", "--quiet")
     assert run(*anew).code == 0 and not surface.exists(), "it would contradict the record"
 
 

@@ -6,8 +6,7 @@ import io
 import json
 import os
 import sys
-from concurrent.futures import Executor, Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,8 @@ import numpy as np
 import pytest
 
 from conftest import Run, World, leftovers
+from shapespace.batch.executors import EXECUTORS
+from shapespace.errors import FitError
 from shapespace.io.meshes import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
 
@@ -119,31 +120,35 @@ def test_a_handful_of_points_never_passes_for_a_good_fit(run: Run, world: World,
     for count in (4, 5, 10):
         points = 60 * np.random.default_rng(count).standard_normal((count, 3))
         write_mesh(tmp_path / "few.ply", Mesh(points))
-        outcome = run("fit", world.model, tmp_path / "few.ply", "-o", tmp_path / "out", "--strict")
+        outcome = run("fit", world.model, tmp_path / "few.ply", "-o", tmp_path / f"out{count}", "--strict")
         assert outcome.code in (1, 2), outcome.out
         assert len(outcome.err.splitlines()) == 1
 
 
-class _Killed(Executor):
-    """Workers that the system stops, as it does when memory runs out."""
+class _Killed:
+    """Workers that the system ends, as it does when memory runs out."""
 
-    def submit(self, *_: Any, **__: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_exception(BrokenProcessPool("A process in the process pool was terminated abruptly."))
-        return future
+    def run(self, work: Any, tasks: Any, /) -> Generator[Any]:
+        yield tasks[0], work.do(tasks[0])
+        yield tasks[1], work.give_up(tasks[1], "its worker ended by signal 9")
+        raise FitError("The system ends worker processes as they start; use --jobs 1, or free some memory.")
 
 
-def test_workers_that_are_killed_end_in_one_sentence(
+def test_workers_that_are_killed_end_in_one_sentence_and_a_table(
     run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.commands.fit.make_executor", lambda *_: _Killed())
+    monkeypatch.setitem(EXECUTORS, "local", lambda *_: _Killed())
     outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--jobs", 2)
     assert outcome.code == 2
-    assert "fewer --jobs" in outcome.sentence() and "--resume" in outcome.err
-    assert leftovers(tmp_path) == [] and (tmp_path / "coefficients.csv").is_file()
+    assert "use --jobs 1" in outcome.err.splitlines()[-1]
+    with (tmp_path / "coefficients.csv").open(newline="") as stream:
+        rows = {row["scan"]: row for row in csv.DictReader(stream)}
+    assert rows["scan_0"]["status"] == "converged" and rows["scan_1"]["status"] == "failed"
+    assert rows["scan_1"]["reason"] == f"{world.scans[1]}: its worker ended by signal 9."
+    assert leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize("where", ["shapespace.io.meshes.read_bytes", "shapespace.batch.run.fit_scan"])
+@pytest.mark.parametrize("where", ["shapespace.io.meshes.read_bytes", "shapespace.batch.fit_work.fit_scan"])
 def test_too_little_memory_for_one_scan_fails_that_scan(
     where: str, run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,7 +187,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
             raise KeyboardInterrupt
         return read_mesh(path)
 
-    for module in ("shapespace.commands.build", "shapespace.commands.look", "shapespace.batch.run"):
+    for module in ("shapespace.commands.build", "shapespace.commands.look", "shapespace.batch.fit_work"):
         monkeypatch.setattr(f"{module}.read_mesh", interrupted)
     arguments: dict[str, tuple[object, ...]] = {
         "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),
@@ -191,7 +196,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
     }
     outcome = run(*arguments[command])
     assert outcome.code == 130
-    goes_on = "; the same command with --resume goes on from there" if command == "fit" else ""
+    goes_on = "; the same command goes on from there" if command == "fit" else ""
     assert outcome.err.splitlines()[-1] == f"shapespace: stopped; the files written so far are whole{goes_on}."
     assert leftovers(tmp_path) == []
     if command == "fit":

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -17,13 +18,13 @@ from shapespace.io.meshes import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
 # Buffered output, as users have it, meets a full disk only when it is flushed.
-STOPPED = "shapespace: stopped; the files written so far are whole; the same command with --resume goes on from there."
+STOPPED = "shapespace: stopped; the files written so far are whole; the same command goes on from there."
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 
 
 def call(*arguments: object, **options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=60, env={**os.environ, **options}
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=600, env={**os.environ, **options}
     )
 
 
@@ -88,8 +89,10 @@ def test_standard_output_on_a_full_disk_is_one_sentence(world: World) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_in_a_batch_leaves_whole_files_that_resume_takes_up(jobs: int, world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("jobs", "by"), [(1, "SIGINT"), (2, "SIGINT"), (2, "SIGTERM"), (1, "SIGHUP")])
+def test_ended_in_a_batch_it_leaves_whole_files_that_the_same_command_takes_up(
+    jobs: int, by: str, world: World, tmp_path: Path
+) -> None:
     scans = tmp_path / "scans"
     scans.mkdir()
     for k in range(150):
@@ -103,9 +106,10 @@ def test_ctrl_c_in_a_batch_leaves_whole_files_that_resume_takes_up(jobs: int, wo
     limit = time.monotonic() + 60
     while len(list(out.glob("*.fit.json"))) < 3 and time.monotonic() < limit:
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
+    # A terminal sends Ctrl-C to all, clusters send SIGTERM to the command.
+    (os.killpg if by == "SIGINT" else os.kill)(process.pid, signal.Signals[by])
     printed, said = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 128 + signal.Signals[by]
     assert printed == ""
     assert without_waiting(said).splitlines() == [STOPPED]
     assert leftovers(tmp_path) == []
@@ -141,3 +145,121 @@ def test_ctrl_c_while_the_workers_start_is_quiet_too(world: World, tmp_path: Pat
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert without_waiting(said).splitlines() == [STOPPED]
+
+
+def batch(world: World, folder: Path, count: int) -> Path:
+    """Write as many scans, and return their folder."""
+    scans = folder / "scans"
+    scans.mkdir()
+    for k in range(count):
+        os.link(world.scans[k % 3], scans / f"s{k:04d}.ply")
+    return scans
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes below `pid` that fit."""
+    found: list[int] = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                found += [int(stat.parent.name), *children_of(int(stat.parent.name))]
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def told(folder: Path) -> list[dict[str, str]]:
+    with (folder / "coefficients.csv").open(newline="") as stream:
+        return sorted(({**row, "path": ""} for row in csv.DictReader(stream)), key=lambda row: row["scan"])
+
+
+def wait_for(count: int, out: Path) -> None:
+    limit = time.monotonic() + 60
+    while len(list(out.glob("*.fit.json"))) < count and time.monotonic() < limit:
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(world: World, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, str]]]:
+    """A batch of scans, and the table of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    scans = batch(world, folder, BATCH)
+    assert call("fit", world.model, scans, "-o", folder / "out", *FAST, "--quiet").returncode == 0
+    return scans, told(folder / "out")
+
+
+# By hand SHAPESPACE_FAULTS=1 kills a batch of 1,000 at 20 moments.
+BATCH, KILLS = (1000, 20) if os.environ.get("SHAPESPACE_FAULTS") else (90, 5)
+FAST = ("--max-iterations", "3")
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+
+
+@LINUX
+@pytest.mark.long
+def test_workers_that_are_killed_change_nothing(
+    world: World, undisturbed: tuple[Path, list[dict[str, str]]], tmp_path: Path
+) -> None:
+    scans, table = undisturbed
+    command = [*COMMAND, "fit", str(world.model), str(scans), "-o", str(tmp_path), "--jobs", "4", *FAST, "--quiet"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(20, tmp_path)
+    workers = [pid for pid in children_of(process.pid) if not children_of(pid) and b"forkserver" in cmdline(pid)]
+    for pid in workers[1:3]:
+        os.kill(pid, signal.SIGKILL)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    assert told(tmp_path) == table and leftovers(tmp_path) == []
+
+
+def cmdline(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+@LINUX
+def test_a_batch_that_is_killed_again_and_again_ends_as_if_nothing_had_been(
+    world: World, undisturbed: tuple[Path, list[dict[str, str]]], tmp_path: Path
+) -> None:
+    scans, table = undisturbed
+    command = [*COMMAND, "fit", str(world.model), str(scans), "-o", str(tmp_path), "--jobs", "2", *FAST, "--quiet"]
+    rng = random.Random(5)
+    done: dict[str, int] = {}
+    for _ in range(KILLS):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        wait_for(len(done) + rng.randrange(BATCH // KILLS), tmp_path)
+        time.sleep(rng.uniform(0.0, 0.05))
+        below = children_of(process.pid)
+        process.kill()
+        process.wait()
+        limit = time.monotonic() + 10
+        while any(b"forkserver" in cmdline(pid) for pid in below) and time.monotonic() < limit:
+            time.sleep(0.01)
+        assert not [pid for pid in below if b"forkserver" in cmdline(pid)], "workers end with their parent"
+        times = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.fit.json")}
+        assert times | done == times, "what was done is there, and was not done again"
+        done = times
+    assert 0 < len(done) < BATCH
+    assert call(*command[3:]).returncode == 0
+    assert told(tmp_path) == table and leftovers(tmp_path) == []
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.fit.json")} | done == {
+        path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.fit.json")
+    }
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_a_second_ctrl_c_ends_it_at_once(world: World, tmp_path: Path) -> None:
+    scans = batch(world, tmp_path, 200)
+    command = [*COMMAND, "fit", str(world.model), str(scans), "-o", str(tmp_path / "out"), "--jobs", "2"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    wait_for(3, tmp_path / "out")
+    for _ in range(2):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.02)
+    began = time.monotonic()
+    process.communicate(timeout=60)
+    assert process.returncode == 130 and time.monotonic() - began < 10
+    assert leftovers(tmp_path) == []

@@ -7,17 +7,19 @@ from collections.abc import Iterator
 from http.client import HTTPConnection
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 from viewer_world import Start, drop, model, scan_file, sentence, start, told
 
-from shapespace.batch.run import Job, fit_file
+from shapespace.batch.fit_work import Job, fit_file
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer import guard
 from shapespace.viewer.fitting import Upload
 from shapespace.viewer.serve import listen, page_address, serve
 from shapespace.viewer.shown import Shown, without_folders
@@ -200,9 +202,9 @@ def test_a_visit_ends_after_a_while_and_its_scans_with_it(start: Start) -> None:
 def test_nothing_is_left_when_the_server_ends(start: Start, model: ShapeModel) -> None:
     from viewer_world import running
 
-    from shapespace.viewer.sessions import Limits
+    from shapespace.viewer.limits import Limits
 
-    with running(Shown(model, "m.h5"), Limits(), None, waits) as viewer:
+    with running(Shown(model, "m.h5"), Limits(), waits) as viewer:
         visitor = viewer.visitor()
         key = drop(visitor, b"x").json()["id"]
         assert oct(viewer.root.stat().st_mode)[-3:] == oct((viewer.root / key).stat().st_mode)[-3:] == "700"
@@ -211,22 +213,62 @@ def test_nothing_is_left_when_the_server_ends(start: Start, model: ShapeModel) -
     assert not viewer.root.exists() and time.monotonic() - began < 10
 
 
-def test_with_a_token_nothing_is_answered_without_it(start: Start) -> None:
-    viewer = start(token="a-secret")
-    stranger = viewer.stranger()
-    for path in ("/", "/api/about", "/api/model", "/assets/viewer.js", "/?token=wrong", "/?token="):
+@pytest.mark.parametrize("local", [True, False])
+def test_nothing_is_answered_without_the_token(start: Start, local: bool) -> None:
+    viewer = start(local=local)
+    token = viewer.access.token
+    assert len(token) >= 43  # 256 bits
+    stranger = viewer.outsider()
+    elsewhere = (f"/api/about?token={token}", f"/x?token={token}")
+    for path in ("/", "/api/about", "/api/model", "/assets/viewer.js", "/?token=wrong", "/?token=", *elsewhere):
         refused = stranger.get(path)
         assert refused.status_code == 401 and "token" in sentence(refused)
     assert drop(stranger, b"x").status_code == 401
-    invited = viewer.stranger()
-    assert invited.get("/?token=a-secret").status_code == 200
+    assert stranger.post(f"/?token={token}").status_code == 401
+    invited = viewer.outsider()
+    entered = invited.get(f"/?token={token}")
+    # The token is in neither the address that stays nor the cookie.
+    assert entered.status_code == 303 and entered.headers["location"] == "/"
+    assert "HttpOnly" in entered.headers["set-cookie"] and token not in entered.headers["set-cookie"]
+    assert invited.get("/").status_code == 200
     assert "token" not in invited.get("/?token=wrong%0d%0aSet-Cookie:x=y").headers.get("set-cookie", "")
     assert invited.get("/api/about").status_code == 200 and drop(invited, b"").status_code == 201
 
 
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What the guard takes for the time, in seconds."""
+    now = [1000.0]
+    monkeypatch.setattr(guard, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
+
+
+def test_wrong_tokens_are_looked_at_slowly_and_hold_nobody_up_who_is_in(start: Start, clock: list[float]) -> None:
+    viewer = start(guesses=3, guess_s=1.0)
+    visitor, stranger = viewer.visitor(), viewer.outsider()
+    answers = [stranger.get(f"/?token={k}") for k in range(8)]
+    assert [answer.status_code for answer in answers] == [401] * 3 + [429] * 5
+    right = stranger.get("/", params={"token": viewer.access.token})
+    assert right.status_code == 429 and "wait" in sentence(right)  # or guesses would tell by it
+    assert visitor.get("/").status_code == 200 and visitor.get("/api/about").status_code == 200
+    clock[0] += 1.1
+    assert [stranger.get("/?token=x").status_code for _ in range(2)] == [401, 429]
+    clock[0] += 1.1
+    assert stranger.get("/", params={"token": viewer.access.token}).status_code == 303
+
+
+def test_the_ticket_that_opens_the_browser_is_good_once_and_for_a_while(start: Start, clock: list[float]) -> None:
+    viewer = start(ticket_s=60.0)
+    ticket = viewer.access.ticket()
+    assert [viewer.outsider().get(f"/?token={ticket}").status_code for _ in range(2)] == [303, 401]
+    late = viewer.access.ticket()
+    clock[0] += 61
+    assert viewer.outsider().get(f"/?token={late}").status_code == 401
+
+
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
 def test_on_loopback_other_host_names_are_refused(start: Start, host: str) -> None:
-    answer = httpx.get(start().address + "/api/about", headers={"host": host})
+    answer = start().visitor().get("/api/about", headers={"host": host})
     assert answer.status_code in (400, 421)
 
 
@@ -437,7 +479,7 @@ def test_a_taken_port_is_one_sentence_and_without_a_wish_the_next_one_is_found()
     for host, port in (("192.0.2.1", None), ("no such host", None), ("127.0.0.1", 99999)):
         with pytest.raises(InputError, match=r"listen|used"):
             listen(host, port)
-    assert page_address("::1", 1, None) == "http://[::1]:1/"
+    assert page_address("::1", 1, "t") == "http://[::1]:1/?token=t"
     assert page_address("0.0.0.0", 1, "t").endswith(":1/?token=t")
 
 

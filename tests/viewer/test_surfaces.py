@@ -12,12 +12,13 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from viewer_world import served
+from viewer_world import enter, served
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
 from shapespace.viewer import surfaces as module
-from shapespace.viewer.guard import SECURITY_HEADERS
+from shapespace.viewer.guard import SECURITY_HEADERS, Access
+from shapespace.viewer.limits import Limits
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
@@ -46,9 +47,12 @@ def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 @contextmanager
-def opened(surfaces: Surfaces, token: str | None = None) -> Iterator[httpx.Client]:
-    app = make_surfaces_app(surfaces, token=token)
+def opened(surfaces: Surfaces, token: str = "secret", *, known: bool = True) -> Iterator[httpx.Client]:
+    access = Access(Limits(), token)
+    app = make_surfaces_app(surfaces, access=access)
     with served(app) as address, httpx.Client(base_url=address, timeout=60) as client:
+        if known:
+            enter(client, access)
         yield client
 
 
@@ -130,11 +134,35 @@ def test_only_its_own_page_may_ask_and_only_read(client: httpx.Client) -> None:
         assert client.request(method, "/api/surfaces").status_code == 405
 
 
+def test_nonsense_in_a_header_is_refused_in_a_sentence(client: httpx.Client) -> None:
+    for origin in ("http://[", "http://", "[", "null"):
+        refused = client.get("/api/mean", headers={"origin": origin})
+        assert refused.status_code == 403 and refused.json()["error"].endswith(".")
+    assert client.get("/", headers={"range": "bytes=x"}).status_code == 200
+
+
+def test_a_bad_record_is_listed_with_its_reason_and_hides_no_other(template: Path, tmp_path: Path) -> None:
+    shutil.copytree(template.parent, tmp_path / "w")
+    folder = tmp_path / "w" / "same"
+    record = json.loads((folder / "able.correspond.json").read_text())
+    bad = {"area_factor": -1.0, "seen_share": 1e999, "distance_p99": -1e999, "unit_ratio": "one"}
+    for key, value in bad.items():
+        text = json.dumps(record | {"name": key, key: value}).replace("Infinity", "1e999")
+        (folder / f"{key}.correspond.json").write_text(text)
+        shutil.copy(folder / "able.corresponding.ply", folder / f"{key}.corresponding.ply")
+    with opened(Surfaces(folder)) as one:
+        rows = {row["name"]: row for row in one.get("/api/surfaces").json()}
+        assert one.get("/api/mean").status_code == 200
+    assert {*NAMES, *bad} <= {*rows}
+    for key in ("area_factor", "unit_ratio"):
+        assert rows[key]["status"] == "unreadable" and f"{key}.correspond.json" in rows[key]["told"]
+
+
 def test_with_a_token_nothing_is_answered_without_it(template: Path) -> None:
-    with opened(Surfaces(template), token="secret") as stranger:
+    with opened(Surfaces(template), token="secret", known=False) as stranger:
         for path in ("/", "/api/about", "/api/mean", "/api/surfaces", "/api/surfaces/able", "/assets/surfaces.js"):
             assert stranger.get(path).status_code == 401
-        assert stranger.get("/?token=secret").status_code == 200
+        assert stranger.get("/?token=secret").status_code == 303
         assert stranger.get("/api/about").status_code == 200  # the cookie
 
 

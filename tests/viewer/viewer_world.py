@@ -6,7 +6,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,12 @@ import uvicorn
 from shapespace.batch.workers import start_loading
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer.connections import server_config
 from shapespace.viewer.fitting import Worker, fit_upload
+from shapespace.viewer.guard import Access
+from shapespace.viewer.limits import Limits
 from shapespace.viewer.server import make_app
-from shapespace.viewer.sessions import Limits, Sessions
+from shapespace.viewer.sessions import Sessions
 from shapespace.viewer.shown import Shown
 from synthetic_shapes import blob_model, raw_scan, similarity
 
@@ -33,11 +36,18 @@ class Running:
     address: str
     sessions: Sessions
     root: Path
-    clients: ExitStack
+    access: Access
+    clients: ExitStack = field(default_factory=ExitStack)
+
+    def outsider(self) -> httpx.Client:
+        """Return a browser that does not know the token."""
+        return self.clients.enter_context(httpx.Client(base_url=self.address, timeout=60))
 
     def stranger(self) -> httpx.Client:
-        """Return a browser that has not opened the page."""
-        return self.clients.enter_context(httpx.Client(base_url=self.address, timeout=60))
+        """Return a browser that has been let in, and has not opened the page."""
+        client = self.outsider()
+        enter(client, self.access)
+        return client
 
     def visitor(self) -> httpx.Client:
         """Return a browser that has opened the page."""
@@ -46,15 +56,18 @@ class Running:
         return client
 
 
+def enter(client: httpx.Client, access: Access) -> None:
+    """Exchange the token for the cookie."""
+    assert client.get("/", params={"token": access.token}).status_code == 303
+
+
 Start = Callable[..., Running]
 
 
 @contextmanager
-def served(app: Any) -> Iterator[str]:
+def served(app: Any, limits: Limits | None = None) -> Iterator[str]:
     """Serve an application in a thread, and give its address."""
-    server = uvicorn.Server(
-        uvicorn.Config(app, log_level="error", access_log=False, ws="none", timeout_graceful_shutdown=2)
-    )
+    server = uvicorn.Server(server_config(app, limits or Limits()))
     listening = socket.socket()
     listening.bind(("127.0.0.1", 0))
     listening.listen()
@@ -68,12 +81,13 @@ def served(app: Any) -> Iterator[str]:
 
 
 @contextmanager
-def running(shown: Shown, limits: Limits, token: str | None, worker: Worker) -> Iterator[Running]:
-    app, sessions = make_app(shown, limits=limits, token=token, worker=worker)
-    with served(app) as address:
+def running(shown: Shown, limits: Limits, worker: Worker, local: bool = True) -> Iterator[Running]:
+    access = Access(limits)
+    app, sessions = make_app(shown, limits=limits, access=access, local=local, worker=worker)
+    with served(app, limits) as address:
         try:
             with ExitStack() as clients:
-                yield Running(address, sessions, sessions.root, clients)
+                yield Running(address, sessions, sessions.root, access, clients)
         finally:
             sessions.closing = True
 
@@ -92,11 +106,11 @@ def start(model: ShapeModel) -> Iterator[Start]:
         def start(
             shown: Shown | None = None,
             *,
-            token: str | None = None,
             worker: Worker = fit_upload,
+            local: bool = True,
             **limits: Any,
         ) -> Running:
-            return stack.enter_context(running(shown or Shown(model, "blobs.h5"), Limits(**limits), token, worker))
+            return stack.enter_context(running(shown or Shown(model, "blobs.h5"), Limits(**limits), worker, local))
 
         yield start
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,9 +16,9 @@ from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.surface import rms_size
-from shapespace.io.files import atomic_path, write_text
+from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.json_files import read_json
-from shapespace.io.meshes import write_mesh
+from shapespace.io.ply import ply_comment, write_ply
 from shapespace.io.tables import CHECKSUM, checked_table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
@@ -52,11 +53,15 @@ class Source:
         name: of the file.
         content_hash: SHA-256 of its content; of models their content hash.
         path: where it was, relative to the folder of the results where there is such a path; empty if not known.
+        size_bytes: of the file, and
+        modified_ns: when it was last written, by which it is known again without reading it; None if not known.
     """
 
     name: str
     content_hash: str
     path: str = ""
+    size_bytes: int | None = None
+    modified_ns: int | None = None
 
     @staticmethod
     def at(file: Path, content_hash: str, folder: Path) -> Source:
@@ -67,21 +72,60 @@ class Source:
             path = str(file)
         return Source(file.name, content_hash, Path(path).as_posix())
 
-    def as_dict(self) -> dict[str, str]:
-        """Return it as it stands in a result file; a path that is not known is left out."""
-        known = {"path": self.path} if self.path else {}
+    @staticmethod
+    def hashed(file: Path, folder: Path) -> Source:
+        """Return the source `file`, read now, with what it is known again by.
+
+        Raises:
+            FileError: it cannot be read.
+        """
+        content_hash = sha256_of_file(file)
+        there = file.stat()
+        source = Source.at(file, content_hash, folder)
+        return replace(source, size_bytes=there.st_size, modified_ns=there.st_mtime_ns)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as it stands in a result file; what is not known is left out."""
+        known: dict[str, Any] = {"path": self.path} if self.path else {}
+        if self.size_bytes is not None:
+            known |= {"size_bytes": self.size_bytes, "modified_ns": self.modified_ns}
         return {"name": self.name, "hash": self.content_hash, **known}
 
 
-def fit_record(result: FitResult, scan: Source, model: Source, landmarks: Source | None = None) -> dict[str, Any]:
-    """Return what NAME.fit.json says of `result`; `landmarks` is the file it started from, None if it used none."""
+def fit_identity(
+    scan_hash: str, model_hash: str, config: Mapping[str, Any], landmarks_hash: str = "", version: str = __version__
+) -> str:
+    """Return the SHA-256 of all that a fit comes from: scan, model, landmarks, settings and version, not of names."""
+    told = {"scan": scan_hash, "model": model_hash, "landmarks": landmarks_hash, "config": dict(config)}
+    return hashlib.sha256(json.dumps(told | {"version": version}, sort_keys=True).encode()).hexdigest()
+
+
+def fit_record(
+    result: FitResult,
+    scan: Source,
+    model: Source,
+    landmarks: Source | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Return what NAME.fit.json says of `result`.
+
+    Args:
+        result: of the fit.
+        scan: that was fitted.
+        model: by which.
+        landmarks: the file it started from, None if it used none.
+        metadata: what is known of the scan, by the columns of a list of scans.
+    """
     T = result.T_scan_model
+    marks = landmarks.content_hash if landmarks else ""
     return {
         "format": RECORD_FORMAT,
         "format_version": RECORD_VERSION,
+        "id": fit_identity(scan.content_hash, model.content_hash, result.config, marks),
         "scan": scan.as_dict(),
         "model": model.as_dict(),
         "landmarks": landmarks.as_dict() if landmarks else None,
+        **({"metadata": dict(metadata)} if metadata else {}),
         "status": result.status,
         "reason": result.reason,
         **_shown(result),
@@ -129,13 +173,16 @@ def _shown(result: FitResult) -> dict[str, Any]:
     return told
 
 
-def failed_record(scan: Source, model: Source, reason: str, config: Mapping[str, Any]) -> dict[str, Any]:
+def failed_record(
+    scan: Source, model: Source, reason: str, config: Mapping[str, Any], metadata: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """Return the record of a scan that could not be fitted at all."""
     return {
         "format": RECORD_FORMAT,
         "format_version": RECORD_VERSION,
         "scan": scan.as_dict(),
         "model": model.as_dict(),
+        **({"metadata": dict(metadata)} if metadata else {}),
         "status": "failed",
         "reason": reason,
         "config": dict(config),
@@ -150,9 +197,18 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
         FileError: the folder cannot be written, or the disk is full.
         FileFormatError: it is no record that `schemas.FitRecord` could read again.
     """
+    write_text(path, record_text(record, path.name))
+
+
+def record_text(record: Mapping[str, Any], where: str) -> str:
+    """Return the text of a NAME.fit.json; `where` is its name in errors.
+
+    Raises:
+        FileFormatError: it is no record that `schemas.FitRecord` could read again.
+    """
     plain = to_json(record)
-    FitRecord.from_json(plain, path.name)
-    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    FitRecord.from_json(plain, where)
+    return json.dumps(plain, indent=1, allow_nan=False) + "\n"
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -169,9 +225,20 @@ def read_record(path: Path) -> dict[str, Any]:
     return cast(dict[str, Any], record)
 
 
-def write_fitted_mesh(path: Path, result: FitResult, model: ShapeModel, stage: str = "final") -> None:
-    """Write the surface at `stage`, in the model's vertex order and the scan's own frame and unit."""
-    write_mesh(path, result.surface(model, stage))
+def write_fitted_mesh(
+    path: Path, result: FitResult, model: ShapeModel, stage: str = "final", identity: str = ""
+) -> None:
+    """Write the surface at `stage` as PLY, in the model's vertex order and the scan's own frame and unit.
+
+    Its header names the fit that it is of by `identity`, the `id` of the record.
+    """
+    comment = f"{RECORD_FORMAT} {identity}" if identity else ""
+    write_bytes(path, write_ply(result.surface(model, stage), comment))
+
+
+def is_surface_of(path: Path, record: Mapping[str, Any]) -> bool:
+    """Return whether the fitted surface in `path` is of the fit that `record` tells."""
+    return bool(record.get("id")) and ply_comment(path) == f"{RECORD_FORMAT} {record['id']}"
 
 
 def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:

@@ -1,26 +1,24 @@
-"""The tasks of a round of correspondence on several cores, each kept on disk as soon as it is done."""
+"""The tasks of a round of correspondence wherever they run, each kept on disk as soon as it is done."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed, wait
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
-from shapespace.batch.workers import context, interrupts_ignored, start_loading, wait_until_loaded
+from shapespace.batch.executors import Serial, Where
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks, Places
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
-from shapespace.errors import FitError
+from shapespace.errors import FileError
 from shapespace.io.files import atomic_path, make_folder
 from shapespace.io.hdf5 import content_hash
 from shapespace.model.shape_model import ShapeModel
@@ -32,17 +30,17 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class KeptRounds:
-    """Does the tasks of a round on `jobs` cores; what is done is kept in `folder`, and a like task finds it there.
+    """Does the tasks of a round somewhere; what is done is kept in `folder`, and a like task finds it there.
 
     Args:
         folder: for what is kept; made if absent.
-        jobs: at a time; 1 does them in this process.
+        where: the tasks are done.
         quiet: whether workers say that code is compiled.
         on_done: told of each task that ends.
     """
 
     folder: Path
-    jobs: int
+    where: Where
     quiet: bool
     on_done: Callable[[], None]
 
@@ -51,74 +49,133 @@ class KeptRounds:
 
         Raises:
             FileError: what is done cannot be written.
-            FitError: a worker was stopped from outside.
+            FitError: there are no workers, or none any more.
         """
         make_folder(self.folder)
         shared = [_shared_hash(bench, glance) for glance in bench.glances]
-        left: list[tuple[PlaceTask, Path]] = []
+        left: list[_KeptTask] = []
         for task in tasks:
-            file = self.folder / f"{_key(task, shared[task.glance])}.npz"
-            placed = _read(file, task.index)
+            kept = _KeptTask.of(task, self.folder / f"{_key(task, shared[task.glance])}.npz")
+            placed = _read(kept.file, task.index)
             if placed is None:
-                left.append((task, file))
+                left.append(kept)
             else:
                 self.on_done()
                 yield placed
         if not left:
             return
-        workers = min(self.jobs, len(left))
-        ended = self._elsewhere(bench, left, workers) if workers > 1 else self._here(bench, left)
-        with contextlib.closing(ended):
-            for placed in ended:
+        executor = self.where.executor(len(left), quiet=self.quiet)
+        work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.bench.npz", bench.seed)
+        work.remember(bench)
+        if executor is not None:
+            work.save(bench)
+        with contextlib.closing((executor or Serial()).run(work, left)) as ended:
+            for task, _ in ended:
                 self.on_done()
-                yield placed
-
-    def _here(self, bench: Workbench, left: Sequence[tuple[PlaceTask, Path]]) -> Generator[Placed]:
-        for task, file in left:
-            placed = bench.place(task)
-            _write(file, placed)
-            yield placed
-
-    def _elsewhere(self, bench: Workbench, left: Sequence[tuple[PlaceTask, Path]], workers: int) -> Generator[Placed]:
-        start_loading(tell=not self.quiet)
-        wait_until_loaded()
-        guide = None if bench.guide is None else _model_arrays(bench.guide)
-        glances = [_model_arrays(glance.model) for glance in bench.glances]
-        shared = (_bench_arrays(bench), glances, guide, bench.seed)
-        with ProcessPoolExecutor(
-            workers,
-            mp_context=context(),
-            initializer=_begin,
-            initargs=shared,
-        ) as pool:
-            with interrupts_ignored():
-                futures = [
-                    pool.submit(_do, _task_arrays(task), task.index, task.glance, asdict(task.settings), file)
-                    for task, file in left
-                ]
-            try:
-                for future in as_completed(futures):
-                    try:
-                        yield future.result()
-                    except BrokenExecutor as error:
-                        raise FitError(
-                            "A worker was stopped from outside, most likely for lack of memory; run the same command "
-                            "again with fewer --jobs."
-                        ) from error
-            finally:
-                wait([future for future in futures if not future.cancel()])
+                yield _read_again(task)
 
 
-_bench: Workbench | None = None
+def _read_again(task: _KeptTask) -> Placed:
+    placed = _read(task.file, task.index)
+    if placed is None:
+        raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
+    return placed
 
 
-def _begin(arrays: Arrays, glances: Sequence[Arrays], guide: Arrays | None, seed: int) -> None:
-    global _bench
-    threadpool_limits(1)
-    mesh = Mesh(arrays["vertices"], arrays["faces"])
-    harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
-    looks = tuple(Glance(_model_of(glance)) for glance in glances)
-    _bench = Workbench(mesh, harmonics, looks, seed, None if guide is None else _model_of(guide))
+@dataclass(frozen=True)
+class _KeptTask:
+    """A task as arrays, which reach any process, and the file for what comes of it."""
+
+    file: Path
+    arrays: Arrays
+    index: int
+    glance: int
+    settings: ElasticSettings
+
+    @staticmethod
+    def of(task: PlaceTask, file: Path) -> _KeptTask:
+        return _KeptTask(file, _task_arrays(task), task.index, task.glance, task.settings)
+
+    def task(self) -> PlaceTask:
+        arrays = self.arrays
+        T = _pose_of(arrays) if "scale" in arrays else None
+        scan = Mesh(arrays["vertices"], arrays.get("faces"), name=str(arrays["name"]))
+        return PlaceTask(self.index, scan, T, arrays.get("expected"), self.settings, self.glance, _marks_of(arrays))
+
+
+@dataclass(frozen=True)
+class RoundWork:
+    """Places scans by one workbench, for an executor.
+
+    Args:
+        file: of the workbench, which each worker reads once.
+        seed: of the workbench.
+    """
+
+    file: Path
+    seed: int
+
+    def do(self, task: _KeptTask) -> None:
+        """Place a scan and keep what came of it in its file, unless it is there already.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        if _read(task.file, task.index) is None:
+            _write(task.file, self._bench().place(task.task()))
+
+    def give_up(self, task: _KeptTask, reason: str) -> None:
+        """Keep in its file what sets a scan aside whose workers were lost.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        _write(task.file, self._bench().nothing(task.index, reason))
+
+    def remember(self, bench: Workbench) -> None:
+        """Keep the workbench for tasks in this process."""
+        _benches.clear()
+        _benches[self.file] = bench
+
+    def save(self, bench: Workbench) -> None:
+        """Write the workbench for other processes, if an earlier run has not.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        if self.file.is_file():
+            return
+        models = {f"glance_{number}": glance.model for number, glance in enumerate(bench.glances)}
+        models |= {} if bench.guide is None else {"guide": bench.guide}
+        parts = {"bench": _bench_arrays(bench)} | {name: _model_arrays(model) for name, model in models.items()}
+        arrays = {f"{part}.{name}": array for part, told in parts.items() for name, array in told.items()}
+        with atomic_path(self.file) as path, path.open("wb") as stream:
+            np.savez(stream, **cast(dict[str, Any], arrays))
+
+    def _bench(self) -> Workbench:
+        if self.file not in _benches:
+            self.remember(self._load())
+        return _benches[self.file]
+
+    def _load(self) -> Workbench:
+        parts: dict[str, Arrays] = {}
+        try:
+            with np.load(self.file, allow_pickle=False) as kept:
+                for key in kept.files:
+                    part, _, name = key.partition(".")
+                    parts.setdefault(part, {})[name] = kept[key]
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            raise FileError(f"Cannot read {self.file}, which this run wrote; remove it and run again.") from error
+        arrays = parts.pop("bench")
+        guide = parts.pop("guide", None)
+        mesh = Mesh(arrays["vertices"], arrays["faces"])
+        harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
+        glances = tuple(Glance(_model_of(parts[f"glance_{number}"])) for number in range(len(parts)))
+        return Workbench(mesh, harmonics, glances, self.seed, None if guide is None else _model_of(guide))
+
+
+_benches: dict[Path, Workbench] = {}
+"""The workbench of this process, by its file."""
 
 
 def _model_arrays(m: ShapeModel) -> Arrays:
@@ -133,18 +190,6 @@ def _model_of(arrays: Arrays) -> ShapeModel:
     return ShapeModel(
         arrays["mean"], arrays["basis"], arrays["stddev"], float(variance), int(samples), faces=arrays["faces"]
     )
-
-
-def _do(arrays: Arrays, index: int, glance: int, settings: dict[str, Any], file: Path) -> Placed:
-    assert _bench is not None
-    T = _pose_of(arrays) if "scale" in arrays else None
-    scan = Mesh(arrays["vertices"], arrays.get("faces"), name=str(arrays["name"]))
-    task = PlaceTask(
-        index, scan, T, arrays.get("expected"), ElasticSettings(**settings), glance, _marks_of(arrays)
-    )  # fmt: skip
-    placed = _bench.place(task)
-    _write(file, placed)
-    return placed
 
 
 def _bench_arrays(bench: Workbench) -> Arrays:

@@ -1,4 +1,4 @@
-"""Processes that fit: one server loads the code once, and each worker is a copy of it with a model of its own.
+"""Processes that fit: one server loads the code once, and each worker is a copy of it that ends with its parent.
 
 This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
 """
@@ -11,12 +11,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Generator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING, Any, cast
 
 from shapespace.errors import FitError
 
 if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
     from multiprocessing.context import ForkServerContext, SpawnContext
 
 WARM_UP = "SHAPESPACE_WARM_UP"
@@ -76,7 +77,8 @@ def wait_until_loaded() -> None:
         return
     try:
         first = context().Process(target=_nothing)
-        first.start()
+        with _children_allowed():
+            first.start()
         first.join()
     except (EOFError, OSError) as error:
         raise FitError("The system does not let worker processes start; fit with --jobs 1.") from error
@@ -84,6 +86,83 @@ def wait_until_loaded() -> None:
 
 def _nothing() -> None:
     pass
+
+
+class Worker:
+    """A process that is given one task after the other by a line of its own.
+
+    Args:
+        serve: what it does, given its end of the line and `arguments`; it sends one word when it is ready.
+        arguments: of `serve`.
+        life: of `life_line`; the process ends with it, whatever it is at.
+
+    Raises:
+        FitError: no process can be started.
+    """
+
+    def __init__(self, serve: Callable[..., None], arguments: tuple[Any, ...], life: Connection) -> None:
+        self.line, theirs = context().Pipe()
+        self._process = context().Process(target=_live, args=(serve, theirs, life, arguments), daemon=True)
+        try:
+            with interrupts_ignored(), _children_allowed():
+                self._process.start()
+        except (EOFError, OSError) as error:
+            raise FitError("The system does not let worker processes start; use --jobs 1.") from error
+        finally:
+            theirs.close()
+
+    def give(self, task: object) -> None:
+        """Send a task; a worker that died meanwhile is found out by `answer`."""
+        with contextlib.suppress(OSError):
+            self.line.send(task)
+
+    def answer(self) -> Any:
+        """Return the tuple that it sent, an empty one when it is ready, or None where none has come or will come."""
+        try:
+            return self.line.recv() if self.line.poll() else None
+        except (EOFError, OSError):
+            return None
+
+    def stop(self) -> int:
+        """End it at once where it has not ended, and return its exit code, below 0 for a signal."""
+        self._process.kill()
+        self._process.join()
+        self.line.close()
+        code = self._process.exitcode
+        self._process.close()
+        return 0 if code is None else code
+
+
+@contextlib.contextmanager
+def life_line() -> Generator[Connection]:
+    """Yield what ends with this block, and with this process whatever ends that: nobody else holds its other end."""
+    life, ours = context().Pipe(duplex=False)
+    try:
+        yield life
+    finally:
+        ours.close()
+        life.close()
+
+
+@contextlib.contextmanager
+def _children_allowed() -> Generator[None]:
+    """Let workers of Dask, which are daemons, have children too: the life line ends those with them."""
+    told: dict[str, Any] = cast(Any, multiprocessing.current_process())._config
+    daemon = told.pop("daemon", None)
+    try:
+        yield
+    finally:
+        if daemon is not None:
+            told["daemon"] = daemon
+
+
+def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
+    def end_with_parent() -> None:
+        life.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    serve(line, *arguments)
 
 
 @contextlib.contextmanager

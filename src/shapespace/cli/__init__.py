@@ -1,7 +1,7 @@
 """The command line: parsing, printing and exit codes; what the commands do stands in `commands`.
 
 Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doubtful); 2 wrong arguments or unusable
-input; 130 stopped by Ctrl-C, files valid.
+input; 130 stopped by Ctrl-C, 143 by SIGTERM and 129 by SIGHUP, files valid.
 """
 
 from __future__ import annotations
@@ -9,14 +9,18 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Generator, Sequence
 
 from shapespace.cli.arguments import parser
 from shapespace.cli.printing import say
 from shapespace.errors import ShapespaceError
 
 __all__ = ["main", "parser"]
+
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     arguments = parser().parse_args(argv)
     try:
-        code = int(arguments.run(arguments))
+        with _ended_as_by_ctrl_c():
+            code = int(arguments.run(arguments))
         sys.stdout.flush()
         return code
     except ShapespaceError as error:
@@ -36,9 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         say("shapespace: there is not enough memory for this; give fewer or smaller meshes, or fewer --jobs.")
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as ended:
         say(f"shapespace: stopped; the files written so far are whole{getattr(arguments, 'goes_on', '')}.")
-        return 130
+        return 128 + (ended.signal if isinstance(ended, _Ended) else signal.SIGINT)
     except BrokenPipeError:
         _drop_output()
         return 0
@@ -47,6 +52,36 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = f" ({error.filename})" if error.filename else ""
         say(f"shapespace: the system refused{where}: {error.strerror or error}; check the path and the free space.")
         return 2
+
+
+class _Ended(KeyboardInterrupt):
+    """A signal asks this process to end, as Ctrl-C does."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.signal = number
+
+
+@contextlib.contextmanager
+def _ended_as_by_ctrl_c() -> Generator[None]:
+    """Take the signals by which clusters and closing terminals end a process as Ctrl-C is taken."""
+
+    def end(number: int, _frame: object) -> None:
+        raise _Ended(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    taken = [number for name in _ENDING if (number := getattr(signal, name, None)) is not None]
+    # Under nohup SIGHUP is ignored, and stays so.
+    before = {number: signal.getsignal(number) for number in taken if signal.getsignal(number) == signal.SIG_DFL}
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _drop_output() -> None:

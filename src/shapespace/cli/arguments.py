@@ -9,6 +9,7 @@ from typing import Any, cast
 from shapespace.cli import run
 from shapespace.version import __version__
 
+_EXECUTORS = ("local", "serial", "dask")
 _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
 
 
@@ -141,7 +142,7 @@ def _add_correspond(commands: Any) -> None:
     sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
                      help="of the template where a scan is chosen (default 10000)")  # fmt: skip
     sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")
-    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="scans at a time (default: one a core)")
+    _add_where(sub, "scans")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.correspond, goes_on="; the same command goes on from there")
 
@@ -237,14 +238,17 @@ def _add_fit(commands: Any) -> None:
                      help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
     sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
     sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
-    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="scans at a time (default: one a core)")
-    sub.add_argument("--resume", action="store_true", help="keep results of an earlier run that still hold")
+    _add_where(sub, "scans")
+    results = sub.add_mutually_exclusive_group()
+    results.add_argument("--again", action="store_true", help="fit also scans whose results of earlier runs still hold")
+    results.add_argument("--resume", action="store_true",
+                         help="keep results of earlier runs that still hold; it is what is done anyway")  # fmt: skip
     sub.add_argument("--dense", action="store_true",
                      help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
-    sub.set_defaults(run=run.fit, goes_on="; the same command with --resume goes on from there")
+    sub.set_defaults(run=run.fit, goes_on="; the same command goes on from there")
 
 
 def _add_view(commands: Any) -> None:
@@ -336,9 +340,30 @@ def _add_recognise_study(commands: Any) -> None:
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="shape model that fits them")
     sub.add_argument("--folds", type=_positive, default=10, metavar="N", help="folds by subject (default 10)")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of everything that is drawn")
-    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help="fits at a time (default: one a core)")
+    _add_where(sub, "fits")
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.recognise_study, goes_on="; the same command goes on from there")
+
+
+def _add_where(sub: argparse.ArgumentParser, what: str) -> None:
+    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help=f"{what} at a time (default: one a core)")
+    sub.add_argument("--executor", choices=_EXECUTORS, default="local",
+                     help="local (default): processes here; serial: one after the other; dask: a cluster")  # fmt: skip
+    sub.add_argument("--dask", metavar="ADDRESS",
+                     help="of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file (.json); "
+                          "without it --executor dask makes a cluster of this machine")  # fmt: skip
+    sub.add_argument("--timeout", type=_seconds, metavar="S",
+                     help=f"give up any of the {what} that takes longer, and go on with the others")  # fmt: skip
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be seconds above 0, not {text!r}")
+    return value
 
 
 def _positive(text: str) -> int:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shapespace.cli.printing import now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
+    from shapespace.batch.executors import Where
     from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
 
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
@@ -197,7 +198,7 @@ def _print_check(report: Mapping[str, Any]) -> None:
 
 def correspond(arguments: argparse.Namespace) -> int:
     """Bring scans into correspondence."""
-    if arguments.jobs != 1:
+    if arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
 
         start_loading(tell=not arguments.quiet)
@@ -217,7 +218,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         arguments.template,
         arguments.model,
         arguments.landmarks,
-        arguments.jobs,
+        _where(arguments),
         arguments.recursive,
     )
     summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
@@ -337,7 +338,8 @@ def info(arguments: argparse.Namespace) -> int:
 
 def fit(arguments: argparse.Namespace) -> int:
     """Fit a model to scans."""
-    if arguments.jobs != 1 and (len(arguments.scans) > 1 or arguments.scans[0].is_dir()):
+    several = len(arguments.scans) > 1 or arguments.scans[0].is_dir()
+    if several and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading
 
         # While this process loads its own code; half of the time that many scans take to start.
@@ -355,7 +357,7 @@ def fit(arguments: argparse.Namespace) -> int:
         dense=arguments.dense,
     )
     settings = BatchSettings(
-        config, arguments.landmarks, arguments.jobs, arguments.resume, arguments.stages, arguments.recursive
+        config, arguments.landmarks, _where(arguments), arguments.again, arguments.stages, arguments.recursive
     )
     records = fit_scans(arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn)
     counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
@@ -369,6 +371,12 @@ def fit(arguments: argparse.Namespace) -> int:
     if counts["failed"] == len(records):
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _where(arguments: argparse.Namespace) -> Where:
+    from shapespace.batch.executors import Where
+
+    return Where(arguments.executor, arguments.jobs, arguments.timeout, arguments.dask or "")
 
 
 def recognise_train(arguments: argparse.Namespace) -> int:
@@ -453,7 +461,7 @@ def recognise_study(arguments: argparse.Namespace) -> int:
         arguments.model,
         folds=arguments.folds,
         seed=arguments.seed,
-        jobs=arguments.jobs,
+        where=_where(arguments),
         quiet=arguments.quiet,
     )
     if arguments.json:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
+from shapespace.batch.fit_work import naming
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.results import read_record
-from shapespace.batch.run import naming
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.commands.corresponding import surface_files
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
 
+from shapespace.batch.executors import Where
 from shapespace.batch.folder import names_for
+from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
-from shapespace.batch.workers import cores
 from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
@@ -62,7 +63,7 @@ class CorrespondFiles:
         template: a mesh to begin with, or None.
         model: to begin with, or None.
         landmarks: a folder of files that are named as the scans, or None.
-        jobs: scans at a time; 0 for one a core.
+        where: scans are registered.
         recursive: take scans in folders below those given too.
     """
 
@@ -70,7 +71,7 @@ class CorrespondFiles:
     template: Path | None = None
     model: Path | None = None
     landmarks: Path | None = None
-    jobs: int = 0
+    where: Where = field(default_factory=Where)
     recursive: bool = False
 
 
@@ -96,8 +97,15 @@ def correspond_files(
     paths = list(dict.fromkeys(path for path in found.files if not path.name.endswith(SURFACE)))
     if len(paths) < len(set(found.files)):
         say(f"{len(set(found.files)) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
-    names = names_for(paths, None)
     make_folder(folder)
+    with only_writer(folder):
+        return _corresponding(paths, files, folder, settings, quiet=quiet, say=say)
+
+
+def _corresponding(
+    paths: Sequence[Path], files: CorrespondFiles, folder: Path, settings: CorrespondSettings, *, quiet: bool, say: _Say
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    names = names_for(paths, None)
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared(paths)
     scans, unread, notes = _read_all(paths, names, marks, quiet=quiet)
@@ -107,7 +115,7 @@ def correspond_files(
         for sentence in _told_astray(template):
             say(f"{template.name}: {sentence}")
     model = None if files.model is None else ShapeModel.load(files.model)
-    rounds = _Rounds(folder / _KEPT, files.jobs or cores(), quiet=quiet)
+    rounds = _Rounds(folder / _KEPT, files.where, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings, model)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
@@ -139,8 +147,8 @@ def correspond_files(
 class _Rounds:
     """Runs rounds with a bar for each."""
 
-    def __init__(self, folder: Path, jobs: int, *, quiet: bool) -> None:
-        self._folder, self._jobs, self._quiet, self._number = folder, jobs, quiet, 0
+    def __init__(self, folder: Path, where: Where, *, quiet: bool) -> None:
+        self._folder, self._where, self._quiet, self._number = folder, where, quiet, 0
 
     def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
         self._number += 1
@@ -149,7 +157,7 @@ class _Rounds:
             def one_more() -> None:
                 bar.update()
 
-            return list(KeptRounds(self._folder, self._jobs, self._quiet, one_more)(bench, tasks))
+            return list(KeptRounds(self._folder, self._where, self._quiet, one_more)(bench, tasks))
 
 
 def _read_all(

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from shapespace.batch.executors import Where
+from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, telling_of_compiling
-from shapespace.batch.run import Job, fit_files, make_executor, make_jobs
-from shapespace.batch.workers import cores, start_loading
+from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
@@ -31,16 +31,16 @@ class BatchSettings:
     Args:
         config: settings of each fit.
         landmarks: of the one scan there is, or None.
-        jobs: scans at a time; 0 for one a core.
-        resume: keep results that still hold.
+        where: they are fitted.
+        again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.
     """
 
     config: FitConfig = field(default_factory=FitConfig)
     landmarks: Path | None = None
-    jobs: int = 0
-    resume: bool = False
+    where: Where = field(default_factory=Where)
+    again: bool = False
     stages: bool = False
     recursive: bool = False
 
@@ -93,6 +93,10 @@ class _Watch:
     def state(self, state: IcpState) -> None:
         self.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
 
+    def plan(self, plan: Plan) -> None:
+        for sentence in plan.sentences():
+            self.say(sentence)
+
     def done(self, job: Job, record: Mapping[str, Any]) -> None:
         self.bar.update()
         if record["status"] == "converged":
@@ -113,17 +117,12 @@ def _fit(
     *,
     quiet: bool,
 ) -> list[dict[str, Any]]:
-    workers = min(settings.jobs or cores(), len(work))
-    fit = partial(
-        fit_files, work, model, model_path, folder, settings.config,
-        resume=settings.resume, stages=settings.stages, on_done=watch.done,
-    )  # fmt: skip
-    if workers <= 1:
-        with telling_of_compiling(quiet=quiet):
-            return fit(on_state=watch.state)
-    start_loading(tell=not quiet)
-    with make_executor(model_path, workers) as executor:
-        return fit(executor=executor)
+    executor = settings.where.executor(len(work), quiet=quiet)
+    with telling_of_compiling(quiet=quiet or executor is not None):
+        return fit_files(
+            work, model, model_path, folder, settings.config, executor=executor, resume=not settings.again,
+            stages=settings.stages, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
+        )  # fmt: skip
 
 
 def _scans(scans: Sequence[Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:

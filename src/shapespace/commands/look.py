@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from shapespace.batch.fit_work import naming
 from shapespace.batch.results import read_record
-from shapespace.batch.run import naming
 from shapespace.commands.corresponding import json_of
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
-from shapespace.batch.run import naming
 from shapespace.commands.corresponding import SURFACE, surface_files
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge

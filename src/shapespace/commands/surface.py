@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from shapespace.batch.fit_work import naming
 from shapespace.batch.folder import names_for
 from shapespace.batch.progress import progress
-from shapespace.batch.run import naming
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file

@@ -143,7 +143,7 @@ class Workbench:
             with threadpool_limits(limits=1, user_api="blas"):
                 placed = self._best(task)
         except ShapespaceError as error:
-            placed = self._nothing(task, str(error))
+            placed = self.nothing(task.index, str(error))
         return replace(placed, seconds=time.process_time() - begun)
 
     def _best(self, task: PlaceTask) -> Placed:
@@ -265,11 +265,10 @@ class Workbench:
         shares = np.quantile(both, [0.95, 0.99, 1.0])
         return covered, (float(both.mean()), float(shares[0]), float(shares[1]), float(shares[2]))
 
-    def _nothing(self, task: PlaceTask, reason: str) -> Placed:
+    def nothing(self, index: int, reason: str) -> Placed:
+        """Return what stands for a scan that is not placed."""
         vertices = np.array(self.mesh.vertices)
-        return Placed(
-            task.index, vertices, Similarity.identity(), np.zeros(len(vertices), np.bool_), 0.0, _FAR, 0.0, reason
-        )  # fmt: skip
+        return Placed(index, vertices, Similarity.identity(), np.zeros(len(vertices), np.bool_), 0.0, _FAR, 0.0, reason)
 
 
 def _facing(scan: Mesh, surface: Mesh) -> Mesh:

@@ -6,12 +6,18 @@ import contextlib
 import errno
 import hashlib
 import os
+import platform
+import re
 import tempfile
-from collections.abc import Generator
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 
 from shapespace.errors import FileError
 
+_TEMPORARY = ".shapespace-"
+_HOST = re.sub(r"\W|_", "", platform.node())[:24]
+_LEFT_S = 3600.0
 _WRITE_HINTS = {
     errno.ENOSPC: "the disk is full; free some space and run again",
     errno.EACCES: "no permission; choose another folder",
@@ -75,22 +81,84 @@ def atomic_path(path: Path) -> Generator[Path]:
         FileError: the folder cannot be written, or the disk is full.
     """
     path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}.", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-    except OSError as error:
-        raise write_error(path, error) from error
-    temporary = Path(name)
+    temporary = _temporary_beside(path)
     try:
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
+        _put(temporary, path)
     except OSError as error:
         raise write_error(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Iterable[Path] = ()) -> None:
+    """Write files of which the last vouches for the others: stopped at any moment, it is whole and theirs, or absent.
+
+    Args:
+        files: what writes each, given a temporary path.
+        remove: what goes as these come.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full; what was there is there still.
+    """
+    with contextlib.ExitStack() as stack:
+        written: dict[Path, Path] = {}
+        for path, write in files.items():
+            written[path] = _temporary_beside(path)
+            stack.callback(written[path].unlink, missing_ok=True)
+            try:
+                write(written[path])
+            except OSError as error:
+                raise write_error(path, error) from error
+        for path in (*list(files)[-1:], *remove):
+            remove_file(path)
+        for path, temporary in written.items():
+            try:
+                _put(temporary, path)
+            except OSError as error:
+                raise write_error(path, error) from error
+
+
+def _temporary_beside(path: Path) -> Path:
+    try:
+        prefix = f"{_TEMPORARY}{_HOST}-{os.getpid()}-{path.stem[:40]}."
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise write_error(path, error) from error
+    return Path(name)
+
+
+def _put(temporary: Path, path: Path) -> None:
+    umask = os.umask(0)
+    os.umask(umask)
+    temporary.chmod(0o666 & ~umask)
+    temporary.replace(path)
+
+
+def sweep(folder: Path) -> None:
+    """Remove the temporary files of processes that were killed as they wrote into `folder`.
+
+    Those of another machine are left for an hour, since nobody here knows whether it writes still.
+    """
+    for path in folder.glob(f"{_TEMPORARY}*-*-*"):
+        host, pid = path.name.removeprefix(_TEMPORARY).split("-")[:2]
+        with contextlib.suppress(OSError, ValueError):
+            ended = _has_ended(int(pid)) if host == _HOST else time.time() - path.stat().st_mtime > _LEFT_S
+            if ended:
+                path.unlink(missing_ok=True)
+
+
+def _has_ended(pid: int) -> bool:
+    if os.name == "nt":
+        return False  # there is no harmless signal to ask with
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        return False
+    return False
 
 
 def write_bytes(path: Path, data: bytes) -> None:

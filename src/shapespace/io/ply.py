@@ -21,6 +21,7 @@ _SCALARS = {
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20
+_FIRST_LINES = 512
 _INDEX_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -274,10 +275,16 @@ def _indices(values: npt.NDArray[Any]) -> IndexArray:
     return values.astype(np.int64)
 
 
-def write_ply(mesh: Mesh) -> bytes:
-    """Return `mesh` as binary little-endian PLY with double coordinates, so that reading it back is exact."""
+def write_ply(mesh: Mesh, comment: str = "") -> bytes:
+    """Return `mesh` as binary little-endian PLY with double coordinates, so that reading it back is exact.
+
+    Args:
+        mesh: vertices in whatever unit they are in.
+        comment: one line for the header, ASCII.
+    """
     faces = mesh.faces
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
+    lines += [f"element vertex {len(mesh.vertices)}"]
     lines += [f"property double {axis}" for axis in "xyz"]
     body = mesh.vertices.astype("<f8").tobytes()
     if faces is not None:
@@ -286,3 +293,14 @@ def write_ply(mesh: Mesh) -> bytes:
         table["n"], table["i"] = 3, faces
         body += table.tobytes()
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + body
+
+
+def ply_comment(path: Path) -> str:
+    """Return the first comment in the header of a PLY file, empty where there is none or it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            lines = stream.read(_FIRST_LINES).split(b"\n")
+    except OSError:
+        return ""
+    found = next((line for line in lines if line.startswith(b"comment ")), b"")
+    return found.removeprefix(b"comment ").decode("ascii", "replace").strip()

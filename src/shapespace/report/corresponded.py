@@ -224,6 +224,8 @@ class Corresponded:
             record = read(CorrespondRecord, self.folder.json(file), file, CORRESPOND_AGAIN)
             if record.name != name:
                 raise FileFormatError(f"{file} is the record of another scan, {record.name}; {CORRESPOND_AGAIN}.")
+            if any(isinstance(value, float) and not 0 <= value < math.inf for value in structs.astuple(record)):
+                raise FileFormatError(f"{file} is damaged: it holds a number that none can be; {CORRESPOND_AGAIN}.")
         except ShapespaceError as error:
             self.unread[printable(name)] = str(error)
             return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
-from shapespace.batch.run import Job, fit_files, make_executor, make_jobs
+from shapespace.batch.executors import Where
+from shapespace.batch.fit_work import Job
+from shapespace.batch.progress import progress
+from shapespace.batch.run import fit_files, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig
@@ -37,7 +38,7 @@ _CURVE = (2, 5, 10, 20, 40, 80)
 
 
 def run_own_study(
-    folder: Path, data: Path, model_file: Path, *, folds: int, workers: int, seed: int = 0, quiet: bool = False
+    folder: Path, data: Path, model_file: Path, *, folds: int, where: Where, seed: int = 0, quiet: bool = False
 ) -> tuple[Path, str]:
     """Fit the labelled scans in `data`, classify them, and write recognition.json and its report.
 
@@ -47,7 +48,7 @@ def run_own_study(
         model_file: the shape model, which should know none of these people; where it parts identity and expression,
             expression alone is a feature as well.
         folds: by subject, at most; fewer where there are fewer people.
-        workers: processes that fit.
+        where: the scans are fitted.
         seed: of the folds.
         quiet: no progress bar.
 
@@ -68,20 +69,16 @@ def run_own_study(
         additive: AdditiveModel | None = AdditiveModel.load(model_file)
     except ModelFileError:
         additive = None  # a plain shape model, which loaded
-    with ExitStack() as stack:
-        executor = stack.enter_context(make_executor(model_file, workers)) if workers > 1 else None
-        bar = stack.enter_context(
-            tqdm(total=len(found.scans), unit="scan", leave=False, desc="fitting", disable=True if quiet else None)
-        )
+    with progress(len(found.scans), "fitting", "scan", quiet=quiet) as bar:
 
         def fitted(job: Job, record: Mapping[str, Any]) -> None:
             bar.update()
 
         jobs = make_jobs([entry.path for entry in found.scans])
-        results = make_folder(folder / "fits")
         records = fit_files(
-            jobs, model, model_file, results, FitConfig(), executor=executor, resume=True, on_done=fitted
-        )
+            jobs, model, model_file, make_folder(folder / "fits"), FitConfig(),
+            executor=where.executor(len(jobs), quiet=quiet), resume=True, on_done=fitted,
+        )  # fmt: skip
     fits = OwnFits.of(found.scans, records, model, additive)
     settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}
     made = _document(fits, found.summary(), settings)

@@ -73,8 +73,8 @@ Message: TypeAlias = Mapping[str, Any]
 def fit_upload(pipe: Connection, upload: Upload) -> None:
     """Fit `upload` and tell of it: the scan, each state of the loop, the verdict; runs in a worker process."""
     _step_back()
+    from shapespace.batch.fit_work import Job, fit_file
     from shapespace.batch.results import write_record
-    from shapespace.batch.run import Job, fit_file
     from shapespace.errors import ShapespaceError
     from shapespace.fit.fit import FitConfig
     from shapespace.fit.state import IcpState

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib.util
-import secrets
 import signal
 import socket
 import threading
@@ -20,11 +19,12 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
 
 if TYPE_CHECKING:
+    from shapespace.viewer.guard import Access
+    from shapespace.viewer.limits import Limits
     from shapespace.viewer.sessions import Sessions
 
 FIRST_PORT = 7860
 _PORTS_TRIED = 50
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _EVERYWHERE = ("0.0.0.0", "::", "")
 
 
@@ -44,12 +44,12 @@ def serve(
     Args:
         path: a model file, or a folder that `shapespace fit` or `shapespace correspond` wrote.
         model: the model's file, where the records of the folder do not lead to it.
-        host: the address to listen at; anything but loopback needs a token, which is part of the address printed.
+        host: the address to listen at.
         port: None takes the first free one from `FIRST_PORT`.
         open_browser: whether to open the page.
         max_upload_mb: largest scan that may be dropped.
         quiet: whether to be silent about code that is being compiled.
-        say: told the address.
+        say: told the address, which holds the token that visitors need.
 
     Raises:
         ShapespaceError: the extra `view` is not installed.
@@ -61,35 +61,48 @@ def serve(
             raise ShapespaceError(
                 f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
             )
-    if (path / CorrespondenceRecord.FILE).is_file():
-        make = _of_surfaces(path, model)
-    else:
-        make = _of_model(path, model, max_upload_mb, quiet=quiet)
+    from shapespace.viewer.guard import LOOPBACK, Access
+    from shapespace.viewer.limits import Limits
+
+    upload_bytes = max_upload_mb * 2**20
+    limits = Limits(
+        upload_bytes=upload_bytes,
+        all_bytes=max(Limits.all_bytes, 2 * upload_bytes),
+        fits_at_once=cores(),
+    )
+    make = (
+        _of_surfaces(path, model)
+        if (path / CorrespondenceRecord.FILE).is_file()
+        else _of_model(path, model, limits, quiet=quiet)
+    )
     with _ended_by_signals():
         build = make()
         listening = listen(host, port)
         taken = int(listening.getsockname()[1])
-        token = None if host in _LOOPBACK else secrets.token_urlsafe(24)
-        app, sessions = build(token, f"shapespace_{taken}")
-        address = page_address(host, taken, token)
+        access, local = Access(limits), host in LOOPBACK
+        app, sessions = build(access, local, f"shapespace_{taken}")
 
         def started() -> None:
-            say(f"The viewer is at {address}")
-            if token is not None:
+            say(f"The viewer is at {page_address(host, taken, access.token)}")
+            if not local:
                 say("Whoever has this address can use it, and the connection is not encrypted.")
             say("Ctrl-C ends the viewer.")
             if open_browser:
-                threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+                opened = page_address(host, taken, access.ticket())
+                threading.Thread(target=webbrowser.open, args=(opened,), daemon=True).start()
 
-        run(app, sessions, listening, started)
+        run(app, sessions, limits, listening, started)
 
 
 _App: TypeAlias = "tuple[object, Sessions | None]"
-_Build: TypeAlias = Callable[[str | None, str], _App]
+_Build: TypeAlias = "Callable[[Access, bool, str], _App]"
 
 
 def _of_surfaces(path: Path, model: Path | None) -> Callable[[], _Build]:
-    """Return what opens a folder in correspondence, and then makes its application from a token and a cookie's name."""
+    """Return what opens a folder in correspondence, and then makes its application.
+
+    It is made of what lets visitors in, whether it is for this machine alone, and a cookie's name.
+    """
     if model is not None:
         raise InputError(f"{path} is a correspondence without fits; leave --model out.")
 
@@ -98,12 +111,15 @@ def _of_surfaces(path: Path, model: Path | None) -> Callable[[], _Build]:
         from shapespace.viewer.surfaces_server import make_surfaces_app
 
         shown = Surfaces(path)
-        return lambda token, cookie_name: (make_surfaces_app(shown, token=token, cookie_name=cookie_name), None)
+        return lambda access, local, cookie_name: (
+            make_surfaces_app(shown, access=access, local=local, cookie_name=cookie_name),
+            None,
+        )
 
     return open_
 
 
-def _of_model(path: Path, model: Path | None, max_upload_mb: int, *, quiet: bool) -> Callable[[], _Build]:
+def _of_model(path: Path, model: Path | None, limits: Limits, *, quiet: bool) -> Callable[[], _Build]:
     """Return the same of a model, or of a folder of fits."""
     # While this process loads its own code.
     start_loading(tell=not quiet)
@@ -111,13 +127,13 @@ def _of_model(path: Path, model: Path | None, max_upload_mb: int, *, quiet: bool
     def open_() -> _Build:
         from shapespace.viewer.scratch import sweep
         from shapespace.viewer.server import make_app
-        from shapespace.viewer.sessions import Limits
         from shapespace.viewer.shown import Shown
 
         sweep()
         shown = Shown.open(path, model)
-        limits = Limits(upload_bytes=max_upload_mb * 2**20, fits_at_once=cores())
-        return lambda token, cookie_name: make_app(shown, limits=limits, token=token, cookie_name=cookie_name)
+        return lambda access, local, cookie_name: make_app(
+            shown, limits=limits, access=access, local=local, cookie_name=cookie_name
+        )
 
     return open_
 
@@ -147,16 +163,21 @@ def _ended_by_signals() -> Generator[None]:
             signal.signal(number, handler)
 
 
-def run(app: object, sessions: Sessions | None, listening: socket.socket, started: Callable[[], None]) -> None:
+def run(
+    app: object, sessions: Sessions | None, limits: Limits, listening: socket.socket, started: Callable[[], None]
+) -> None:
     """Serve `app` until a signal ends it; scans and processes of visitors are gone when it returns.
 
     Args:
         app: the application.
         sessions: its sessions, None where it has none.
+        limits: of connections.
         listening: where it is served.
         started: called when it answers.
     """
     import uvicorn
+
+    from shapespace.viewer.connections import server_config
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -181,18 +202,8 @@ def run(app: object, sessions: Sessions | None, listening: socket.socket, starte
                 sessions.closing = True
             super().handle_exit(sig, frame)
 
-    config = uvicorn.Config(
-        app,  # type: ignore[arg-type]
-        log_level="error",
-        access_log=False,
-        server_header=False,
-        timeout_graceful_shutdown=3,
-        timeout_keep_alive=30,
-        ws="none",
-        lifespan="on",
-    )
     try:
-        Server(config).run(sockets=[listening])
+        Server(server_config(app, limits)).run(sockets=[listening])
     except KeyboardInterrupt:
         # Ctrl-C is how a viewer ends.
         pass
@@ -229,9 +240,9 @@ def listen(host: str, port: int | None) -> socket.socket:
     raise InputError(f"The ports from {FIRST_PORT} to {FIRST_PORT + _PORTS_TRIED - 1} are taken; choose one by --port.")
 
 
-def page_address(host: str, port: int, token: str | None) -> str:
-    """Return the address of the page, as a browser takes it."""
+def page_address(host: str, port: int, token: str) -> str:
+    """Return the address that lets a browser in."""
     name = socket.gethostname() if host in _EVERYWHERE else host
     if ":" in name:
         name = f"[{name}]"
-    return f"http://{name}:{port}/" + ("" if token is None else f"?token={token}")
+    return f"http://{name}:{port}/?token={token}"

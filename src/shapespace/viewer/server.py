@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import unicodedata
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
-from contextlib import asynccontextmanager
+from contextlib import aclosing, asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -17,30 +17,32 @@ import numpy as np
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from shapespace.errors import FileError
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks import write_landmarks
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.report import colours
+from shapespace.schemas import to_json
 from shapespace.types import Mesh
 from shapespace.version import __version__
-from shapespace.viewer.answers import BINARY, PAGES, asset, download, handlers
+from shapespace.viewer.answers import PAGES, answer, application, asset, binary
+from shapespace.viewer.bodies import Bodies
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, Worker, fit_upload
-from shapespace.viewer.guard import Guard, cookie
+from shapespace.viewer.guard import Access, Guard, cookie
+from shapespace.viewer.limits import Limits
 from shapespace.viewer.scratch import new_folder
-from shapespace.viewer.sessions import DroppedScan, Limits, Session, Sessions
+from shapespace.viewer.sessions import DroppedScan, Session, Sessions
 from shapespace.viewer.shown import Shown, shape_of
 
 EXPORTS = ("ply", "obj", "stl")
-_LARGEST_QUESTION = 2**20
 _LONGEST_NAME = 120
 _FEWEST_LANDMARKS = 3
 _NO_SCAN = "There is no such scan; it was removed, or it never was yours."
 _NO_SESSION = "This visit has ended, and its scans were removed; reload the page."
-_DISK = "The server could not store the scan: {}; free some space there and drop it again."
 
 Endpoint: TypeAlias = Callable[[Request], Coroutine[Any, Any, Response]]
 
@@ -48,8 +50,9 @@ Endpoint: TypeAlias = Callable[[Request], Coroutine[Any, Any, Response]]
 def make_app(
     shown: Shown,
     *,
-    limits: Limits | None = None,
-    token: str | None = None,
+    limits: Limits,
+    access: Access,
+    local: bool = True,
     cookie_name: str = "shapespace",
     worker: Worker = fit_upload,
 ) -> tuple[ASGIApp, Sessions]:
@@ -57,8 +60,9 @@ def make_app(
 
     Args:
         shown: what it shows.
-        limits: what a visitor may use; None for the defaults.
-        token: what every request must carry; None on loopback.
+        limits: what visitors may use.
+        access: what every request must carry.
+        local: whether it is for this machine alone.
         cookie_name: of its cookies; browsers share cookies between ports, so it should name the port.
         worker: what fits a dropped scan, in a process of its own.
     """
@@ -74,7 +78,7 @@ def make_app(
         model_file,
         shown.model_name,
         with_landmarks=len(shown.model.landmarks) >= _FEWEST_LANDMARKS,
-        limits=limits or Limits(),
+        limits=limits,
         worker=worker,
         remove_root=remove_root,
     )
@@ -95,18 +99,15 @@ def make_app(
             await asyncio.gather(*working, return_exceptions=True)
             sessions.close()
 
-    app = Starlette(
-        routes=viewer.routes(),
-        lifespan=lifespan,
-        exception_handlers=handlers(shown.told),
-    )
-    return Guard(app, token=token, cookie=f"{cookie_name}_token"), sessions
+    app = application(viewer.routes(), lifespan, shown.told)
+    return Guard(app, access=access, cookie=f"{cookie_name}_token", local=local), sessions
 
 
 class _Viewer:
     def __init__(self, shown: Shown, sessions: Sessions, cookie_name: str) -> None:
         self._shown = shown
         self._sessions = sessions
+        self._bodies = Bodies(sessions.limits, sessions.kept_bytes)
         self._cookie = cookie_name
         self._packed: tuple[bytes, int] | None = None
         self._packing = asyncio.Lock()
@@ -142,7 +143,7 @@ class _Viewer:
     async def about(self, request: Request) -> Response:
         model, limits = self._shown.model, self._sessions.limits
         _, modes = await self.packed_model()
-        return JSONResponse(
+        return answer(
             {
                 "version": __version__,
                 "model": self._shown.model_name,
@@ -169,10 +170,10 @@ class _Viewer:
 
     async def model(self, request: Request) -> Response:
         packed, _ = await self.packed_model()
-        return Response(packed, media_type=BINARY)
+        return binary(packed)
 
     async def fits(self, request: Request) -> Response:
-        return JSONResponse(await asyncio.to_thread(self._shown.fit_list))
+        return answer(await asyncio.to_thread(self._shown.fit_list))
 
     async def fit(self, request: Request) -> Response:
         try:
@@ -181,15 +182,15 @@ class _Viewer:
             raise HTTPException(
                 404, "There is no such fit; reload the page to see what the folder holds now."
             ) from None
-        return Response(packed, media_type=BINARY)
+        return binary(packed)
 
     async def export(self, request: Request) -> Response:
         kind = request.query_params.get("format", "")
         if kind not in EXPORTS:
             raise HTTPException(400, f"There is no export as {kind[:20]!r}; choose one of {', '.join(EXPORTS)}.")
-        question = await _question(request)
+        question = await self._question(request)
         content = await asyncio.to_thread(self._exported, kind, question, self._session(request))
-        return download(content, f"shape.{kind}")
+        return binary(content, f"shape.{kind}")
 
     def _exported(self, kind: str, question: Mapping[str, Any], session: Session | None) -> bytes:
         mesh = self._asked_mesh(question, session)
@@ -199,13 +200,14 @@ class _Viewer:
             return read_bytes(path)
 
     def _asked_mesh(self, question: Mapping[str, Any], session: Session | None) -> Mesh:
-        if "fit" in question:
+        fit, key = question.get("fit"), question.get("scan")
+        if isinstance(fit, str):
             try:
-                return self._shown.fitted_mesh(str(question["fit"]))
-            except (KeyError, AssertionError):
+                return self._shown.fitted_mesh(fit)
+            except KeyError:
                 raise HTTPException(404, "There is no such fit.") from None
-        if "scan" in question:
-            scan = session.scans.get(str(question["scan"])) if session else None
+        if isinstance(key, str):
+            scan = session.scans.get(key) if session else None
             if scan is None or not (scan.folder / f"{NAME}.fitted.ply").is_file():
                 raise HTTPException(404, _NO_SCAN)
             return read_mesh(scan.folder / f"{NAME}.fitted.ply")
@@ -216,7 +218,7 @@ class _Viewer:
 
     async def scans(self, request: Request) -> Response:
         session = self._session(request)
-        return JSONResponse([scan.facts() for scan in session.scans.values()] if session else [])
+        return answer([scan.facts() for scan in session.scans.values()] if session else [])
 
     async def drop(self, request: Request) -> Response:
         session = self._own_session(request)
@@ -234,23 +236,28 @@ class _Viewer:
             "the viewer with a larger --max-upload-mb."
         )
         announced = request.headers.get("content-length", "0")
-        if not announced.isdigit() or int(announced) > limits.upload_bytes:
+        if not (announced.isascii() and announced.isdigit()):
+            raise HTTPException(400, "The length of the scan is not a number; drop it again.")
+        if int(announced) > limits.upload_bytes:
             raise HTTPException(413, too_large)
-        session.uploading += 1
+        self._bodies.check_room(int(announced))
+        if not self._sessions.has_room(session):
+            raise HTTPException(503, f"{limits.visitors} visitors have scans here, as many as may; try again later.")
         folder = self._sessions.new_folder()
+        session.uploading += 1
         try:
             # A name of our own: what the visitor calls the file never becomes a path.
             path = folder / f"upload-{secrets.token_hex(4)}{ending}"
-            await _receive(request, path, limits.upload_bytes, too_large)
+            size = await self._receive(request, path, too_large)
             if self._sessions.find(session.key) is None:
                 raise HTTPException(403, _NO_SESSION)
-            scan = self._sessions.add(session, name, folder, path)
+            scan = self._sessions.add(session, name, folder, path, size)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
         finally:
             session.uploading -= 1
-        return JSONResponse(scan.facts(), 201)
+        return answer(scan.facts(), 201)
 
     async def events(self, request: Request) -> Response:
         scan = self._own_scan(request)
@@ -261,21 +268,21 @@ class _Viewer:
                     self._session(request)  # a visitor who watches is not idle
                     yield ": waiting\n\n"
                 else:
-                    yield f"data: {json.dumps(_finite(message))}\n\n"
+                    yield f"data: {json.dumps(to_json(message))}\n\n"
 
         return StreamingResponse(stream(), media_type="text/event-stream")
 
     async def preview(self, request: Request) -> Response:
-        return _file(self._own_scan(request).folder / PREVIEW)
+        return await _file(self._own_scan(request).folder / PREVIEW)
 
     async def picture(self, request: Request) -> Response:
-        return _file(self._own_scan(request).folder / PICTURE)
+        return await _file(self._own_scan(request).folder / PICTURE)
 
     async def record(self, request: Request) -> Response:
         path = self._own_scan(request).folder / f"{NAME}.fit.json"
         if not path.is_file():
             raise HTTPException(404, "This scan has no result yet.")
-        return download(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
+        return binary(await asyncio.to_thread(read_bytes, path), "scan.fit.json")
 
     async def landmarks(self, request: Request) -> Response:
         session, scan = self._own_session(request), self._own_scan(request)
@@ -283,7 +290,7 @@ class _Viewer:
             raise HTTPException(409, "Landmarks can be placed on a scan whose fit has ended in doubt; drop it again.")
         if session.unfinished() >= self._sessions.limits.unfinished:
             raise HTTPException(429, "Too many of your scans are being fitted; wait for one, or stop one.")
-        given: object = (await _question(request)).get("landmarks")
+        given: object = (await self._question(request)).get("landmarks")
         points = cast(dict[str, Any], given) if isinstance(given, dict) else dict[str, Any]()
         known = self._shown.model.landmarks
         if not all(name in known and _numbers(point) and len(point) == 3 for name, point in points.items()):
@@ -293,15 +300,15 @@ class _Viewer:
         path = scan.folder / "landmarks.csv"
         write_landmarks(path, {name: np.asarray(point, dtype=np.float64) for name, point in points.items()})
         self._sessions.fit_again(scan, path)
-        return JSONResponse(scan.facts())
+        return answer(scan.facts())
 
     async def cancel(self, request: Request) -> Response:
         self._sessions.cancel(self._own_scan(request))
-        return JSONResponse({})
+        return answer({})
 
     async def remove(self, request: Request) -> Response:
         self._sessions.remove(self._own_session(request), self._own_scan(request))
-        return JSONResponse({})
+        return answer({})
 
     def _session(self, request: Request) -> Session | None:
         return self._sessions.find(request.cookies.get(self._cookie))
@@ -319,41 +326,36 @@ class _Viewer:
             raise HTTPException(404, _NO_SCAN)
         return scan
 
+    async def _receive(self, request: Request, path: Path, too_large: str) -> int:
+        """Write the body of `request` to `path`, and return how many bytes it has."""
+        size = 0
+        most = self._sessions.limits.upload_bytes
+        with path.open("xb") as file:
+            async with aclosing(self._bodies.pieces(request, most, too_large)) as pieces:
+                async for piece in pieces:
+                    size += file.write(piece)
+        return size
+
+    async def _question(self, request: Request) -> Mapping[str, Any]:
+        """Return the JSON object in the body of `request`."""
+        body = bytearray()
+        most = self._sessions.limits.question_bytes
+        async with aclosing(self._bodies.pieces(request, most, "The request is too long.")) as pieces:
+            async for piece in pieces:
+                body += piece
+        try:
+            question: object = json.loads(body)
+        except (ValueError, RecursionError):
+            question = None
+        if not isinstance(question, dict):
+            raise HTTPException(400, "The request is not a JSON object.")
+        return cast(Mapping[str, Any], question)
+
     async def packed_model(self) -> tuple[bytes, int]:
         async with self._packing:
             if self._packed is None:
                 self._packed = await asyncio.to_thread(self._shown.packed_model)
             return self._packed
-
-
-async def _receive(request: Request, path: Path, most: int, too_large: str) -> None:
-    """Write the body of `request` to `path`, and stop where it grows too large."""
-    size = 0
-    try:
-        with path.open("xb") as file:
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size > most:
-                    raise HTTPException(413, too_large)
-                file.write(chunk)
-    except OSError as error:
-        raise HTTPException(507, _DISK.format(error.strerror or error)) from error
-
-
-async def _question(request: Request) -> Mapping[str, Any]:
-    """Return the JSON object in the body of `request`."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > _LARGEST_QUESTION:
-            raise HTTPException(413, "The request is too long.")
-    try:
-        question: object = json.loads(body)
-    except (ValueError, RecursionError):
-        question = None
-    if not isinstance(question, dict):
-        raise HTTPException(400, "The request is not a JSON object.")
-    return cast(Mapping[str, Any], question)
 
 
 def _numbers(value: object) -> bool:
@@ -371,16 +373,8 @@ def _shown_name(name: str) -> str:
     return f"{stem[:_LONGEST_NAME]}{dot}{ending[:10]}" or "The file"
 
 
-def _file(path: Path) -> Response:
-    if not path.is_file():
-        raise HTTPException(404, "There is no picture of this scan.")
-    return FileResponse(path, media_type=BINARY)
-
-
-def _finite(value: Any) -> Any:
-    """Return `value` with numbers that JSON does not know as null."""
-    if isinstance(value, float):
-        return value if value - value == 0 else None
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in cast(Mapping[str, Any], value).items()}
-    return [_finite(item) for item in cast(list[Any], value)] if isinstance(value, list) else value
+async def _file(path: Path) -> Response:
+    try:
+        return binary(await asyncio.to_thread(read_bytes, path))
+    except FileError:
+        raise HTTPException(404, "There is no picture of this scan.") from None

@@ -10,38 +10,13 @@ import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, Upload, Worker, converse, fit_upload
+from shapespace.viewer.limits import Limits
 
 _HELPED_BY_LANDMARKS = ("doubtful", "failed", "max_iterations")
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a visitor may use.
-
-    Args:
-        upload_bytes: largest scan.
-        fits_at_once: of all visitors; more wait in a queue.
-        unfinished: fits that one visitor may have running or waiting.
-        kept: fitted scans that one visitor may keep; the oldest go.
-        sessions: visitors at a time; the one idle for longest goes.
-        fit_s: seconds that a fit may take.
-        idle_s: seconds without a request after which a visitor's scans are removed.
-        unwatched_s: seconds after which a fit that nobody watches is stopped.
-    """
-
-    upload_bytes: int = 200 * 2**20
-    fits_at_once: int = 2
-    unfinished: int = 3
-    kept: int = 8
-    sessions: int = 100
-    fit_s: float = 600.0
-    idle_s: float = 1800.0
-    unwatched_s: float = 20.0
 
 
 class DroppedScan:
@@ -50,11 +25,12 @@ class DroppedScan:
     All of it is touched by the server's event loop alone, except `stop`.
     """
 
-    def __init__(self, key: str, name: str, folder: Path, upload: Path) -> None:
+    def __init__(self, key: str, name: str, folder: Path, upload: Path, size: int) -> None:
         self.key = key
         self.name = name
         self.folder = folder
         self.upload: Path | None = upload
+        self.size = size
         self.state = "waiting"
         self.run = 0
         self.gone = False
@@ -123,6 +99,11 @@ class Session:
         self.uploading = 0
         self.scans: dict[str, DroppedScan] = {}
 
+    @property
+    def has_scans(self) -> bool:
+        """Whether scans of this visitor are here, or on their way."""
+        return bool(self.scans) or self.uploading > 0
+
     def unfinished(self) -> int:
         """Return how many fits run or wait, and how many scans are on their way here."""
         return self.uploading + sum(not scan.finished for scan in self.scans.values())
@@ -172,12 +153,22 @@ class Sessions:
         return session
 
     def new(self) -> Session:
-        """Return a new session; where there are too many, the one idle for longest goes."""
-        while len(self._sessions) >= self.limits.sessions:
-            self._end(min(self._sessions.values(), key=lambda session: (session.unfinished() > 0, session.seen)))
+        """Return a new session; where too many have no scans, the one of them that is idle for longest goes."""
+        onlookers = [session for session in self._sessions.values() if not session.has_scans]
+        if len(onlookers) >= self.limits.onlookers:
+            self._end(min(onlookers, key=lambda session: session.seen))
         session = Session(secrets.token_urlsafe(24))
         self._sessions[session.key] = session
         return session
+
+    def has_room(self, session: Session) -> bool:
+        """Return whether `session` may have scans: it has some, or few enough others do."""
+        return session.has_scans or sum(one.has_scans for one in self._sessions.values()) < self.limits.visitors
+
+    def kept_bytes(self) -> int:
+        """Return how many bytes the dropped files have that wait for a fit or are kept for another."""
+        scans = (scan for session in self._sessions.values() for scan in session.scans.values())
+        return sum(scan.size for scan in scans if scan.upload is not None)
 
     def new_folder(self) -> Path:
         """Return a new folder for one scan, for this user alone."""
@@ -185,9 +176,9 @@ class Sessions:
         folder.mkdir(mode=0o700)
         return folder
 
-    def add(self, session: Session, name: str, folder: Path, upload: Path) -> DroppedScan:
-        """Take a scan that lies in `folder` and put its fit into the queue."""
-        scan = DroppedScan(folder.name, name, folder, upload)
+    def add(self, session: Session, name: str, folder: Path, upload: Path, size: int) -> DroppedScan:
+        """Take a scan of `size` bytes that lies in `folder`, and put its fit into the queue."""
+        scan = DroppedScan(folder.name, name, folder, upload, size)
         session.scans[scan.key] = scan
         finished = [old for old in session.scans.values() if old.finished]
         for old in finished[: max(0, len(session.scans) - self.limits.kept)]:

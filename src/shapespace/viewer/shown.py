@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shapespace.errors import FileError, InputError
+from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
 from shapespace.report.scene import pack_model
 from shapespace.report.wording import without_folders
-from shapespace.schemas import to_json
+from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
@@ -85,7 +86,7 @@ class Shown:
         if self.folder is None:
             return {}
         try:
-            now = sorted((p.name, p.stat().st_mtime_ns) for p in self.folder.root.glob("*.fit.json"))
+            now = sorted((p.name, p.lstat().st_mtime_ns) for p in self.folder.root.glob("*.fit.json"))
         except OSError as error:
             raise FileError(
                 f"Cannot read {self.folder.root}: {error.strerror or error}; is the folder still there?"
@@ -97,7 +98,7 @@ class Shown:
 
     def fit_list(self) -> list[dict[str, Any]]:
         """Return what the page lists: failed and doubtful fits first, then by the error they expect of themselves."""
-        rows = [self._row(fit) for fit in self.fits().values()]
+        rows = [self._safe_row(fit) for fit in self.fits().values()]
 
         def concern(row: Mapping[str, Any]) -> tuple[int, float, str]:
             error = row["scan_to_model_mm"] if row["expected_error_mm"] is None else row["expected_error_mm"]
@@ -132,18 +133,29 @@ class Shown:
             FileFormatError: it is absent or damaged.
             KeyError: there is no such fit.
         """
+        fit = self.fits()[name]
         assert self.folder is not None
-        return self.folder.mesh(self.fits()[name].entry.fitted)
+        with _as_damaged(name):
+            return self.folder.mesh(fit.entry.fitted)
 
     def _packed_fit(self, name: str) -> bytes:
         assert self.folder is not None
         fit = self.fits()[name]
         if not self._ours(fit):
             raise InputError(f"{name} was fitted by another model; give that one with --model.")
-        return packed(staged_fit(self.folder, fit))
+        with _as_damaged(name):
+            return packed(staged_fit(self.folder, fit))
 
     def _ours(self, fit: SavedFit) -> bool:
         return fit.record.model.hash == self.model.content_hash
+
+    def _safe_row(self, fit: SavedFit) -> dict[str, Any]:
+        """Return the row of `fit`; where its record holds what no fit writes, that of an unreadable one."""
+        try:
+            with _as_damaged(fit.name):
+                return self._row(fit)
+        except ShapespaceError as error:
+            return self._row(SavedFit(fit.entry, FitRecord(status="unreadable", reason=str(error))))
 
     def _row(self, fit: SavedFit) -> dict[str, Any]:
         pictured, why = fit.pictured, ""
@@ -171,6 +183,17 @@ class Shown:
         if self._ours(fit) and fit.record.z:
             row["z"] = _rounded(fit.record.z)
         return row
+
+
+@contextmanager
+def _as_damaged(name: str) -> Generator[None]:
+    """Let whatever goes wrong with the files of the fit `name` be one sentence: one of many must not stop the rest."""
+    try:
+        yield
+    except ShapespaceError:
+        raise
+    except Exception as error:
+        raise FileFormatError(f"The files of {name} are damaged: they hold what no fit writes; {FIT_AGAIN}.") from error
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:

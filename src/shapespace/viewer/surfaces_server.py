@@ -10,23 +10,26 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from shapespace.viewer.answers import BINARY, PAGES, asset, download, handlers
-from shapespace.viewer.guard import Guard
+from shapespace.viewer.answers import PAGES, answer, application, asset, binary
+from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.surfaces import Surfaces
 
 _LONGEST = 2000
 
 
-def make_surfaces_app(surfaces: Surfaces, *, token: str | None = None, cookie_name: str = "shapespace") -> ASGIApp:
+def make_surfaces_app(
+    surfaces: Surfaces, *, access: Access, local: bool = True, cookie_name: str = "shapespace"
+) -> ASGIApp:
     """Return the application.
 
     Args:
         surfaces: what it shows.
-        token: what every request must carry; None on loopback.
+        access: what every request must carry.
+        local: whether it is for this machine alone.
         cookie_name: of its cookie; browsers share cookies between ports, so it should name the port.
     """
     shown = _Viewer(surfaces)
@@ -41,20 +44,17 @@ def make_surfaces_app(surfaces: Surfaces, *, token: str | None = None, cookie_na
             reading.cancel()
             await asyncio.gather(reading, return_exceptions=True)
 
-    app = Starlette(
-        routes=[
-            Route("/", shown.page),
-            Route("/assets/{name}", asset),
-            Route("/api/about", shown.about),
-            Route("/api/mean", shown.mean),
-            Route("/api/surfaces", shown.listed),
-            Route("/api/surfaces/{name}", shown.surface),
-            Route("/api/places", shown.places),
-        ],
-        lifespan=lifespan,
-        exception_handlers=handlers(surfaces.told),
-    )
-    return Guard(app, token=token, cookie=f"{cookie_name}_token")
+    routes = [
+        Route("/", shown.page),
+        Route("/assets/{name}", asset),
+        Route("/api/about", shown.about),
+        Route("/api/mean", shown.mean),
+        Route("/api/surfaces", shown.listed),
+        Route("/api/surfaces/{name}", shown.surface),
+        Route("/api/places", shown.places),
+    ]
+    app = application(routes, lifespan, surfaces.told)
+    return Guard(app, access=access, cookie=f"{cookie_name}_token", local=local)
 
 
 class _Viewer:
@@ -67,10 +67,10 @@ class _Viewer:
         return FileResponse(PAGES / "surfaces.html", media_type="text/html")
 
     async def about(self, request: Request) -> Response:
-        return JSONResponse(self._surfaces.about())
+        return answer(self._surfaces.about())
 
     async def mean(self, request: Request) -> Response:
-        return Response(await self.packed_mean(), media_type=BINARY)
+        return binary(await self.packed_mean())
 
     async def packed_mean(self) -> bytes:
         async with self._packing:
@@ -79,18 +79,18 @@ class _Viewer:
             return self._packed
 
     async def listed(self, request: Request) -> Response:
-        return JSONResponse(await asyncio.to_thread(self._surfaces.listed))
+        return answer(await asyncio.to_thread(self._surfaces.listed))
 
     async def surface(self, request: Request) -> Response:
         try:
             packed = await asyncio.to_thread(self._surfaces.packed_surface, request.path_params["name"])
         except KeyError:
             raise HTTPException(404, "There is no such scan in correspondence; reload the page.") from None
-        return Response(packed, media_type=BINARY)
+        return binary(packed)
 
     async def places(self, request: Request) -> Response:
         given = request.query_params.get("vertices", "")[:_LONGEST].split(",")
         if not all(part.isascii() and part.isdigit() for part in given):
             raise HTTPException(400, "Give the numbers of vertices with commas between them.")
         text = await asyncio.to_thread(self._surfaces.places, [int(part) for part in given])
-        return download(text.encode(), "places.csv")
+        return binary(text.encode(), "places.csv")

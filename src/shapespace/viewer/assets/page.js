@@ -109,10 +109,5 @@
     });
   }
 
-  /** The token is in a cookie now, and need not stay in the address or the history. */
-  function forgetToken() {
-    if (new URLSearchParams(location.search).has("token")) history.replaceState(null, "", location.pathname);
-  }
-
-  Object.assign(Viewer, { $, alertUser, ask, telling, guarded, json, binary, post, startMessages, startTheme, forgetToken });
+  Object.assign(Viewer, { $, alertUser, ask, telling, guarded, json, binary, post, startMessages, startTheme });
 })();

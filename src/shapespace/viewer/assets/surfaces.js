@@ -180,7 +180,6 @@
   }
 
   async function begin() {
-    Viewer.forgetToken();
     about = await json("/api/about");
     document.title = `${about.name} \u2013 shapespace`;
     $("about").textContent = `${about.name}: ${about.corresponding} of ${about.scans} scans in correspondence, ${about.vertices.toLocaleString("en")} vertices`;

@@ -982,7 +982,6 @@
   }
 
   async function begin() {
-    Viewer.forgetToken();
     about = await json("/api/about");
     const unpacked = await binary("/api/model");
     model = new Shapespace.Model(unpacked);

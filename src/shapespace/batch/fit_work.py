@@ -1,0 +1,269 @@
+"""What is done with one scan of a batch: its fit, its files, and what of an earlier run still holds."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from shapespace.batch.folder import RECORD
+from shapespace.batch.results import (
+    Source,
+    coefficient_row,
+    failed_record,
+    fit_record,
+    is_surface_of,
+    read_record,
+    write_fitted_mesh,
+    write_record,
+    write_stages,
+)
+from shapespace.errors import FileError, ShapespaceError
+from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.state import IcpState
+from shapespace.io.files import sha256_of_file, write_together
+from shapespace.io.landmarks import read_landmarks
+from shapespace.io.meshes import read_mesh
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray
+from shapespace.version import __version__
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scan to fit.
+
+    Args:
+        name: NAME of its result files, unique in the folder.
+        scan: path of the scan.
+        landmarks: path of its landmarks, or None.
+        metadata: what is known of it, by the columns of a list of scans; carried to its record.
+    """
+
+    name: str
+    scan: Path
+    landmarks: Path | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+def fit_file(
+    job: Job,
+    model: ShapeModel,
+    model_file: Path,
+    folder: Path,
+    config: FitConfig,
+    *,
+    stages: bool = False,
+    on_state: Callable[[IcpState], None] | None = None,
+) -> dict[str, Any]:
+    """Fit one scan from its file, write its results into `folder`, and return its record.
+
+    A scan that cannot be fitted gives a record with status `failed`. Stopped at any moment, the record that is there
+    is of the surfaces that are there.
+
+    Raises:
+        FileError: the results cannot be written.
+    """
+    model_source = Source.at(model_file, model.content_hash, folder)
+    scan_source = Source.at(job.scan, "", folder)
+    marks_source: Source | None = None
+    try:
+        scan_source = Source.hashed(job.scan, folder)
+        scan = read_mesh(job.scan)
+        landmarks: Mapping[str, FloatArray] | None = None
+        if job.landmarks is not None:
+            marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
+            landmarks = read_landmarks(job.landmarks)
+        result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
+    except MemoryError:
+        short = f"{job.scan}: not enough memory to fit it; thin the scan first."
+        return _write_failed(
+            failed_record(scan_source, model_source, short, config.as_dict(), job.metadata), job, folder
+        )
+    except ShapespaceError as error:
+        reason = naming(job.scan, str(error))
+        return _write_failed(
+            failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata), job, folder
+        )
+    record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
+    files = _Files.of(job, folder)
+    writes: dict[Path, Callable[[Path], None]] = {}
+    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if config.dense else [])):
+        writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
+    if stages:
+        writes[files.stages] = partial(write_stages, result=result, model=model)
+    writes[files.record] = partial(write_record, record=record)
+    write_together(writes, files.stale(dense=not config.dense, stages=not stages))
+    return record
+
+
+def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
+    files = _Files.of(job, folder)
+    # An earlier run's surface would contradict the record.
+    stale = [files.fitted, *files.stale(dense=True, stages=True)]
+    write_together({files.record: partial(write_record, record=record)}, stale)
+    return record
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Where the results of one scan are."""
+
+    record: Path
+    fitted: Path
+    dense: Path
+    stages: Path
+
+    @staticmethod
+    def of(job: Job, folder: Path) -> _Files:
+        endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
+        return _Files(*(folder / f"{job.name}{ending}" for ending in endings))
+
+    def stale(self, *, dense: bool, stages: bool) -> list[Path]:
+        """Return what an earlier fit may have left that this one does not write."""
+        # Without a record it is no result of ours, but perhaps a scan.
+        left = [self.dense] if dense and self.record.is_file() else []
+        return [*left, self.stages] if stages else left
+
+
+def naming(scan: Path, sentence: str) -> str:
+    """Return `sentence` about the mesh in `scan` with its path in it, not just its name."""
+    if str(scan) in sentence:
+        return sentence
+    if sentence.startswith(f"{scan.name}: "):
+        return f"{scan}{sentence.removeprefix(scan.name)}"
+    return f"{scan}: {sentence[:1].lower()}{sentence[1:]}"
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """What to do with one scan: its job, the settings, whether to write the stages too, and to keep what holds."""
+
+    job: Job
+    config: FitConfig
+    stages: bool
+    resume: bool
+
+
+@dataclass(frozen=True)
+class FitWork:
+    """Fits scans by one model, for an executor.
+
+    Args:
+        model_file: which each worker reads once.
+        model_hash: its content hash.
+        folder: where results go.
+        run: a word that no other run has.
+        on_state: called with each state of the loop; None where workers are other processes.
+    """
+
+    model_file: Path
+    model_hash: str
+    folder: Path
+    run: str
+    on_state: Callable[[IcpState], None] | None = None
+
+    def do(self, task: FitTask) -> dict[str, Any]:
+        """Return the record of the fit of one scan, done now, or before a worker was lost.
+
+        Raises:
+            FileError: the model cannot be read, or the results not written.
+        """
+        if task.resume:
+            task, earlier = resumed(task, self.model_hash, self.folder, self.run)
+            if earlier is not None:
+                return earlier
+        return fit_file(
+            task.job, self._model(), self.model_file, self.folder, task.config,
+            stages=task.stages, on_state=self.on_state,
+        )  # fmt: skip
+
+    def give_up(self, task: FitTask, reason: str) -> dict[str, Any]:
+        """Write and return the record of a scan whose workers were lost."""
+        model = Source.at(self.model_file, self.model_hash, self.folder)
+        scan = Source.at(task.job.scan, "", self.folder)
+        with contextlib.suppress(ShapespaceError):
+            scan = Source.hashed(task.job.scan, self.folder)
+        told = f"{task.job.scan}: {reason}."
+        record = failed_record(scan, model, told, task.config.as_dict(), task.job.metadata)
+        return _write_failed(record | {"given_up": self.run}, task.job, self.folder)
+
+    def remember(self, model: ShapeModel) -> None:
+        """Keep the model for fits in this process, which then do not read it again."""
+        _models.clear()
+        _models[self.model_hash] = model
+
+    def _model(self) -> ShapeModel:
+        if self.model_hash not in _models:
+            model = ShapeModel.load(self.model_file)
+            if model.content_hash != self.model_hash:
+                raise FileError(f"{self.model_file} is not the model that this run began with; start it again.")
+            self.remember(model)
+        return _models[self.model_hash]
+
+
+_models: dict[str, ShapeModel] = {}
+"""The model of this process, by its content hash."""
+
+
+def has_surface(job: Job, folder: Path) -> bool:
+    """Return whether `folder` holds the surface of an earlier fit of the scan."""
+    files = _Files.of(job, folder)
+    return files.fitted.is_file() and files.record.is_file()
+
+
+def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tuple[FitTask, dict[str, Any] | None]:
+    """Return what is left to do, and the record of an earlier fit if it holds what is asked for, or more.
+
+    A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
+    is tried again by another run, not by `run` itself.
+    """
+    files = _Files.of(task.job, folder)
+    if not files.record.is_file():
+        return task, None
+    try:
+        record = read_record(files.record)
+        if not _is_of(record, task, model_hash, folder):
+            return task, None
+        if run and record.get("given_up") == run:
+            return task, record
+        dense = bool(record["config"]["dense"]) and is_surface_of(files.dense, record)
+        staged = files.stages.is_file()
+        enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
+        whole = len(record.get("b", ())) == len(record.get("z", ())) == len(record.get("b_stddev", ()))
+        coefficient_row(task.job.name, record)
+    except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
+        return task, None
+    if enough and whole and record["status"] != "failed":
+        return task, record | ({"metadata": dict(task.job.metadata)} if task.job.metadata else {})
+    also = replace(task.config, dense=task.config.dense or dense)
+    return replace(task, config=also, stages=task.stages or staged), None
+
+
+def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Path) -> bool:
+    """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
+    job = task.job
+    settings: dict[str, Any] = json.loads(json.dumps(task.config.as_dict()))
+    settings["version"] = __version__
+    del settings["dense"]
+    marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
+    return bool(
+        record["model"]["hash"] == model_hash
+        and record.get("landmarks") == marks
+        and all(record["config"].get(key) == value for key, value in settings.items())
+        and _is_same_scan(record["scan"], job.scan, folder)
+    )
+
+
+def _is_same_scan(told: Mapping[str, Any], scan: Path, folder: Path) -> bool:
+    """Return whether `scan` is what the record tells: by place, size and time if they agree, else by its content."""
+    with contextlib.suppress(OSError):
+        there = scan.stat()
+        now = (there.st_size, there.st_mtime_ns, Source.at(scan, "", folder).path)
+        if (told.get("size_bytes"), told.get("modified_ns"), told.get("path")) == now:
+            return True
+    return bool(told["hash"] == sha256_of_file(scan))

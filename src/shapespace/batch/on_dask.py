@@ -1,0 +1,155 @@
+"""Tasks on a Dask cluster: a few chunks in flight, workers that are lost made up for, and only answers sent back."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from shapespace.batch.executors import Child
+from shapespace.errors import FitError, InputError, ShapespaceError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from shapespace.batch.executors import Work
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+CHUNKS_A_WORKER = 50
+"""Chunks that each worker sees in a run: many enough that all end together."""
+LARGEST_CHUNK = 50
+"""Tasks in a chunk at most: few enough that little is lost with a worker."""
+AHEAD = 2
+"""Chunks that wait at each worker beside the one that it does."""
+FINDS_S = 30.0
+WORKERS_S = 600.0
+"""A queue may take so long to start the first worker."""
+_LOST = "its workers ended again and again, most likely for lack of memory; thin it"
+
+
+@dataclass(frozen=True)
+class OnDask:
+    """On a Dask cluster, whose workers see the same files under the same paths.
+
+    Args:
+        cluster: address of the scheduler, path of its scheduler file, a `distributed.Client` that is open already, or
+            empty for a cluster of this machine as Dask's configuration has it.
+        timeout_s: a task that takes longer is given up; None for no limit.
+    """
+
+    cluster: str | Client = ""
+    timeout_s: float | None = None
+
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> Generator[tuple[T, R]]:
+        """As `Executor.run`."""
+        if not tasks:
+            return
+        with ExitStack() as stack:
+            client = self._client(stack)
+            yield from _Run(client, work, tasks, self.timeout_s).answers()
+
+    def _client(self, stack: ExitStack) -> Client:
+        try:
+            from distributed import Client, LocalCluster
+        except ImportError as error:
+            raise ShapespaceError(
+                "A cluster needs the extra 'cluster'; run pip install 'shapespace[cluster]', or leave out --executor."
+            ) from error
+        if isinstance(self.cluster, Client):
+            return self.cluster
+        try:
+            if not self.cluster:
+                made: Any = LocalCluster
+                return stack.enter_context(Client(stack.enter_context(made(threads_per_worker=1))))
+            if self.cluster.endswith(".json"):
+                return stack.enter_context(Client(scheduler_file=self.cluster, timeout=FINDS_S))
+            return stack.enter_context(Client(self.cluster, timeout=FINDS_S))
+        except (OSError, TimeoutError, ValueError) as error:
+            where = f"at {self.cluster}" if self.cluster else "on this machine"
+            raise InputError(f"There is no Dask scheduler {where} that answers; start it, or mend --dask.") from error
+
+
+class _Run:
+    """One run of many tasks, sent as chunks of their numbers."""
+
+    def __init__(self, client: Client, work: Work[Any, Any], tasks: Sequence[Any], timeout_s: float | None) -> None:
+        self._client: Any = client
+        self._work, self._tasks, self._timeout_s = work, tasks, timeout_s
+        self._flying: dict[Any, Sequence[int]] = {}
+        self._suspects: list[int] = []
+
+    def answers(self) -> Generator[tuple[Any, Any]]:
+        """Yield each task with what came of it.
+
+        Dask blames all tasks that wait at a worker for its death, so those are tried again at the end, one at a time.
+        """
+        workers = self._workers()
+        size = max(1, min(LARGEST_CHUNK, len(self._tasks) // (workers * CHUNKS_A_WORKER)))
+        chunks = [range(at, min(at + size, len(self._tasks))) for at in range(0, len(self._tasks), size)]
+        try:
+            yield from self._each(chunks, (1 + AHEAD) * workers)
+            suspects, self._suspects = self._suspects, []
+            yield from self._each([[number] for number in suspects], 1)
+            for number in self._suspects:
+                yield self._tasks[number], self._work.give_up(self._tasks[number], _LOST)
+        finally:
+            self._client.cancel(list(self._flying), force=True)
+
+    def _each(self, chunks: Sequence[Sequence[int]], at_a_time: int) -> Generator[tuple[Any, Any]]:
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        left = iter(chunks)
+        ended: Any = as_completed(self._submit(left, at_a_time), raise_errors=False)
+        for future in ended:
+            if future.status == "lost":  # its worker died with the answer, and another one does it again
+                ended.add(future)
+                continue
+            numbers = self._flying.pop(future)
+            if future.status == "cancelled":
+                raise FitError("The Dask scheduler is gone; start it and run the same command again: it goes on.")
+            error = future.exception() if future.status == "error" else None
+            if isinstance(error, KilledWorker):
+                self._suspects.extend(numbers)
+            elif error is not None:
+                raise error
+            answers: list[Any] = [] if error is not None else future.result()
+            ended.update(self._submit(left, 1))
+            for number, answer in zip(numbers, answers, strict=False):
+                yield self._tasks[number], answer
+
+    def _submit(self, chunks: Iterator[Sequence[int]], count: int) -> list[Any]:
+        """Send up to `count` chunks to the cluster."""
+        sent: list[Any] = []
+        for _, numbers in zip(range(count), chunks, strict=False):
+            tasks = [self._tasks[number] for number in numbers]
+            future = self._client.submit(do_chunk, self._work, tasks, self._timeout_s, pure=False)
+            self._flying[future] = numbers
+            sent.append(future)
+        return sent
+
+    def _workers(self) -> int:
+        try:
+            self._client.wait_for_workers(1, timeout=WORKERS_S)
+        except TimeoutError as error:
+            raise FitError(
+                f"The Dask cluster has no worker after {WORKERS_S:g} s; start some and run again."
+            ) from error
+        return max(1, len(self._client.nthreads()))
+
+
+def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None) -> list[R]:
+    """Do some tasks at a worker of Dask, in a process below it that may die without it."""
+    if getattr(_here, "work", None) != (work, timeout_s):
+        if (earlier := getattr(_here, "child", None)) is not None:
+            earlier.stop()
+        _here.work, _here.child = (work, timeout_s), Child(work, timeout_s)
+    return [_here.child.do(task) for task in tasks]
+
+
+_here = threading.local()
+"""Of each thread of a worker: its child, and what that does."""

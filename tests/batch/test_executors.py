@@ -1,0 +1,175 @@
+"""One contract for every executor: each task is answered once, whatever becomes of the workers."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shapespace.batch.executors import EXECUTORS, Executor, Local, Serial, Where
+from shapespace.errors import FileError, FitError, InputError
+
+SEVERAL = [kind for kind in EXECUTORS if kind != "serial"]
+TIMEOUT_S = 3.0
+
+
+@dataclass(frozen=True)
+class Letters:
+    """Writes a line for each task, and does what the task says."""
+
+    folder: Path
+
+    def do(self, task: str) -> tuple[str, int]:
+        if (given_up := self.folder / f"{task}.given_up").is_file():
+            return given_up.read_text(), 0
+        with (self.folder / f"{task}.done").open("a") as stream:
+            stream.write(f"{os.getpid()}\n")
+        tries = len((self.folder / f"{task}.done").read_text().splitlines())
+        if task == "full":
+            raise FileError("The disk is full.")
+        if task.startswith("kill") or (task.startswith("unlucky") and tries == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if task.startswith("hang"):
+            time.sleep(600)
+        time.sleep(0.01)
+        return task.upper(), os.getpid()
+
+    def give_up(self, task: str, reason: str) -> tuple[str, int]:
+        (self.folder / f"{task}.given_up").write_text(reason)
+        return reason, 0
+
+
+@pytest.fixture(params=EXECUTORS)
+def executor(request: pytest.FixtureRequest) -> Callable[..., Executor]:
+    """What makes an executor of each kind."""
+    kind: str = request.param
+    if kind == "serial":
+        return Serial
+    if kind == "local":
+        return lambda timeout_s=None: Local(2, timeout_s)
+    client = request.getfixturevalue("cluster")
+    from shapespace.batch.on_dask import OnDask
+
+    return lambda timeout_s=None: OnDask(client, timeout_s)
+
+
+def several(executor: Callable[..., Executor]) -> Callable[..., Executor]:
+    if executor is Serial:
+        pytest.skip("a process cannot do without itself")
+    return executor
+
+
+def test_each_task_is_answered_once(executor: Callable[..., Executor], tmp_path: Path) -> None:
+    tasks = [f"t{k}" for k in range(40)]
+    answers = list(executor().run(Letters(tmp_path), tasks))
+    assert sorted((task, answer[0]) for task, answer in answers) == sorted((task, task.upper()) for task in tasks)
+    assert all(len((tmp_path / f"{task}.done").read_text().splitlines()) == 1 for task in tasks)
+    assert list(executor().run(Letters(tmp_path), [])) == []
+
+
+def test_what_stops_every_task_is_raised(executor: Callable[..., Executor], tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="disk is full"):
+        list(executor().run(Letters(tmp_path), ["a", "full", *(f"t{k}" for k in range(20))]))
+
+
+def test_a_task_that_kills_its_workers_is_given_up_and_the_others_go_on(
+    executor: Callable[..., Executor], tmp_path: Path
+) -> None:
+    tasks = ["a", "kill", "b", "unlucky1", "c", "unlucky2", "d"]
+    answers = {task: answer[0] for task, answer in several(executor)().run(Letters(tmp_path), tasks)}
+    assert "lack of memory" in answers.pop("kill")
+    assert answers == {task: task.upper() for task in tasks if task != "kill"}
+
+
+def test_a_task_that_hangs_is_given_up_and_the_others_go_on(executor: Callable[..., Executor], tmp_path: Path) -> None:
+    began = time.monotonic()
+    tasks = ["a", "hang", *"bcd"]
+    answers = {task: answer[0] for task, answer in several(executor)(timeout_s=TIMEOUT_S).run(Letters(tmp_path), tasks)}
+    assert "--timeout" in answers.pop("hang")
+    assert answers == {task: task.upper() for task in tasks if task != "hang"}
+    assert time.monotonic() - began < 60
+
+
+def test_closed_early_nothing_goes_on(executor: Callable[..., Executor], tmp_path: Path) -> None:
+    tasks = [f"t{k:03d}" for k in range(400)]
+    with closing(executor().run(Letters(tmp_path), tasks)) as ended:
+        next(ended)
+    time.sleep(0.3)
+    done = len(list(tmp_path.glob("*.done")))
+    time.sleep(0.5)
+    assert done == len(list(tmp_path.glob("*.done"))) < len(tasks)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_workers_end_with_their_parent_whatever_ends_it(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from shapespace.batch.executors import Local
+from test_executors import Letters
+if __name__ == "__main__":
+    list(Local(2).run(Letters(Path({str(tmp_path)!r})), ["hang1", "hang2"]))
+"""
+    (tmp_path / "main.py").write_text(code)
+    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    parent = subprocess.Popen([sys.executable, tmp_path / "main.py"], env={**os.environ, "PYTHONPATH": path})
+    lines = [tmp_path / f"hang{k}.done" for k in (1, 2)]
+    limit = time.monotonic() + 60
+    while not all(line.is_file() and line.read_text() for line in lines) and time.monotonic() < limit:
+        time.sleep(0.02)
+    parent.kill()
+    parent.wait()
+    pids = [int(line.read_text().split()[0]) for line in lines]
+    while any(Path(f"/proc/{pid}/stat").exists() for pid in pids) and time.monotonic() < limit:
+        time.sleep(0.02)
+    assert not [pid for pid in pids if Path(f"/proc/{pid}/stat").exists()]
+
+
+@dataclass(frozen=True)
+class Unloadable:
+    """Ends each worker as it starts."""
+
+    def __reduce__(self) -> Any:
+        return os._exit, (3,)
+
+    def do(self, task: str) -> str:
+        return task
+
+    def give_up(self, task: str, reason: str) -> str:
+        return reason
+
+
+def test_workers_that_cannot_start_are_one_sentence() -> None:
+    with pytest.raises(FitError, match="--jobs 1"):
+        list(Local(2).run(Unloadable(), ["a", "b", "c"]))
+
+
+@pytest.mark.parametrize(
+    ("told", "match"),
+    [
+        ({"kind": "slurm"}, "local, serial, dask"),
+        ({"dask": "tcp://x:1"}, "leave out one"),
+        ({"kind": "serial", "timeout_s": 3.0}, "hangs"),
+    ],
+)
+def test_where_tasks_cannot_run_is_said(told: dict[str, Any], match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        Where(**told)
+
+
+def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    from shapespace.batch import on_dask
+
+    on_dask.FINDS_S, before = 0.2, on_dask.FINDS_S
+    try:
+        with pytest.raises(InputError, match=r"127\.0\.0\.1:9"):
+            list(on_dask.OnDask("tcp://127.0.0.1:9").run(Letters(tmp_path), ["a"]))
+    finally:
+        on_dask.FINDS_S = before

@@ -1,0 +1,216 @@
+"""Requests of every kind of nonsense to both viewers: no answer but one of the visitor's own fault, and no traceback.
+
+`SHAPESPACE_FUZZ=100000 pytest tests/viewer/test_viewer_fuzzed.py` goes on for an hour or so, with other requests.
+"""
+
+import json
+import logging
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from viewer_world import VERTICES, enter, served
+
+from same_blobs import write_same
+from shapespace.viewer import sessions as sessions_module
+from shapespace.viewer.guard import Access
+from shapespace.viewer.limits import Limits
+from shapespace.viewer.server import make_app
+from shapespace.viewer.shown import Shown
+from shapespace.viewer.surfaces import Surfaces
+from shapespace.viewer.surfaces_server import make_surfaces_app
+from synthetic_shapes import blob_model
+
+BY_HAND = int(os.environ.get("SHAPESPACE_FUZZ", "0"))
+MANY = settings(
+    max_examples=BY_HAND or 500, derandomize=not BY_HAND, deadline=None, database=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+LIMITS = Limits(
+    upload_bytes=5000, all_bytes=20_000, stalled_s=0.05, body_s=0.2, quiet_s=0.3, visitors=50, guesses=10**6
+)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A viewer that runs, the cookies of a visitor of it, and what it told the terminal."""
+
+    address: tuple[str, int]
+    cookies: str
+    scan: str
+    said: list[str]
+
+
+@contextmanager
+def target(app: Any, access: Access) -> Iterator[Target]:
+    said: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: said.append(record.getMessage())
+    logger = logging.getLogger("uvicorn.error")
+    with served(app, LIMITS) as address, httpx.Client(base_url=address) as visitor:
+        logger.addHandler(handler)
+        logging.getLogger("asyncio").addHandler(handler)
+        try:
+            enter(visitor, access)
+            visitor.get("/")
+            dropped = visitor.put("/api/scans?name=a.ply", content=b"x")
+            host, port = address.removeprefix("http://").split(":")
+            cookies = "; ".join(f"{key}={value}" for key, value in visitor.cookies.items())
+            scan = dropped.json()["id"] if dropped.status_code == 201 else ""
+            yield Target((host, int(port)), cookies, scan, said)
+        finally:
+            logger.removeHandler(handler)
+            logging.getLogger("asyncio").removeHandler(handler)
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Target]:
+    """A viewer of records that are mostly nonsense; a scan is told at once that it failed."""
+    folder = tmp_path_factory.mktemp("fits")
+    model = blob_model(VERTICES)
+    good = {"format": "shapespace fit", "status": "converged", "model": {"hash": model.content_hash}, "z": [1]}
+    for name, record in (("good", good), ("huge", {**good, "evidence": {"expected_error_mm": 10**400}}), ("list", [])):
+        (folder / f"{name}.fit.json").write_text(json.dumps(record))
+    with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sessions_module, "converse", lambda *given: "It was not fitted.")
+        access = Access(LIMITS)
+        app, sessions = make_app(Shown(model, "m.h5", folder), limits=LIMITS, access=access)
+        stack.callback(sessions.close)
+        yield stack.enter_context(target(app, access))
+
+
+@pytest.fixture(scope="module")
+def surfaces(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Target]:
+    access = Access(LIMITS)
+    shown = Surfaces(write_same(tmp_path_factory.mktemp("blobs")))
+    with target(make_surfaces_app(shown, access=access), access) as one:
+        yield one
+
+
+TEXT = st.one_of(
+    st.sampled_from(
+        ["", "[", "http://[", "%", "%zz", "%00", "%ff%fe", "..", "..%2f..", "/", "%2e%2e/%2e%2e", "\xb2", "-1", "1e999",
+         "NaN", "0", "9" * 5000, "a" * 70_000, "{}", "null", "'", "able", "good", "huge", "list", "ply", "a.ply"]
+    ),
+    st.text(st.characters(max_codepoint=255), max_size=12),
+)  # fmt: skip
+ROUTES = (
+    "GET /", "GET /assets/X", "GET /api/about", "GET /api/model", "GET /api/fits", "GET /api/fits/X", "HEAD /X",
+    "POST /api/export?format=X", "POST /api/export?format=ply", "GET /api/scans", "PUT /api/scans?name=X",
+    "PUT /api/scans?name=a.ply", "DELETE /api/scans/X", "GET /api/scans/ID/X", "GET /api/scans/ID/events",
+    "GET /api/scans/ID/preview", "GET /api/scans/ID/record", "GET /api/scans/X/picture", "POST /api/scans/ID/landmarks",
+    "POST /api/scans/ID/cancel", "GET /api/mean", "GET /api/surfaces", "GET /api/surfaces/X", "X /api/scans/ID/X",
+    "GET /api/places?vertices=X", "GET /api/places?vertices=1,X", "GET /?token=X", "GET /?X=X", "GET X", "OPTIONS *",
+    "X /", "CONNECT http://X/", "POST /api/scans", "PATCH /api/scans/ID",
+)  # fmt: skip
+HEADERS = st.lists(
+    st.tuples(
+        st.sampled_from(["Host", "Origin", "Cookie", "Range", "If-Range", "Content-Length", "Transfer-Encoding",
+             "Sec-Fetch-Site", "Sec-Fetch-Dest", "Connection", "Upgrade", "Expect", "Content-Type", "Accept", "X"]),
+        TEXT | st.sampled_from(["chunked", "100-continue", "websocket", "bytes=0-,0-,5-1", "cross-site", "close"]),
+    ),
+    max_size=2,
+)  # fmt: skip
+JSON = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just(10**400)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.dictionaries(st.sampled_from(["z", "fit", "scan", "landmarks", "tip", "format"]), inner, max_size=3),
+    ),
+    max_leaves=8,
+)  # fmt: skip
+BODIES = st.one_of(
+    st.just(b""),
+    JSON.map(lambda value: json.dumps(value).encode()),
+    st.builds(lambda inner: json.dumps({"landmarks": inner}).encode(), JSON),
+    st.sampled_from([b"[" * 4000, b"ply\n", b"x" * 6000, b"5\r\nhello\r\n0\r\n\r\n", b"zz\r\n", b"\x00"]),
+    st.binary(max_size=40),
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request; `sized` says whether it says how long it is, `known` whether it carries the cookies."""
+
+    line: str
+    headers: list[tuple[str, str]]
+    body: bytes
+    sized: bool
+    known: bool
+
+    def written(self, at: Target) -> bytes:
+        own = {} if any(name == "Host" for name, _ in self.headers) else {"Host": "{}:{}".format(*at.address)}
+        if self.known:
+            own["Cookie"] = at.cookies
+        if self.sized:
+            own["Content-Length"] = str(len(self.body))
+        lines = [f"{self.line.replace('ID', at.scan)} HTTP/1.1"]
+        lines += [f"{name}: {value}" for name, value in (*own.items(), *self.headers)]
+        return "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + self.body
+
+
+def put_together(route: str, text: str, **rest: Any) -> Asked:
+    return Asked(line=route.replace("X", text), **rest)
+
+
+ASKED = st.builds(
+    put_together, route=st.sampled_from(ROUTES), text=TEXT, headers=st.just([]) | HEADERS, body=BODIES,
+    sized=st.sampled_from([True, True, True, False]), known=st.sampled_from([True] * 5 + [False]),
+)  # fmt: skip
+
+
+def answered(at: Target, request: bytes) -> bytes:
+    """Return the answer to a request, empty where the server closed the connection."""
+    came = b""
+    with socket.create_connection(at.address, timeout=10) as one:
+        try:
+            one.sendall(request)
+            while b"\r\n\r\n" not in came and (piece := one.recv(2**16)):
+                came += piece
+        except ConnectionError:
+            pass
+    return came
+
+
+def check(at: Target, request: bytes) -> None:
+    came = answered(at, request)
+    status = int(came.split()[1]) if came else 400
+    assert status < 500 or status == 503, came
+    assert not at.said, at.said
+
+
+@MANY
+@given(asked=ASKED)
+def test_no_request_is_the_fault_of_the_viewer_of_fits(fits: Target, asked: Asked) -> None:
+    check(fits, asked.written(fits))
+
+
+@MANY
+@given(asked=ASKED)
+def test_no_request_is_the_fault_of_the_viewer_of_surfaces(surfaces: Target, asked: Asked) -> None:
+    check(surfaces, asked.written(surfaces))
+
+
+@settings(MANY, max_examples=BY_HAND or 200)
+@given(asked=ASKED, at=st.integers(0, 2**16), piece=st.binary(max_size=3), cut=st.integers(0, 30))
+def test_no_bytes_are_the_fault_of_the_viewer(fits: Target, asked: Asked, at: int, piece: bytes, cut: int) -> None:
+    written = asked.written(fits)
+    at %= len(written)
+    came = answered(fits, written[:at] + piece + written[at + cut :])
+    assert not came or int(came.split()[1]) < 500 or came.startswith(b"HTTP/1.1 503"), came
+    # uvicorn says of each that it was no HTTP.
+    assert {*fits.said} <= {"Invalid HTTP request received."}
+    fits.said.clear()
+
+
+def test_after_all_that_a_visitor_is_served(fits: Target, surfaces: Target) -> None:
+    for one in (fits, surfaces):
+        came = answered(one, f"GET /api/about HTTP/1.1\r\nHost: localhost\r\nCookie: {one.cookies}\r\n\r\n".encode())
+        assert came.startswith(b"HTTP/1.1 200")
