@@ -20,6 +20,7 @@ from shapespace.errors import FileFormatError
 Status = Literal["converged", "max_iterations", "doubtful", "failed"]
 FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
 CORRESPOND_AGAIN = "run shapespace correspond again"
+_TOLD = 200
 _T = TypeVar("_T")
 
 
@@ -37,8 +38,8 @@ def read(kind: type[_T], content: object, where: str, again: str) -> _T:
     """
     try:
         return msgspec.convert(content, kind)
-    except msgspec.ValidationError as error:
-        said = str(error).replace("`", "").replace("$.", "").replace("Object missing", "missing")
+    except (msgspec.ValidationError, UnicodeEncodeError, OverflowError, RecursionError) as error:
+        said = str(error)[:_TOLD].replace("`", "").replace("$.", "").replace("Object missing", "missing")
         raise FileFormatError(f"{where} is damaged: {said[:1].lower()}{said[1:]}; {again}.") from error
 
 

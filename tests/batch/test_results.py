@@ -101,7 +101,8 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
     assert (rows[1]["status"], rows[1]["reason"]) == ("failed", "two.ply is empty, so re-export it.")
     assert header[-1] == "model_hash"
     assert {row["model_hash"] for row in rows} == {MODEL.content_hash}
-    assert all(not rows[1][name] for name in header[3:-1])
+    assert all(not rows[1][name] for name in header[3:-1] if name != "checksum")
+    assert rows[0]["checksum"] != rows[1]["checksum"]
 
 
 def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Path) -> None:
@@ -129,7 +130,7 @@ def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Pat
     write_coefficients(tmp_path / "c.csv", [row], 5)
     with (tmp_path / "c.csv").open(newline="") as stream:
         (cells,) = csv.DictReader(stream)
-    assert set(row) == set(cells)
+    assert {*row, "checksum"} == set(cells)
     assert all(cells[key] == str(value) for key, value in row.items() if key != "reason")
 
 

@@ -489,7 +489,6 @@ def test_a_crafted_model_file_is_checked_as_a_whole(run: Run, world: World, tmp_
         ("zero", {"stddev": 0 * arrays["stddev"]}, {}),
         ("faces", {"faces": arrays["faces"] + 400}, {}),
         ("scalar", {"mean": np.array(1.0)}, {}),
-        ("text", {"mean": np.array([b"abc", b"def"])}, {}),
         ("total", {}, {"total_variance": float("nan")}),
         ("none", {}, {"total_variance": 0.0}),
     ):

@@ -13,7 +13,6 @@ from sklearn.naive_bayes import GaussianNB
 from sklearn.pipeline import make_pipeline
 
 from shapespace.errors import FileError, FileFormatError, InputError
-from shapespace.recognise import saved as module
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.saved import FACTS, TRUSTED, SavedClassifier, load_classifier, software_versions
 
@@ -252,12 +251,37 @@ def test_every_cut_and_most_flipped_bytes_are_found(good, tmp_path):
         np.testing.assert_allclose(same.probabilities(samples()[0]), whole, atol=1e-5)
 
 
-def test_an_archive_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(good, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_LARGEST_BYTES", 2**16)
+def test_an_archive_that_unpacks_to_far_more_than_its_size_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "x.skops", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("bomb.npy", bytes(2**20))
+        archive.writestr("bomb.npy", bytes(2**21))
     monkeypatch.setattr(zipfile.ZipFile, "read", None)
-    with pytest.raises(FileFormatError, match="would unpack to more"):
+    with pytest.raises(FileFormatError, match="would unpack to far more than its size"):
+        load_classifier(tmp_path / "x.skops")
+
+
+# What made compiled code read past its arrays, and ended the process, or broadcast small arrays to gigabytes.
+@pytest.mark.parametrize(
+    ("name", "attribute", "change"),
+    [
+        ("svm", "_n_support", lambda a: np.concatenate([a, np.zeros(9000, np.int32)])),
+        ("svm", "_n_support", lambda a: a * 1000),
+        ("svm", "_dual_coef_", lambda a: a[:1]),
+        ("svm", "_intercept_", lambda a: a[:1]),
+        ("svm", "kernel", lambda _: "precomputed"),
+        ("knn", "weights", lambda _: "uniform"),
+        ("knn", "_y", lambda a: a[:1]),
+        ("lda", "intercept_", lambda a: np.zeros((10_000, 1, 1))),
+        ("qda", "whiten_", lambda a: a[:, :1]),
+    ],
+)
+def test_arrays_that_do_not_fit_together_never_reach_compiled_code(name, attribute, change, tmp_path, monkeypatch):
+    hostile = trained(name)
+    step = hostile.pipeline.steps[-1][1]
+    fitted = getattr(step, "machine_", step)
+    setattr(fitted, attribute, change(getattr(fitted, attribute)))
+    monkeypatch.setattr(SavedClassifier, "probabilities", lambda *_: np.zeros((4, 3)))
+    hostile.save(tmp_path / "x.skops")
+    with pytest.raises(FileFormatError, match="does not work"):
         load_classifier(tmp_path / "x.skops")
 
 

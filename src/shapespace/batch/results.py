@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -18,15 +16,18 @@ from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.surface import rms_size
-from shapespace.io.files import atomic_path, read_bytes, sha256_of_file, write_bytes, write_text
+from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
+from shapespace.io.json_files import read_json
 from shapespace.io.ply import ply_comment, write_ply
+from shapespace.io.tables import CHECKSUM, checked_table_text
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import FitRecord, to_json
+from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
 META = "meta_"
 """Begins the names of columns that the list of scans had."""
+_LARGEST_RECORD = 2**24
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -223,10 +224,7 @@ def read_record(path: Path) -> dict[str, Any]:
         FileError: it cannot be read.
         FileFormatError: it is not the record of a fit.
     """
-    try:
-        record = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
+    record = read_json(path, FIT_AGAIN, _LARGEST_RECORD)
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
         raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
     FitRecord.from_json(cast(object, record), str(path))
@@ -312,12 +310,10 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
     columns += [column for column in every if column not in lead]
     columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS]
-    columns += [*dict.fromkeys(column for row in rows for column in row if column.startswith(META)), "model_hash"]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(_safe_cells(row) for row in rows)
-    write_text(path, text.getvalue())
+    columns += dict.fromkeys(column for row in rows for column in row if column.startswith(META))
+    columns += [CHECKSUM, "model_hash"]
+    cells = ([row.get(column) for column in columns] for row in map(_safe_cells, rows))
+    write_text(path, checked_table_text(columns, cells))
 
 
 def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from shapespace.io.files import read_bytes, write_text
+from shapespace.io.files import write_text
+from shapespace.io.json_files import read_json
 
 ABOUT = "about.json"
 
@@ -25,7 +26,7 @@ def read_about(folder: Path) -> tuple[str, str] | None:
     if not path.is_file():
         return None
     try:
-        stored = json.loads(read_bytes(path))
+        stored = read_json(path, "make the faces again")
         return str(stored["provenance"]), str(stored["licence"])
     except (ValueError, KeyError, TypeError):
         return None

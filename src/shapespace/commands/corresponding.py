@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shapespace.errors import FileFormatError, InputError
-from shapespace.io.files import read_bytes
+from shapespace.errors import InputError
 from shapespace.io.folders import mesh_files
+from shapespace.io.json_files import read_json
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
@@ -100,10 +99,7 @@ def json_of(file: Path) -> object:
         FileError: it cannot be read.
         FileFormatError: it is not JSON.
     """
-    try:
-        return json.loads(read_bytes(file))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{file} is not JSON, or it is cut short; {CORRESPOND_AGAIN}.") from error
+    return read_json(file, CORRESPOND_AGAIN)
 
 
 def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:

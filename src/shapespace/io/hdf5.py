@@ -1,7 +1,8 @@
 """Named arrays and attributes in one HDF5 file that shows any later change.
 
 The first 512 bytes (an HDF5 user block, which HDF5 tools skip) hold the SHA-256 of the rest, and are checked before
-the HDF5 library parses anything. A content hash over the arrays and attributes themselves travels inside.
+anything else is read. A content hash over the arrays and attributes themselves travels inside. The HDF5 library writes,
+but never reads: see `hdf5_parts`.
 """
 
 from __future__ import annotations
@@ -11,20 +12,20 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.hdf5_parts import SIGNATURE, Attribute, OtherHdf5Error, hdf5_parts
+from shapespace.io.json_files import check_file
 
-Attribute: TypeAlias = str | int | float
 _USER_BLOCK = 512
 _MAGIC = b"shapespace sha256 "
 _HASH_NAME = "content_hash"
-_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_LARGEST_BYTES = 2**33
 
 
 def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Attribute]) -> str:
@@ -44,62 +45,67 @@ def write_hdf5(path: Path, arrays: Mapping[str, npt.NDArray[Any]], attributes: M
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
+        FileFormatError: a text that cannot be stored, or this version of h5py does not write what `read_hdf5` reads.
     """
+    import h5py  # a twentieth of a second that only those who write should wait
+
     digest = content_hash(arrays, attributes)
     memory = io.BytesIO()
-    with h5py.File(memory, "w", userblock_size=_USER_BLOCK) as file:
+    with h5py.File(memory, "w", userblock_size=_USER_BLOCK, libver="earliest", track_order=False) as file:
         for name, array in arrays.items():
-            file.create_dataset(name, data=array)
+            file.create_dataset(name, data=array, track_order=False)
         for name, value in {**attributes, _HASH_NAME: digest}.items():
-            file.attrs[name] = value
+            try:
+                file.attrs[name] = value
+            except ValueError as error:
+                raise FileFormatError(
+                    f"Cannot write {path}: the text of {name} holds a zero or what is no Unicode; leave that out."
+                ) from error
     data = memory.getvalue()[_USER_BLOCK:]
+    try:
+        hdf5_parts(memoryview(data))
+    except OtherHdf5Error as error:
+        raise FileFormatError(
+            f"{path} was not written: h5py {h5py.__version__} writes it so that it could not be read ({error}); "
+            "install another version of h5py."
+        ) from error
     write_bytes(path, _user_block(data) + data)
     return digest
 
 
-def _user_block(data: bytes) -> bytes:
+def _user_block(data: bytes | memoryview) -> bytes:
     return (_MAGIC + hashlib.sha256(data).hexdigest().encode() + b"\n").ljust(_USER_BLOCK, b"\0")
 
 
 def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
-    """Return the arrays and attributes in `path`, checked against both hashes.
+    """Return the arrays (read-only) and attributes in `path`, checked against both hashes.
 
     Raises:
         FileError: the file cannot be read.
-        FileFormatError: it is not HDF5, or it is cut short or changed since it was written.
+        FileFormatError: it is not HDF5, was not written by `write_hdf5`, or is cut short or changed since.
     """
+    check_file(path, _LARGEST_BYTES, "give a model written by shapespace build")
     data = read_bytes(path)
     damaged = FileFormatError(
         f"{path} is damaged: its content does not match its checksum; copy it again or rebuild the model."
     )
-    if data.startswith(_MAGIC):
-        if data[:_USER_BLOCK] != _user_block(data[_USER_BLOCK:]):
-            raise damaged
-    elif not data.startswith(_HDF5_SIGNATURE):
-        if _HDF5_SIGNATURE in data[: 2 * _USER_BLOCK]:
+    if not data.startswith(_MAGIC):
+        if data.startswith(SIGNATURE):
+            raise FileFormatError(
+                f"{path} is HDF5 but not a shapespace model: it has no checksum; give a model written by shapespace "
+                "build."
+            )
+        if SIGNATURE in data[: 2 * _USER_BLOCK]:
             raise damaged
         raise FileFormatError(f"{path} is not an HDF5 file; give a model written by shapespace build.")
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    attributes: dict[str, Attribute] = {}
+    if data[:_USER_BLOCK] != _user_block(memoryview(data)[_USER_BLOCK:]):
+        raise damaged
     try:
-        with h5py.File(io.BytesIO(data), "r") as file:
-            for name, item in cast(Any, file).items():
-                if isinstance(item, h5py.Dataset):
-                    # We write uncompressed; a declared size beyond the file's would be memory for nothing.
-                    declared = int(cast(Any, item).nbytes)
-                    if declared > len(data):
-                        raise FileFormatError(
-                            f"{path} declares {declared} bytes in {name!r} but is only {len(data)} bytes long; "
-                            "give a model written by shapespace build."
-                        )
-                    arrays[str(name)] = np.asarray(cast(Any, item)[()])
-            stored = cast(dict[str, Any], dict(file.attrs))
-            for name, value in stored.items():
-                attributes[name] = value.item() if isinstance(value, np.generic) else value
-    except FileFormatError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise damaged from error
-    if _HASH_NAME in attributes and attributes[_HASH_NAME] != content_hash(arrays, attributes):
+        arrays, attributes = hdf5_parts(memoryview(data)[_USER_BLOCK:])
+    except OtherHdf5Error as error:
+        raise FileFormatError(
+            f"{path} is HDF5 but not as shapespace writes it: {error}; give a model written by shapespace build."
+        ) from error
+    if attributes.get(_HASH_NAME) != content_hash(arrays, attributes):
         raise damaged
     return arrays, attributes

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from platformdirs import user_cache_path
 
 from shapespace.errors import FileError
+from shapespace.io.archives import arrays_in
 from shapespace.io.files import atomic_path
 
 MOST_BYTES = 500_000_000
@@ -51,8 +52,7 @@ def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
             if hashlib.file_digest(stream, "sha256").hexdigest().encode() != said:
                 return None
             stream.seek(_DIGEST_BYTES)
-            with np.load(stream, allow_pickle=False) as stored:
-                arrays = {key: np.asarray(stored[key]) for key in stored.files}
+            arrays = arrays_in(stream, path.stat().st_size)
     except (OSError, ValueError):
         return None
     with contextlib.suppress(OSError):

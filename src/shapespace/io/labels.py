@@ -54,10 +54,14 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
     if len(content) > _LARGEST_BYTES:
         raise FileFormatError(f"{path} is too large for a table of labels ({len(content) / 2**20:.0f} MiB).")
     try:
-        rows = list(csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
+        lines = filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
+        heads = next(lines, list[str]())
+        # No more cells than there are: a row may be shorter than the header.
+        rows = [dict(zip(heads, line, strict=False)) for line in lines]
     except (UnicodeDecodeError, csv.Error) as error:
         raise FileFormatError(f"{path} is not a CSV table in UTF-8 ({error}).") from error
-    heads = list(rows[0]) if rows else []
+    if not rows:
+        heads = []
     name = next((head for head in _NAMES if head in heads), None)
     label = next((head for head in _LABELS if head in heads and (of_subjects or head != "subject")), None)
     if name is None or label is None:
@@ -67,9 +71,9 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
         )
     named: dict[str, dict[PurePath, Label]] = {}
     for row in rows:
-        text = _printable(row[label] or "")
+        text = _printable(row.get(label) or "")
         subject = _printable(row.get("subject") or "")
-        if row[name] and (text or subject):
+        if row.get(name) and (text or subject):
             place = PurePath(row[name].replace("\\", "/")).with_suffix("")
             named.setdefault(place.name, {})[place] = Label(text, _intensity(row.get("intensity")), subject)
     found: dict[str, Label] = {}

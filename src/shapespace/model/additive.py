@@ -280,7 +280,7 @@ class AdditiveModel:
             raise ModelFileError(f"{path} does not part identity and expression; build it with --additive LABELS.csv.")
         try:
             return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
-        except (InputError, ValueError, TypeError) as error:
+        except (InputError, ValueError, TypeError, OverflowError) as error:
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
 
     def _checked(self, z: npt.ArrayLike) -> FloatArray:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any, TypedDict
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
+from shapespace.io.json_files import plain_json
 from shapespace.types import FloatArray, IntArray
 from shapespace.version import __version__
 
@@ -21,6 +24,22 @@ FORMAT_VERSION = 1
 _HELD_OUT = "held out"
 _EVERY_MODEL = ("mean", "basis", "stddev", "faces")
 """What is not of one representation."""
+_UNIT_TOLERANCE = 1e-3
+_TOLD = 200
+_WHOLE_NUMBERS = ("faces", "control_counts", "degree")
+
+
+class _Told(Struct, frozen=True):
+    """The attributes that a reader needs, and their types."""
+
+    total_variance: float
+    n_training: int
+    gauge: Gauge
+    landmarks: str
+    representation: str
+    provenance: str
+    licence: str
+    variance_divisor: str = ""
 
 
 class ModelFields(TypedDict):
@@ -93,27 +112,40 @@ def load(path: Path) -> ModelFields:
         raise ModelFileError(str(error)) from error
     if attributes.get("format") != FORMAT_NAME:
         raise ModelFileError(f"{path} is HDF5 but not a shapespace model; give a file written by shapespace build.")
-    if attributes.get("format_version") != FORMAT_VERSION:
+    version = attributes.get("format_version")
+    if version != FORMAT_VERSION:
         raise ModelFileError(
-            f"{path} is a model of format version {attributes.get('format_version')}, but this shapespace reads "
+            f"{path} is a model of format version {str(version)[:40]}, but this shapespace reads "
             f"version {FORMAT_VERSION}; update shapespace."
         )
     try:
-        stored = cast(dict[str, int], json.loads(str(attributes["landmarks"])))
+        told = msgspec.convert(attributes, _Told)
+        landmarks = msgspec.convert(plain_json(told.landmarks), dict[str, int])
+        for name, array in arrays.items():
+            if array.dtype != (np.int32 if name in _WHOLE_NUMBERS else np.float64):
+                raise ValueError(f"{name} is of the type {array.dtype}")
+        if told.representation == "vertices" and arrays["basis"].ndim == 2:
+            with np.errstate(over="ignore"):
+                length = np.einsum("dk,dk->k", arrays["basis"], arrays["basis"])
+            if not (np.abs(length - 1.0) < _UNIT_TOLERANCE).all():
+                raise ValueError("a column of basis is not of length 1")
+        # What was read is a view of the whole file, which is let go here.
+        owned = {name: array.copy() for name, array in arrays.items()}
         return {
-            "mean": arrays["mean"].astype(np.float64),
-            "basis": arrays["basis"].astype(np.float64),
-            "stddev": arrays["stddev"].astype(np.float64),
-            "faces": arrays["faces"].astype(np.int32) if "faces" in arrays else None,
-            "total_variance": float(attributes["total_variance"]),
-            "n_training": int(attributes["n_training"]),
-            "gauge": cast(Gauge, str(attributes["gauge"])),
-            "landmarks": {str(name): int(vertex) for name, vertex in stored.items()},
-            "representation": str(attributes["representation"]),
-            "coding": {name: array for name, array in arrays.items() if name not in _EVERY_MODEL},
-            "provenance": str(attributes["provenance"]),
-            "licence": str(attributes["licence"]),
-            "held_out": attributes.get("variance_divisor") == _HELD_OUT,
+            "mean": owned["mean"],
+            "basis": owned["basis"],
+            "stddev": owned["stddev"],
+            "faces": owned.get("faces"),
+            "total_variance": told.total_variance,
+            "n_training": told.n_training,
+            "gauge": told.gauge,
+            "landmarks": landmarks,
+            "representation": told.representation,
+            "coding": {name: array for name, array in owned.items() if name not in _EVERY_MODEL},
+            "provenance": told.provenance,
+            "licence": told.licence,
+            "held_out": told.variance_divisor == _HELD_OUT,
         }
-    except (AttributeError, KeyError, ValueError, TypeError) as error:
-        raise ModelFileError(f"{path} is a shapespace model but a part of it is missing: {error}.") from error
+    except (KeyError, ValueError) as error:
+        what = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")
+        raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {what}.") from error

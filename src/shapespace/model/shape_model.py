@@ -29,6 +29,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
+_TOLD = 300
 _IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
@@ -80,7 +81,7 @@ class ShapeModel:
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
         d, k = len(mean), len(stddev)
-        if mean.ndim != 1 or d % 3 or basis.shape != (d, k) or k < 1:
+        if mean.ndim != 1 or stddev.ndim != 1 or d % 3 or basis.shape != (d, k) or k < 1:
             raise InputError(
                 f"A shape model needs mean (D,), basis (D, K) and stddev (K,), not {mean.shape}, {basis.shape} "
                 f"and {stddev.shape}."
@@ -378,9 +379,11 @@ class ShapeModel:
         """
         fields = model_file.load(Path(path))
         try:
-            model = cls(**fields)
+            with np.errstate(all="ignore"):  # huge numbers overflow on the way to being refused
+                model = cls(**fields)
         except InputError as error:
-            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+            said = str(error)[:_TOLD]
+            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {said}") from error
         _IN_FILES.add(model)
         return model
 

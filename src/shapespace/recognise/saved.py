@@ -11,7 +11,6 @@ import json
 import math
 import warnings
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,12 +18,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.lib import format as npy
 
 from shapespace.errors import FileFormatError, InputError
+from shapespace.io.archives import npy_array, zip_members
 from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.json_files import check_file, plain_json
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.recognise.learn import Pipeline, skops_io
+from shapespace.recognise.learn import SVC, Pipeline, skops_io
 from shapespace.recognise.scores import calibrated
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -58,10 +58,29 @@ TRUSTED = frozenset(
 """The types that a classifier's file may hold."""
 _LOADERS = frozenset({"DictNode", "JsonNode", "ListNode", "NdArrayNode", "ObjectNode", "TupleNode", "TypeNode"})
 
+# C classes, K modes, P pairs of classes, O = C - 1; other letters are alike in all arrays of a classifier.
+_SHAPES: Mapping[str, Mapping[str, str]] = {
+    "mean-direction": {"directions_": "CK"},
+    "knn": {"_fit_X": "NK", "_y": "N"},
+    "lda": {"coef_": "CK", "intercept_": "C"},
+    "qda": {"means_": "CK", "whiten_": "CKK", "offsets_": "C"},
+    "logistic": {"coef_": "RK", "intercept_": "R"},
+    "svm": {
+        "classes_": "C", "support_": "S", "support_vectors_": "SK", "_n_support": "C", "_dual_coef_": "OS",
+        "_intercept_": "P",
+    },
+}  # fmt: skip
+_SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    "knn": {
+        "weights": "distance", "metric": "minkowski", "effective_metric_": "euclidean", "n_jobs": None,
+        "_fit_method": "brute",
+    },
+    "svm": {"kernel": "rbf", "_sparse": False},
+}  # fmt: skip
+"""Where scikit-learn's compiled code would trust what stands in the file."""
 _OURS = sorted(name for name in TRUSTED if name.startswith("shapespace."))
 _LARGEST_BYTES = 2**28
 _LARGEST_JSON = 2**24
-_MOST_MEMBERS = 4096
 _AGAIN = "train it again with shapespace recognise train"
 _PROBE_TOLERANCE = 1e-6
 
@@ -190,9 +209,8 @@ def load_classifier(path: Path) -> SavedClassifier:
         FileFormatError: it is damaged, of another version, not a classifier, or holds types that are not trusted.
     """
     path = Path(path)
+    check_file(path, _LARGEST_BYTES, _AGAIN)
     content = read_bytes(path)
-    if len(content) > _LARGEST_BYTES:
-        raise FileFormatError(f"{path} is too large for a classifier ({len(content) / 2**20:.0f} MiB).")
     members = _members(path, content)
     facts = _facts(path, members)
     _check_types(path, _json(path, members, _SCHEMA))
@@ -207,6 +225,7 @@ def load_classifier(path: Path) -> SavedClassifier:
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
+            _check_arrays(saved)
             answer = saved.probabilities(_probe(saved.width))
             told = np.asarray(facts["probe"], dtype=np.float64)
             same = answer.shape == told.shape and bool(np.abs(answer - told).max() <= _PROBE_TOLERANCE)
@@ -226,45 +245,27 @@ def _probe(modes: int) -> FloatArray:
 
 
 def _members(path: Path, content: bytes) -> dict[str, bytes]:
-    """Return the members of the archive, none of them larger than the file may be, nor than it says."""
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-            names = [info.filename for info in infos]
-            if len(names) > _MOST_MEMBERS or len(set(names)) != len(names):
-                raise FileFormatError(f"{path} is an archive with too many or repeated members; {_AGAIN}.")
-            if sum(info.file_size for info in infos) > _LARGEST_BYTES:
-                raise FileFormatError(f"{path} would unpack to more than a classifier needs; {_AGAIN}.")
-            members = {name: archive.read(name) for name in names}
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(f"{path} is not a classifier of shapespace, or it is cut short; {_AGAIN}.") from error
+        members = zip_members(io.BytesIO(content), len(content))
+    except (OSError, ValueError) as error:
+        raise FileFormatError(
+            f"{path} is not a classifier of shapespace, or it is cut short ({error}); {_AGAIN}."
+        ) from error
     for name, data in members.items():
         if name not in (FACTS, _SCHEMA):
-            _check_array(path, name, data)
+            try:
+                npy_array(data)
+            except ValueError as error:
+                raise FileFormatError(f"{path}: {name[:60]!r} in it {error}; {_AGAIN}.") from error
     return members
-
-
-def _check_array(path: Path, name: str, data: bytes) -> None:
-    """Refuse what is no plain array, or declares more than it holds, before numpy takes memory for it."""
-    stream = io.BytesIO(data)
-    try:
-        readers: Mapping[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-        shape, _, dtype = readers[npy.read_magic(stream)](stream)
-        whole = not dtype.hasobject and math.prod(shape) * dtype.itemsize == len(data) - stream.tell()
-    except Exception as error:  # numpy's own parser of headers may raise anything at all
-        raise FileFormatError(f"{path}: {name[:60]!r} in it is not an array; {_AGAIN}.") from error
-    if not whole:
-        raise FileFormatError(f"{path}: the array {name[:60]!r} in it is cut short or holds objects; {_AGAIN}.")
 
 
 def _json(path: Path, members: Mapping[str, bytes], name: str) -> Any:
     if name not in members or len(members[name]) > _LARGEST_JSON:
         raise FileFormatError(f"{path} is not a classifier of shapespace: it has no usable {name}; {_AGAIN}.")
     try:
-        return json.loads(members[name])
-    except (ValueError, RecursionError) as error:
+        return plain_json(members[name])
+    except ValueError as error:
         raise FileFormatError(f"{path}: {name} in it is damaged; {_AGAIN}.") from error
 
 
@@ -297,10 +298,10 @@ def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
     if not isinstance(facts, dict) or cast(dict[str, Any], facts).get("format") != FORMAT:
         raise FileFormatError(f"{path} is not a classifier of shapespace; {_AGAIN}.")
     known = cast(dict[str, Any], facts)
-    if known.get("format_version") != FORMAT_VERSION:
+    found: Any = known.get("format_version")
+    if found != FORMAT_VERSION:
         raise FileFormatError(
-            f"{path} is of format version {known.get('format_version')!r}, and this shapespace reads {FORMAT_VERSION}; "
-            f"{_AGAIN}."
+            f"{path} is of format version {str(found)[:40]}, and this shapespace reads {FORMAT_VERSION}; {_AGAIN}."
         )
     return known
 
@@ -341,8 +342,29 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: byte
     return saved
 
 
+def _check_arrays(saved: SavedClassifier) -> None:
+    """Raise ValueError where arrays do not fit together: compiled code would read, and broadcasts grow, beyond them."""
+    found: Any = saved.pipeline
+    wanted: Any = CLASSIFIERS[saved.classifier](0)
+    if [type(step) for _, step in found.steps] != [type(step) for _, step in wanted.steps]:
+        raise ValueError
+    classes, fitted = len(saved.classes), found.steps[-1][1]
+    fitted = getattr(fitted, "machine_", fitted)
+    sizes = {"C": classes, "K": saved.modes, "O": classes - 1, "P": classes * (classes - 1) // 2}
+    for name, letters in _SHAPES[saved.classifier].items():
+        shape = getattr(fitted, name).shape
+        if len(shape) != len(letters) or any(sizes.setdefault(a, n) != n for a, n in zip(letters, shape, strict=True)):
+            raise ValueError
+    if any(getattr(fitted, name) != value for name, value in _SETTINGS.get(saved.classifier, {}).items()):
+        raise ValueError
+    if isinstance(fitted, SVC):
+        counts = np.asarray(getattr(fitted, "_n_support"))  # noqa: B009  # of no public name, and what libsvm walks by
+        if counts.min() < 0 or counts.sum() != sizes["S"]:
+            raise ValueError
+
+
 def _projection(content: bytes) -> FloatArray:
-    array = np.load(io.BytesIO(content), allow_pickle=False)
+    array = npy_array(content)
     if array.dtype != np.float64 or array.ndim != 2 or not np.isfinite(array).all():
         raise ValueError
     return cast(FloatArray, array)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -13,7 +11,9 @@ import numpy as np
 
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
+from shapespace.io.json_files import check_file
 from shapespace.io.labels import Label
+from shapespace.io.tables import table_rows
 from shapespace.types import FloatArray, read_only
 
 NEUTRAL = "neutral"
@@ -22,6 +22,7 @@ NEUTRAL = "neutral"
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _FORMULA = ("'=", "'+", "'-", "'@", "'\t", "'\r")
 _LARGEST_BYTES = 2**28
+_TABLE_AGAIN = "run shapespace fit --resume to write it again, or take the column checksum out if that was meant"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,45 +79,52 @@ def read_coefficients(path: Path) -> list[ScanCoefficients]:
         FileError: it cannot be read.
         FileFormatError: it is not such a table, or it does not say of which model it is.
     """
-    content = read_bytes(path)
-    if len(content) > _LARGEST_BYTES:
-        raise FileFormatError(f"{path} is too large for a table of coefficients ({len(content) / 2**20:.0f} MiB).")
+    check_file(path, _LARGEST_BYTES, _TABLE_AGAIN)
+    rows = table_rows(read_bytes(path))
     try:
-        reader = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        rows = list(reader)
-        heads = list(reader.fieldnames or ())
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path} is not a CSV table in UTF-8 ({error}).") from error
-    modes = 0
-    while f"z{modes + 1}" in heads:
+        heads = next(rows)
+        modes = _modes(heads, path)
+        scans = [
+            _from_row(dict(zip(heads, row, strict=True)), modes, f"{path}, row {number}")
+            for number, row in enumerate(rows, 1)
+        ]
+    except FileFormatError:
+        raise
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; {_TABLE_AGAIN}.") from error
+    if not scans:
+        raise FileFormatError(f"{path} has no rows; fit some scans first.")
+    return scans
+
+
+def _modes(heads: Sequence[str], path: Path) -> int:
+    known, modes = set(heads), 0
+    while f"z{modes + 1}" in known:
         modes += 1
-    if not modes or not {"scan", "status", "reason"} <= set(heads):
+    if not modes or not {"scan", "status", "reason"} <= known:
         raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
-    if "model_hash" not in heads:
+    if "model_hash" not in known:
         raise FileFormatError(
             f"{path} does not say of which model its coefficients are; run shapespace fit --resume to write it again, "
             "or give the folder of the results."
         )
-    if not rows:
-        raise FileFormatError(f"{path} has no rows; fit some scans first.")
-    return [_from_row(row, modes, f"{path}, row {number}") for number, row in enumerate(rows, 1)]
+    return modes
 
 
-def _from_row(row: Mapping[str, str | None], modes: int, where: str) -> ScanCoefficients:
-    status = row["status"] or ""
+def _from_row(row: Mapping[str, str], modes: int, where: str) -> ScanCoefficients:
+    status = row["status"]
     z: FloatArray | None = None
     if status != "failed":
         try:
-            z = read_only(np.asarray([float(row[f"z{k}"] or "") for k in range(1, modes + 1)]))
+            z = read_only(np.asarray([float(row[f"z{k}"]) for k in range(1, modes + 1)]))
         except ValueError as error:
             raise FileFormatError(f"{where}: a coefficient is not a number; fit the scan again.") from error
-    scan = ScanCoefficients(_plain(row["scan"]), status, _plain(row["reason"]), z, row["model_hash"] or "")
+    scan = ScanCoefficients(_plain(row["scan"]), status, _plain(row["reason"]), z, row["model_hash"])
     return _checked(scan, where)
 
 
-def _plain(cell: str | None) -> str:
+def _plain(text: str) -> str:
     # The writer puts an apostrophe before what a spreadsheet would run.
-    text = cell or ""
     return text[1:] if text.startswith(_FORMULA) else text
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import zipfile
-import zlib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +15,9 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.files import read_bytes, read_error, sha256_of_file
+from shapespace.io.archives import read_arrays
+from shapespace.io.files import read_error, sha256_of_file
+from shapespace.io.json_files import read_json
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
@@ -26,8 +25,6 @@ from shapespace.report.wording import counted, printable
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.types import FloatArray, Mesh
 
-_LARGEST_JSON = 64 * 2**20
-_LARGEST_ARRAY = 2**30
 _AGAIN = "make it again with shapespace fit --stages"
 _RECORD = ".fit.json"
 _FEWEST_POINTS = 20
@@ -76,11 +73,7 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_JSON, self.again)
-            try:
-                content: object = json.loads(read_bytes(path), parse_constant=lambda _: None)
-            except (ValueError, RecursionError) as error:
-                raise FileFormatError(f"{path} is not JSON, or it is cut short; {self.again}.") from error
+            content: object = read_json(path, self.again)
             if not isinstance(content, dict):
                 raise FileFormatError(f"{path} does not hold a JSON object; {self.again}.")
         return cast(dict[str, Any], _printable(cast(object, content)))
@@ -92,23 +85,8 @@ class Folder:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or declares arrays that it does not hold.
         """
-        path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_ARRAY, self.again)
-            try:
-                with zipfile.ZipFile(path) as archive:
-                    for member in archive.infolist():
-                        _check_member(path, archive, member, self.again)
-                with np.load(path, allow_pickle=False) as loaded:
-                    return {key: np.asarray(loaded[key]) for key in loaded.files}
-            except OSError as error:
-                raise read_error(path, error) from error
-            except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError) as error:
-                if isinstance(error, FileFormatError):
-                    raise
-                raise FileFormatError(
-                    f"{path} is not an .npz file of arrays, or it is cut short; {self.again}."
-                ) from error
+            return read_arrays(self.path(name), self.again)
 
     def mesh(self, name: object) -> Mesh:
         """Return the mesh in a file.
@@ -351,29 +329,6 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     if model.content_hash not in hashes:
         raise InputError(f"{path} is not the model of the fits in {folder.root}; give the right one with --model.")
     return model
-
-
-def _bounded(path: Path, most: int, again: str) -> None:
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise read_error(path, error) from error
-    if size > most:
-        raise FileFormatError(f"{path} is larger ({size / 2**20:.0f} MiB) than such a file can be; {again}.")
-
-
-def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo, again: str) -> None:
-    """Refuse an array whose header promises another size than the archive holds, before it is allocated."""
-    with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read_header(stream)
-        header = stream.tell()
-    promised = dtype.itemsize
-    for extent in shape:
-        promised *= int(extent)
-    if dtype.hasobject or promised != member.file_size - header or promised > _LARGEST_ARRAY:
-        raise FileFormatError(f"{path}: the array {member.filename!r} is not what its header says; {again}.")
 
 
 def _printable(value: object) -> object:

@@ -91,6 +91,7 @@ class StagedFit:
         return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
 
     @staticmethod
+    @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
     def from_arrays(
         arrays: Mapping[str, npt.NDArray[Any]], told: FitResult | FitRecord, *, name: str, label: str
     ) -> StagedFit:
@@ -109,7 +110,7 @@ class StagedFit:
         b, z, b_stddev, shrinkage = (
             np.array(values, dtype=np.float64) for values in (told.b, told.z, told.b_stddev, told.shrinkage)
         )
-        if int(arrays.get("format_version", np.array(0))) != STAGES_VERSION:
+        if not np.array_equal(arrays.get("format_version", 0), STAGES_VERSION):
             raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
         try:
             faces = arrays.get("faces")
@@ -121,14 +122,14 @@ class StagedFit:
                 surfaces[stage] = Mesh(arrays[stage].astype(np.float64), faces, name=name)
                 forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
                 backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
-            regions = arrays["regions"].astype(np.int32)
+            regions = np.clip(arrays["regions"], 0, len(REGIONS)).astype(np.int32)
             history = tuple(
                 Moment(int(phase), int(iteration), float(rms), np.asarray(b_now, dtype=np.float64), _similarity(T))
                 for phase, iteration, rms, b_now, T in zip(
                     *(arrays[f"history_{key}"] for key in ("phase", "iteration", "rms_mm", "b", "T")), strict=True
                 )
             )
-        except (KeyError, ValueError, TypeError, IndexError, ShapespaceError) as error:
+        except (KeyError, ValueError, TypeError, IndexError, OverflowError, ShapespaceError) as error:
             raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {again}.") from error
         V, S = len(surfaces["final"].vertices), len(scan.vertices)
         whole = all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values()))

@@ -1,0 +1,195 @@
+"""The part of HDF5 that our own writer uses, read without the HDF5 library.
+
+That library follows links to other files and devices, takes what memory a header asks for, and hangs or crashes in
+damaged structures; a checksum does not help against who recomputes it. So only this is read, and all else refused:
+superblock 0, one group of names, each with an array in one piece, and attributes that are a number or a text ("HDF5
+File Format Specification", versions 1 of its parts). Nothing is followed but addresses within the file, no step is
+taken more often than `_MOST` times, and arrays and texts together are no larger than the file, however often they are
+named.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Attribute: TypeAlias = str | int | float
+Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
+
+SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+_MOST = 256
+_MOST_AXES = 8
+_SPACE, _TYPE, _LAYOUT, _ATTRIBUTE, _CONTINUED, _GROUP = 0x01, 0x03, 0x08, 0x0C, 0x10, 0x11
+_NOTHING, _OLD_FILL, _FILL, _CHANGED = 0x00, 0x04, 0x05, 0x12
+_IN_DATASET = {_NOTHING, _SPACE, _TYPE, _OLD_FILL, _FILL, _LAYOUT, _CHANGED}
+_IN_ROOT = {_NOTHING, _ATTRIBUTE, _GROUP, _CHANGED}
+_SHARED = 2
+_ONE_PIECE = (3, 1)
+# Each type as its message has it, zero bytes at the end left out: float64, then signed integers, little-endian.
+_NUMBERS = {
+    bytes.fromhex("11203f000800000000004000340b0034ff03"): np.dtype("<f8"),
+    bytes.fromhex("1008000004000000000020"): np.dtype("<i4"),
+    bytes.fromhex("1008000008000000000040"): np.dtype("<i8"),
+}
+_TEXT = bytes.fromhex("19010100100000001000000001000000000008")
+
+
+class OtherHdf5Error(ValueError):
+    """It is HDF5, or claims to be, but not as our writer writes it; the text says why, as a clause."""
+
+
+def hdf5_parts(data: memoryview) -> tuple[Arrays, dict[str, Attribute]]:
+    """Return the arrays by name, read-only views of `data`, and the attributes, of an HDF5 file without user block.
+
+    Raises:
+        OtherHdf5Error: it is none, or holds anything that our writer does not write.
+    """
+    return _Parts(data).read()
+
+
+class _Parts:
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+        self._left = len(data)
+
+    def read(self) -> tuple[Arrays, dict[str, Attribute]]:
+        signature, version, offset_bytes, length_bytes = self._fields("8sB4xBB", 0)
+        if (signature, version, offset_bytes, length_bytes) != (SIGNATURE, 0, 8, 8):
+            raise OtherHdf5Error("it begins otherwise")
+        root = self._messages(self._fields("Q", 64)[0], _IN_ROOT, "the file")
+        attributes = dict(self._attribute(body) for kind, body in root if kind == _ATTRIBUTE)
+        arrays: Arrays = {}
+        for tree, heap in (_unpacked("QQ", body) for kind, body in root if kind == _GROUP):
+            for name, header in self._names(tree, heap):
+                if name in arrays:
+                    raise OtherHdf5Error(f"it names {name!r} twice")
+                arrays[name] = self._array(name, header)
+        return arrays, attributes
+
+    def _bytes(self, at: int, count: int) -> memoryview:
+        if at + count > len(self._data):
+            raise OtherHdf5Error("it points past its own end")
+        return self._data[at : at + count]
+
+    def _fields(self, layout: str, at: int) -> tuple[Any, ...]:
+        return _unpacked(layout, self._bytes(at, struct.calcsize(f"<{layout}")))
+
+    def _charge(self, count: int, what: str) -> None:
+        """Take `count` bytes from what the file may fill in memory, before they are taken there."""
+        self._left -= count
+        if self._left < 0:
+            raise OtherHdf5Error(f"it declares {count} bytes in {what} but is only {len(self._data)} bytes long")
+
+    def _messages(self, at: int, allowed: set[int], where: str) -> list[tuple[int, memoryview]]:
+        """Return the messages of the object whose header begins at `at`, by kind."""
+        version, length = self._fields("B7xI", at)
+        if version != 1:
+            raise OtherHdf5Error(f"{where} has a header of another version")
+        found: list[tuple[int, memoryview]] = []
+        blocks = [self._bytes(at + 16, length)]
+        for block in blocks:  # grows while it is walked, by what is continued elsewhere
+            place = 0
+            while place + 8 <= len(block):
+                kind, size, flags = _unpacked("HHB", block[place : place + 5])
+                body = block[place + 8 : place + 8 + size]
+                place += 8 + size
+                if place > len(block) or flags & _SHARED or len(found) + len(blocks) > _MOST:
+                    raise OtherHdf5Error(f"{where} has a header that is damaged")
+                if kind == _CONTINUED:
+                    blocks.append(self._bytes(*_unpacked("QQ", body)))
+                elif kind in allowed:
+                    found.append((kind, body))
+                else:
+                    raise OtherHdf5Error(f"{where} holds a feature of HDF5 ({kind:#04x}) that no model needs")
+        return found
+
+    def _names(self, tree: int, heap: int) -> list[tuple[str, int]]:
+        """Return each name in the group with the address of its header; all stand at one level of the tree."""
+        mark, kind, level, count = self._fields("4sBBH", tree)
+        heap_mark, texts = self._fields("4s20xQ", heap)
+        if (mark, kind, level, heap_mark) != (b"TREE", 0, 0, b"HEAP") or count > _MOST:
+            raise OtherHdf5Error("its names stand otherwise")
+        found: list[tuple[str, int]] = []
+        for child in range(count):
+            (node,) = self._fields("Q", tree + 32 + 16 * child)
+            mark, entries = self._fields("4s2xH", node)
+            if mark != b"SNOD" or len(found) + entries > _MOST:
+                raise OtherHdf5Error("its names stand otherwise")
+            for entry in range(entries):
+                name, header, link = self._fields("QQI", node + 8 + 40 * entry)
+                if link:
+                    raise OtherHdf5Error("it holds a link or a group")
+                found.append((self._name(texts + name), header))
+        return found
+
+    def _name(self, at: int) -> str:
+        return _text(bytes(self._data[at : at + _MOST]).partition(b"\0")[0])
+
+    def _array(self, name: str, at: int) -> npt.NDArray[Any]:
+        found = dict(self._messages(at, _IN_DATASET, repr(name)))
+        if not {_SPACE, _TYPE, _LAYOUT} <= found.keys():
+            raise OtherHdf5Error(f"{name!r} is no array")
+        dtype = _NUMBERS.get(bytes(found[_TYPE]).rstrip(b"\0"))
+        if dtype is None:
+            raise OtherHdf5Error(f"{name!r} is of another type than float64 and int32")
+        shape = _shape(found[_SPACE])
+        size = math.prod(shape) * dtype.itemsize
+        self._charge(size, repr(name))
+        if tuple(found[_LAYOUT][:2]) != _ONE_PIECE:
+            raise OtherHdf5Error(f"{name!r} is not stored in one piece")
+        address, stored = _unpacked("QQ", found[_LAYOUT][2:18])
+        if stored != size or not size:
+            raise OtherHdf5Error(f"{name!r} is empty or cut short")
+        return np.frombuffer(self._bytes(address, size), dtype).reshape(shape)
+
+    def _attribute(self, body: memoryview) -> tuple[str, Attribute]:
+        version, *sizes = _unpacked("BxHHH", body[:8])
+        ends = np.cumsum([8, *(-(-size // 8) * 8 for size in sizes)]).tolist()
+        name, kind, space, value = (bytes(body[a:b]) for a, b in zip(ends, [*ends[1:], None], strict=True))
+        called = _text(name.partition(b"\0")[0])
+        kind = kind.rstrip(b"\0")
+        if version != 1 or _shape(memoryview(space)) or not (kind == _TEXT or kind in _NUMBERS):
+            raise OtherHdf5Error(f"its attribute {called!r} is neither a number nor a text")
+        if kind == _TEXT:
+            length, heap, index = _unpacked("IQI", value[:16])
+            return called, self._text_in_heap(length, heap, index, called)
+        number = np.frombuffer(value[: _NUMBERS[kind].itemsize], _NUMBERS[kind])
+        if not len(number):
+            raise OtherHdf5Error(f"its attribute {called!r} is cut short")
+        return called, number[0].item()
+
+    def _text_in_heap(self, length: int, heap: int, wanted: int, called: str) -> str:
+        mark, size = self._fields("4s4xQ", heap)
+        objects = self._bytes(heap, size)
+        place = 16
+        for _ in range(_MOST if mark == b"GCOL" else 0):
+            index, held = _unpacked("H6xQ", objects[place : place + 16])
+            if index == wanted:
+                if held < length or place + 16 + held > size:
+                    break
+                self._charge(length, f"the attribute {called!r}")
+                return _text(bytes(objects[place + 16 : place + 16 + length]))
+            place += 16 + -(-held // 8) * 8
+        raise OtherHdf5Error(f"its attribute {called!r} is damaged")
+
+
+def _unpacked(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
+    try:
+        return struct.unpack(f"<{layout}", data)
+    except struct.error as error:
+        raise OtherHdf5Error("it is cut short") from error
+
+
+def _shape(space: memoryview) -> tuple[int, ...]:
+    version, rank = _unpacked("BB", space[:2])
+    if version != 1 or rank > _MOST_AXES:
+        raise OtherHdf5Error("it holds an array of a strange shape")
+    return _unpacked(f"{rank}Q", space[8 : 8 + 8 * rank])
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")  # what is replaced does not match the checksum
