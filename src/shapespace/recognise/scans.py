@@ -22,7 +22,7 @@ NEUTRAL = "neutral"
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _FORMULA = ("'=", "'+", "'-", "'@", "'\t", "'\r")
 _LARGEST_BYTES = 2**28
-_TABLE_AGAIN = "run shapespace fit --resume to write it again, or take the column checksum out if that was meant"
+_TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksum out if that was meant"
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def _modes(heads: Sequence[str], path: Path) -> int:
         raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
     if "model_hash" not in known:
         raise FileFormatError(
-            f"{path} does not say of which model its coefficients are; run shapespace fit --resume to write it again, "
+            f"{path} does not say of which model its coefficients are; run shapespace fit to write it again, "
             "or give the folder of the results."
         )
     return modes
