@@ -9,6 +9,8 @@ import io
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
@@ -35,6 +37,8 @@ DOCUMENTS = [
 NEEDS_DATA = "<!-- needs data -->"
 # The demo takes minutes and the viewer runs until it is stopped; both have tests of their own. Here they are parsed.
 PARSED_ONLY = ("demo", "view")
+BESIDE = ("dask",)
+"""Programs that go on while the commands after them run."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,17 @@ def arguments(command: str) -> list[str]:
     return out
 
 
+@contextlib.contextmanager
+def going_on(command: list[str]) -> Iterator[None]:
+    """Run a command of this environment until the block ends."""
+    program = Path(sys.executable).with_name(command[0])
+    with subprocess.Popen([program, *command[1:]], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+
+
 def run(document: Path, *, with_data: bool, instead: Mapping[str, Callable[[], None]] = MappingProxyType({})) -> int:
     """Run the examples of `document` in order in the current folder, and return how many there were.
 
@@ -94,6 +109,13 @@ def run(document: Path, *, with_data: bool, instead: Mapping[str, Callable[[], N
         with_data: whether to run those that need open data.
         instead: what to do for some commands.
     """
+    with contextlib.ExitStack() as beside:
+        return _run(document, beside, with_data=with_data, instead=instead)
+
+
+def _run(
+    document: Path, beside: contextlib.ExitStack, *, with_data: bool, instead: Mapping[str, Callable[[], None]]
+) -> int:
     namespace: dict[str, Any] = {"__name__": "__main__"}
     count = 0
     for block in blocks(document):
@@ -106,6 +128,9 @@ def run(document: Path, *, with_data: bool, instead: Mapping[str, Callable[[], N
             count += 1
         for command in commands(block):
             program = shlex.split(command, comments=True)[0]
+            if program in BESIDE and command.endswith(" &"):
+                beside.enter_context(going_on(shlex.split(command.removesuffix(" &"))))
+                continue
             if program != "shapespace":
                 continue
             if command in instead:
