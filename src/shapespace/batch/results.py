@@ -17,10 +17,11 @@ from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.surface import rms_size
-from shapespace.io.files import atomic_path, read_bytes, write_text
+from shapespace.io.files import atomic_path, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord, to_json
+from shapespace.store.results import bytes_at
 from shapespace.store.rows import coefficient_columns, safe_cells
 from shapespace.store.rows import coefficient_row as coefficient_row
 from shapespace.version import __version__
@@ -140,14 +141,14 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the record in a NAME.fit.json.
+    """Return the record in a NAME.fit.json, or the one of a store that such a file would hold.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is not the record of a fit.
     """
     try:
-        record = json.loads(read_bytes(path))
+        record = json.loads(bytes_at(path))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path} is not JSON, or it is cut short; fit the scan again.") from error
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -24,12 +25,12 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
 from shapespace.report.wording import counted, printable
 from shapespace.schemas import FitEntry, FitRecord
+from shapespace.store.results import ENDING, ENDINGS, Results, bytes_at, kept_at, mesh_at, results_at
 from shapespace.types import FloatArray, Mesh
 
 _LARGEST_JSON = 64 * 2**20
 _LARGEST_ARRAY = 2**30
 _AGAIN = "make it again with shapespace fit --stages"
-_RECORD = ".fit.json"
 _FEWEST_POINTS = 20
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
@@ -76,9 +77,8 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_JSON, self.again)
             try:
-                content: object = json.loads(read_bytes(path), parse_constant=lambda _: None)
+                content: object = json.loads(_content(path, _LARGEST_JSON, self.again), parse_constant=lambda _: None)
             except (ValueError, RecursionError) as error:
                 raise FileFormatError(f"{path} is not JSON, or it is cut short; {self.again}.") from error
             if not isinstance(content, dict):
@@ -94,12 +94,16 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            _bounded(path, _LARGEST_ARRAY, self.again)
+            if kept_at(path):
+                content: Path | io.BytesIO = io.BytesIO(bytes_at(path))
+            else:
+                _bounded(path, _LARGEST_ARRAY, self.again)
+                content = path
             try:
-                with zipfile.ZipFile(path) as archive:
+                with zipfile.ZipFile(content) as archive:
                     for member in archive.infolist():
                         _check_member(path, archive, member, self.again)
-                with np.load(path, allow_pickle=False) as loaded:
+                with np.load(content, allow_pickle=False) as loaded:
                     return {key: np.asarray(loaded[key]) for key in loaded.files}
             except OSError as error:
                 raise read_error(path, error) from error
@@ -118,7 +122,7 @@ class Folder:
             FileFormatError: it is damaged.
         """
         with self._named_shortly():
-            return read_mesh(self.path(name))
+            return mesh_at(self.path(name))
 
     @contextmanager
     def _named_shortly(self) -> Generator[None]:
@@ -234,7 +238,7 @@ def has_fits(folder: Folder) -> bool:
     Raises:
         FileError: the folder cannot be read.
     """
-    return bool(_records(folder))
+    return bool(len(_results(folder)))
 
 
 def find_fits(folder: Folder) -> list[SavedFit]:
@@ -246,32 +250,22 @@ def find_fits(folder: Folder) -> list[SavedFit]:
         FileError: the folder cannot be read.
         InputError: there is no fit in it.
     """
-    names = _records(folder)
-    if not names:
-        raise InputError(f"{folder.root} holds no fits (NAME{_RECORD}); give a folder that shapespace fit wrote.")
-    return [_found(folder, name) for name in names]
+    results = _results(folder)
+    if not results:
+        raise InputError(f"{folder.root} holds no fits (NAME{ENDING}); give a folder that shapespace fit wrote.")
+    return [saved_fit(folder, results, name) for name in results.names()]
 
 
-def _records(folder: Folder) -> list[str]:
-    try:
-        return sorted(path.name for path in folder.root.iterdir() if path.name.endswith(_RECORD))
-    except OSError as error:
-        raise read_error(folder.root, error) from error
+def _results(folder: Folder) -> Results:
+    return results_at(folder.root) or Results(folder.root)
 
 
-def _found(folder: Folder, file: str) -> SavedFit:
-    name = file.removesuffix(_RECORD)
-
-    def beside(ending: str) -> str | None:
-        return f"{name}.{ending}" if (folder.root / f"{name}.{ending}").is_file() else None
-
-    entry = FitEntry(
-        name=printable(name),
-        json=file,
-        stages=beside("stages.npz"),
-        fitted=beside("fitted.ply"),
-        dense=beside("dense.ply"),
+def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
+    """Return one fit of `results`, which are those of `folder`; `unreadable` where it cannot be read."""
+    fitted, dense, stages = (
+        f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )
+    entry = FitEntry(name=printable(name), json=f"{name}{ENDING}", fitted=fitted, dense=dense, stages=stages)
     try:
         return read_fit(folder, entry)
     except ShapespaceError as error:
@@ -351,6 +345,17 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     if model.content_hash not in hashes:
         raise InputError(f"{path} is not the model of the fits in {folder.root}; give the right one with --model.")
     return model
+
+
+def _content(path: Path, most: int, again: str) -> bytes:
+    """Return the content of a file that is not too large, or what a store keeps in its place."""
+    if not kept_at(path):
+        _bounded(path, most, again)
+        return read_bytes(path)
+    content = bytes_at(path)
+    if len(content) > most:
+        raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {again}.")
+    return content
 
 
 def _bounded(path: Path, most: int, again: str) -> None:

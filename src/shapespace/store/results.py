@@ -141,6 +141,7 @@ class Results:
 
     Args:
         folder: that `shapespace fit` wrote.
+        store: its shards where they are open already; None opens them.
 
     Raises:
         FileError: the folder cannot be read.
@@ -148,10 +149,10 @@ class Results:
         ShapespaceError: there is a store, and the extra `store` is not installed.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, store: Store | None = None) -> None:
         self.folder = Path(folder)
-        manifest = read_manifest(self.folder)
-        self.store = None if manifest is None else Store(self.folder, manifest)
+        manifest = None if store is not None else read_manifest(self.folder)
+        self.store = store if manifest is None else Store(self.folder, manifest)
         try:
             there = {entry.name for entry in os.scandir(self.folder)}
         except OSError as error:
@@ -215,7 +216,7 @@ class Results:
         """
         if name in self.singles:
             return read_bytes(self.folder / f"{name}{ENDING}")
-        self._known(name)
+        self.known(name)
         assert self.store is not None
         return self.store.record_text(name).encode("utf-8", "surrogatepass")
 
@@ -245,7 +246,7 @@ class Results:
         """
         if name in self.singles:
             return read_mesh(self.folder / f"{name}{ENDINGS[kind]}")
-        self._known(name)
+        self.known(name)
         assert self.store is not None
         if not self.has(name, kind):
             raise FileFormatError(f"{self.folder}: no {kind} surface of {name} was kept; fit the scan again.")
@@ -261,7 +262,7 @@ class Results:
         """
         if name in self.singles:
             return read_bytes(self.folder / f"{name}{ENDINGS['stages']}")
-        self._known(name)
+        self.known(name)
         assert self.store is not None
         if not self.has(name, "stages"):
             raise FileFormatError(f"{self.folder}: the stages of {name} were not kept; fit it again with --stages.")
@@ -323,7 +324,12 @@ class Results:
             self._problems.append(told)
         return None
 
-    def _known(self, name: str) -> None:
+    def known(self, name: str) -> None:
+        """Check that there is a fit of that name.
+
+        Raises:
+            InputError: there is none; the sentence names those that are called nearly so.
+        """
         if name not in self:
             near = difflib.get_close_matches(name, [*self.singles, *self._stored], _NEAR, 0.6)
             hint = f"; there is {', '.join(near)}" if near else ""
@@ -343,7 +349,7 @@ def named(file: str) -> tuple[str, str]:
 
 
 def results_at(folder: Path) -> Results | None:
-    """Return the results in a folder that holds a store, kept open; None of other folders.
+    """Return the results in a folder that holds a store, kept open while nothing changes; None of other folders.
 
     Raises:
         FileError: it cannot be read.
@@ -351,15 +357,22 @@ def results_at(folder: Path) -> Results | None:
     """
     try:
         changed = (folder / Manifest.FILE).stat().st_mtime_ns
+        return _results_at(folder.resolve(), folder, changed, folder.stat().st_mtime_ns)
     except OSError:
         return None if read_manifest(folder) is None else Results(folder)
-    found = _results_at(folder.resolve(), folder, changed)
-    return found if found.store is not None else None
 
 
 @lru_cache(maxsize=_OPEN)
-def _results_at(_folder: Path, called: Path, _changed: int) -> Results:
-    return Results(called)
+def _results_at(resolved: Path, called: Path, changed: int, _files_changed: int) -> Results | None:
+    # Shards stay open where only single files came.
+    store = _store_at(resolved, called, changed)
+    return None if store is None else Results(called, store)
+
+
+@lru_cache(maxsize=_OPEN)
+def _store_at(_resolved: Path, called: Path, _changed: int) -> Store | None:
+    manifest = read_manifest(called)
+    return None if manifest is None else Store(called, manifest)
 
 
 def kept_at(path: Path) -> bool:
@@ -368,6 +381,11 @@ def kept_at(path: Path) -> bool:
     if not what or path.is_file() or (results := results_at(path.parent)) is None:
         return False
     return name in results and (what == "record" or results.has(name, what))
+
+
+def is_result(path: Path) -> bool:
+    """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
+    return path.is_file() or kept_at(path)
 
 
 def mesh_at(path: Path) -> Mesh:
