@@ -259,7 +259,7 @@ class Store:
         def write(path: Path) -> None:
             arrow(".parquet").write_table(
                 table, path, compression="zstd", row_group_size=_ROW_GROUP, use_dictionary=texts,
-                write_statistics=["scan"],
+                write_statistics=["scan"], write_page_checksum=True,
             )  # fmt: skip
 
         return self._written(TABLE, called, write)
@@ -315,8 +315,10 @@ class Store:
             write(temporary)
             _to_disk(temporary)
             size, digest = temporary.stat().st_size, sha256_of_file(temporary)
+            end = _end_of_table(temporary) if part == TABLE else b""
         _to_disk(path.parent)
-        return StoredFile(file=f"{part}/{path.name}", bytes=size, sha256=digest)
+        ended = {"end_bytes": len(end), "end_sha256": hashlib.sha256(end).hexdigest()} if end else {}
+        return StoredFile(file=f"{part}/{path.name}", bytes=size, sha256=digest, **ended)
 
 
 def _names_in(table: Path) -> set[str]:
@@ -325,6 +327,15 @@ def _names_in(table: Path) -> set[str]:
         return {str(name) for name in arrow(".parquet").read_table(table, columns=["scan"]).column("scan").to_pylist()}
     except (OSError, ValueError, KeyError):
         return {""}
+
+
+def _end_of_table(path: Path) -> bytes:
+    """Return the end of a Parquet file: its schema, where its pages are, how long that is, and PAR1."""
+    with path.open("rb") as stream:
+        stream.seek(-8, os.SEEK_END)
+        length = int.from_bytes(stream.read(4), "little")
+        stream.seek(-8 - length, os.SEEK_END)
+        return stream.read()
 
 
 def _to_disk(path: Path) -> None:

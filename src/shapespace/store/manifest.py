@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ import msgspec
 from msgspec import Struct
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.io.files import read_bytes, sha256_of_file
+from shapespace.io.files import read_bytes, read_error, sha256_of_file
 from shapespace.schemas import json_text, read
 from shapespace.version import __version__
 
@@ -32,11 +33,21 @@ _FILE = re.compile(r"(table/[\w-]{1,80}\.parquet|surfaces/[\w-]{1,80}\.zarr\.zip
 
 
 class StoredFile(Struct, frozen=True, kw_only=True):
-    """A file of a store: where it is below the folder, its size in bytes and its SHA-256."""
+    """A file of a store.
+
+    Args:
+        file: where it is, below the folder.
+        bytes: its size.
+        sha256: of all of it.
+        end_bytes: of a table, the size of its end, which says where everything else is; 0 for others.
+        end_sha256: and the SHA-256 of that; the rest of a table carries checksums of its own.
+    """
 
     file: str
     bytes: int
     sha256: str
+    end_bytes: int = 0
+    end_sha256: str = ""
 
     def path(self, root: Path) -> Path:
         """Return where it lies, once it is known to be a file of this folder of the size it should have.
@@ -53,6 +64,24 @@ class StoredFile(Struct, frozen=True, kw_only=True):
             raise FileFormatError(f"{path} is no longer there, and with it a part of the results; {AGAIN}.")
         if path.stat().st_size != self.bytes:
             raise FileFormatError(f"{path} is cut short or of another size than it was; {AGAIN}.")
+        return path
+
+    def verify_end(self, root: Path) -> Path:
+        """Return where it lies, once its end is known to be what was written; the rest is not read.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is something else.
+        """
+        path = self.path(root)
+        try:
+            with path.open("rb") as stream:
+                stream.seek(max(self.bytes - max(self.end_bytes, 0), 0))
+                end = stream.read()
+        except OSError as error:
+            raise read_error(path, error) from error
+        if hashlib.sha256(end).hexdigest() != self.end_sha256:
+            raise FileFormatError(f"{path} is damaged: its content is not what was written; {AGAIN}.")
         return path
 
     def verify(self, root: Path) -> Path:

@@ -132,8 +132,8 @@ class Shard:
 
     @contextmanager
     def _table(self) -> Generator[Any]:
-        path = self.entry.table.path(self.root) if self._verified else self.entry.table.verify(self.root)
-        with _damage(path), arrow(".parquet").ParquetFile(path) as table:
+        path = self.entry.table.path(self.root) if self._verified else self.entry.table.verify_end(self.root)
+        with _damage(path), arrow(".parquet").ParquetFile(path, page_checksum_verification=True) as table:
             if not self._verified:
                 self._check(table.metadata, table.schema_arrow, path)
             yield table
