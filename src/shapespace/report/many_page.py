@@ -6,9 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.report import sections, tables
-from shapespace.report.blocks import Block, Cell, Column, Facts, Item, Notice, Table, Text, Tiles, number, status
+from shapespace.report.blocks import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Folded,
+    Item,
+    Notice,
+    Table,
+    Text,
+    Tiles,
+    number,
+    status,
+)
 from shapespace.report.folder_page import FolderPage
 from shapespace.report.page import Chapter, Step
 from shapespace.report.population import FEWEST, MEASURES, Group, Listed, Population
@@ -151,13 +165,13 @@ class ManyPage(FolderPage):
         return self.page.figure(
             figures.distributions_figure(measures, self.population.trusted, title=f"How near {every} come"),
             "Distances over what the scan shows, and the error that a fit expects of itself. The last bar holds all "
-            "that lies beyond: half a percent.",
+            "that lies beyond.",
             alt=f"Histograms of {listed(list(measures))} of {every}",
             chart=True,
         )
 
-    def _trusted_z(self) -> FloatArray:
-        return np.asarray(self.population.z[self.population.trusted], dtype=np.float64)
+    def _trusted_z(self) -> npt.NDArray[np.float32]:
+        return self.population.z[self.population.trusted]
 
     def _coefficients(self) -> Block:
         from shapespace.report import figures
@@ -175,10 +189,9 @@ class ManyPage(FolderPage):
 
         trusted = self.population.trusted
         return self.page.figure(
-            figures.density_figure(
-                self._trusted_z(), self._far[trusted], title="Where the fits lie in the shape space"
-            ),
-            "How many trusted fits lie where, darker for more, by the logarithm. Dashed: three standard deviations. "
+            figures.density_figure(self._trusted_z(), self._far[trusted], title="Where in the shape space"),
+            "How many trusted fits lie where, darker for more, by the logarithm; the farthest are left out. Dashed: "
+            "three standard deviations. "
             "Right: how far each fit is from the mean in all coefficients.",
             alt="Density of z1 against z2 and z3, and a histogram of the root mean square of all coefficients",
             chart=True,
@@ -191,7 +204,7 @@ class ManyPage(FolderPage):
         for k in self.farthest:
             z = self.population.z[k]
             most = int(np.nanargmax(np.abs(z)))
-            levels = [
+            levels: list[Cell] = [
                 Cell(printable(column.levels[column.codes[k]])) if column.codes[k] >= 0 else Cell(DASH)
                 for column in listed_in
             ]
@@ -250,15 +263,16 @@ class ManyPage(FolderPage):
             levels = next((other for other in people.listed if 1 < len(other.levels) <= _MOST_LINES), None)
             lines = [] if levels is None else [(name, inside) for name, inside, _ in levels.groups()]
             drawing = figures.over_time_figure(
-                column.values, dict(list(measures.items())[:2]), ~trusted, is_time=column.kind == "time",
-                name=column.name, title=f"Along {column.name}", lines=lines,
+                column.values, column.edges(), dict(list(measures.items())[:2]), ~trusted,
+                is_time=column.kind == "time", name=column.name, title=f"Along {column.name}", lines=lines,
             )  # fmt: skip
             caption = (
                 f"Medians of the trusted fits, of at least {FEWEST} each, and the share of all that is not trusted."
             )
             caption += f" Thin lines: by {levels.name}." if levels is not None and lines else ""
         picture = self.page.figure(drawing, caption, alt=f"Errors by {column.name}", chart=True)
-        return [picture, self._compared(column)]
+        table = self._compared(column)
+        return [picture, table if column.kind == "level" else Folded(f"By {column.name}, in numbers", [table])]
 
     def _compared(self, column: Listed) -> Table:
         def row(group: Group) -> list[Cell]:
@@ -288,8 +302,8 @@ class ManyPage(FolderPage):
         """Return the table of the fits that are looked at."""
         wanted = listed([f"{most} {STATUS_WORDS[kind]}" for kind, most in WORST.items()])
         told = (
-            f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), and "
-            f"the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and any fit as files."
+            f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
+            f"and the {_FARTHEST} farthest from the mean. shapespace export gives the table of all, and fits as files."
         )
         table = tables.fits_table(self.fits, self.places, caption="Fits to look at: distances and errors in mm")
         return [Text(told), table, *([Text(self.label_note, "soft")] if self.label_note else [])]
@@ -305,7 +319,8 @@ class ManyPage(FolderPage):
         """Return coefficients of other fits, evenly from all."""
         z = self._trusted_z()
         z = z[np.isfinite(z).all(axis=1)]
-        return z[:: max(1, len(z) // _IN_PICTURE)] if z.shape[1] == len(fit.record.z) and len(z) > 2 else None
+        few = z[:: max(1, len(z) // _IN_PICTURE)].astype(np.float64)
+        return few if z.shape[1] == len(fit.record.z) and len(z) > 2 else None
 
     def settings(self) -> list[Block]:
         """Return methods, versions and models, and of how many fits they are."""

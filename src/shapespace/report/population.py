@@ -22,10 +22,10 @@ from shapespace.store.rows import META
 from shapespace.types import FloatArray
 
 MEASURES: Mapping[str, str] = {
-    "expected_error_mm": "vertex error that the fit expects of itself (mm)",
-    "to_scan_mm": "mean distance from model to scan (mm)",
-    "to_model_mm": "mean distance from scan to model (mm)",
-    "seen_percent": "share of the model that the scan shows (%)",
+    "expected_error_mm": "expected vertex error (mm)",
+    "to_scan_mm": "mean, model to scan (mm)",
+    "to_model_mm": "mean, scan to model (mm)",
+    "seen_percent": "model that the scan shows (%)",
 }
 """What is told of each fit, in words."""
 
@@ -68,8 +68,7 @@ class Listed:
             counts = np.bincount(self.codes[self.codes >= 0], minlength=len(self.levels))
             most = sorted(np.argsort(-counts, kind="stable")[:MOST_LEVELS].tolist())
             return [(self.levels[k], self.codes == k, float(k)) for k in most if counts[k]]
-        known = self.values[np.isfinite(self.values)]
-        edges = np.linspace(known.min(), known.max(), min(MOST_BINS, max(2, len(known) // FEWEST)) + 1)
+        edges = self.edges()
         at = np.clip(np.searchsorted(edges, self.values, side="right") - 1, 0, len(edges) - 2)
         at[~np.isfinite(self.values)] = -1
         middles = (edges[1:] + edges[:-1]) / 2
@@ -77,6 +76,16 @@ class Listed:
             (f"{self.told(edges[k])} to {self.told(edges[k + 1])}", at == k, float(middles[k]))
             for k in range(len(middles))
         ]
+
+    def edges(self) -> FloatArray:
+        """Return where stretches of times or numbers begin, and where the last ends; of whole numbers at such."""
+        known = self.values[np.isfinite(self.values)]
+        low, high = float(known.min()), float(known.max())
+        most = min(MOST_BINS, max(2, len(known) // FEWEST))
+        if self.kind == "number" and bool((known == np.round(known)).all()):
+            step = max(1.0, float(np.ceil((high - low + 1) / most)))
+            return np.asarray(np.arange(low, high + step + 1, step), dtype=np.float64)
+        return np.asarray(np.linspace(low, np.nextafter(high, np.inf), most + 1), dtype=np.float64)
 
     def told(self, value: float) -> str:
         """Return a value in words."""
@@ -291,7 +300,7 @@ def _mean(z: npt.NDArray[np.float32]) -> FloatArray:
     known = np.isfinite(z)
     count = known.sum(axis=0)
     total = np.where(known, z, 0).sum(axis=0, dtype=np.float64)
-    return np.divide(total, count, out=np.full(z.shape[1], np.nan), where=count > 0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _number(text: str) -> float:

@@ -51,7 +51,6 @@ class Shard:
         self._verified = False
         self._row_groups: tuple[int, ...] = ()
         self._names_of_columns: frozenset[str] = frozenset()
-        self._records = lru_cache(maxsize=_RECORDS_KEPT)(self._read_records)
 
     @property
     def name(self) -> str:
@@ -93,7 +92,7 @@ class Shard:
         with self._table():
             ends = np.cumsum(self._row_groups)
         group = int(np.searchsorted(ends, row, side="right"))
-        text = self._records(group)[row - int(ends[group - 1] if group else 0)]
+        text = _records(self, group)[row - int(ends[group - 1] if group else 0)]
         if not isinstance(text, str):
             raise FileFormatError(f"{self.name} lacks a record; {AGAIN}.")
         return text
@@ -157,9 +156,16 @@ class Shard:
         self._names_of_columns = frozenset(schema.names)
         self._verified = True
 
-    def _read_records(self, group: int) -> list[Any]:
+    def records(self, group: int) -> list[Any]:
+        """Return the records of a row group."""
         with self._table() as table:
             return table.read_row_group(group, columns=[RECORD]).column(RECORD).to_pylist()
+
+
+@lru_cache(maxsize=_RECORDS_KEPT)
+def _records(shard: Shard, group: int) -> list[Any]:
+    # Of all shards together, since each group holds some MB.
+    return shard.records(group)
 
 
 def is_plain_name(name: object) -> bool:

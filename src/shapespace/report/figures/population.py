@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 
@@ -55,11 +56,12 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         axes.set_axis_off()
     for axes, (name, far) in zip(plots, shown.items(), strict=False):
         known = np.isfinite(far)
-        low, high = float(far[known].min()), float(np.quantile(far[known], 0.995))
+        usual = far[known & trusted] if (known & trusted).any() else far[known]
+        low, high = float(far[known].min()), float(min(1.3 * np.quantile(usual, 0.99), far[known].max()))
         low = 0.0 if low < 0.5 * high else low
-        edges = np.linspace(low, high if high > low else low + 1.0, _BINS + 1)
+        edges = np.linspace(low if high > low else high - 1.0, high, _BINS + 1)
         parts = [np.clip(far[known & which], edges[0], edges[-1]) for which in (trusted, ~trusted)]
-        axes.hist(parts, edges, stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
+        axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
         axes.set_xlabel(_wrapped(name))
         axes.set_ylabel("fits")
         axes.set_xlim(edges[0], edges[-1])
@@ -67,20 +69,21 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         if np.isfinite(middle):
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
             axes.annotate(
-                f"median {middle:.3g}", (middle, 0.97), xycoords=("data", "axes fraction"), xytext=(4, 0),
-                textcoords="offset points", fontsize=SMALL, va="top", color=INK,
+                f"median {middle:.3g}", (middle, 0.97), xycoords=("data", "axes fraction"), 
+                xytext=(4 if middle < (low + high) / 2 else -4, 0), textcoords="offset points", fontsize=SMALL, va="top",
+                ha="left" if middle < (low + high) / 2 else "right", color=INK,
             )  # fmt: skip
     legend(plots[0], loc="center right")
     return finish(figure)
 
 
-def _wrapped(name: str, most: int = 36) -> str:
+def _wrapped(name: str, most: int = 28) -> str:
     import textwrap
 
     return escaped("\n".join(textwrap.wrap(name, most)))
 
 
-def coefficients_spread(z: FloatArray, *, title: str) -> Figure:
+def coefficients_spread(z: npt.NDArray[np.floating[Any]], *, title: str) -> Figure:
     """Draw the percentiles of each coefficient (n, K) over all fits, in standard deviations of the model.
 
     Raises:
@@ -89,24 +92,24 @@ def coefficients_spread(z: FloatArray, *, title: str) -> Figure:
     z = z[np.isfinite(z).all(axis=1)] if z.size else z
     if not z.size:
         raise InputError("There are no coefficients to draw.")
-    figure, axes = chart(title, height=3.0)
-    at = np.arange(1, z.shape[1] + 1)
+    figure, axes = chart(title, height=3.4)
+    at = np.arange(1, z.shape[1] + 1, dtype=np.float64)
     for low, high, strength in _BANDS:
-        ends = np.percentile(z, [low, high], axis=0)
+        ends = np.array([np.percentile(values, [low, high]) for values in z.T]).T
         axes.fill_between(
             at, ends[0], ends[1], step="mid", color=FORWARD, alpha=strength, lw=0, label=f"{low} to {high} %"
         )
-    axes.step(at, np.median(z, axis=0), where="mid", color=INK, lw=1.4, label="median")
+    axes.step(at, np.array([np.median(values) for values in z.T]), where="mid", color=INK, lw=1.4, label="median")
     for value in (-1.645, 1.645):
         axes.axhline(value, color=GREY, lw=1, ls="--", label="5 and 95 % of the model" if value > 0 else None)
     axes.set(xlabel="coefficient", ylabel="z", xlim=(0.5, z.shape[1] + 0.5))
-    legend(axes, loc="upper right", ncols=5)
+    legend(axes, loc="upper right", ncols=3)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.22 * (high - low))
+    axes.set_ylim(low, high + 0.4 * (high - low))
     return finish(figure)
 
 
-def density_figure(z: FloatArray, far: FloatArray, *, title: str) -> Figure:
+def density_figure(z: npt.NDArray[np.floating[Any]], far: FloatArray, *, title: str) -> Figure:
     """Draw how many fits lie where in the first coefficients, and how far all coefficients of a fit are from the mean.
 
     Args:
@@ -129,7 +132,7 @@ def density_figure(z: FloatArray, far: FloatArray, *, title: str) -> Figure:
             axes.set_axis_off()
             continue
         first, second = (z[:, k] for k in pair)
-        reach = [max(3.2, float(np.abs(values).max()) * 1.04) for values in (first, second)]
+        reach = [max(3.2, 1.1 * float(np.quantile(np.abs(values), 0.9995))) for values in (first, second)]
         counts, x, y = np.histogram2d(first, second, 90, [[-reach[0], reach[0]], [-reach[1], reach[1]]])
         shown = np.ma.masked_equal(counts.T, 0)
         axes.pcolormesh(x, y, shown, cmap=colours, norm=LogNorm(1, max(2.0, float(counts.max()))), rasterized=True)
@@ -137,20 +140,21 @@ def density_figure(z: FloatArray, far: FloatArray, *, title: str) -> Figure:
         axes.plot(3 * np.cos(turn), 3 * np.sin(turn), color=GREY, lw=1, ls="--")
         axes.set(xlabel=f"z{pair[0] + 1}", ylabel=f"z{pair[1] + 1}")
     axes = plots[2]
-    axes.hist(far, np.linspace(0, float(far.max()) * 1.02 + 1e-9, _BINS + 1), color=FORWARD)
+    axes.hist(far, np.linspace(0, float(far.max()) * 1.02 + 1e-9, _BINS + 1).tolist(), color=FORWARD)
     axes.set_yscale("log")
-    axes.set(xlabel="RMS of all z of a fit", ylabel="fits")
+    axes.set(xlabel="RMS of all z", ylabel="fits")
     return finish(figure, w_pad=1.0)
 
 
 def over_time_figure(
-    at: FloatArray, measures: Mapping[str, FloatArray], untrusted: Any, *, is_time: bool, name: str, title: str,
-    lines: Sequence[tuple[str, Any]] = (),
+    at: FloatArray, edges: FloatArray, measures: Mapping[str, FloatArray], untrusted: Any, *, is_time: bool, name: str,
+    title: str, lines: Sequence[tuple[str, Any]] = (),
 ) -> Figure:  # fmt: skip
     """Draw medians and the middle 90 % of measures along a time or a number, and the share of fits not trusted.
 
     Args:
         at: (n,) numbers, or seconds since 1970.
+        edges: of the stretches that they are drawn by.
         measures: in words -> (n,).
         untrusted: (n,) whether a fit is not trusted.
         is_time: whether `at` are times.
@@ -165,7 +169,6 @@ def over_time_figure(
     known = np.isfinite(at)
     if not shown or not known.any():
         raise InputError(f"{name}: there is nothing to draw.")
-    edges = np.linspace(at[known].min(), at[known].max() + 1e-9, min(40, max(2, int(known.sum()) // _FEWEST)) + 1)
     places = np.where(known, np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(edges) - 2), -1)
     middles = (edges[1:] + edges[:-1]) / 2
     figure, plots = charts(title, [1.75] * (len(shown) + 1), columns=1)
@@ -214,7 +217,7 @@ def _name_times(axes: Axes, first: float, last: float) -> None:
     named = [datetime.fromtimestamp(tick, UTC).strftime("%Y-%m" if far else "%Y-%m-%d") for tick in ticks]
     axes.set_xticks(ticks, named)
     for label, side in zip(axes.get_xticklabels(), ("left", *["center"] * (_TIMES - 2), "right"), strict=True):
-        label.set_horizontalalignment(side)
+        label.set_horizontalalignment(cast(Any, side))
 
 
 def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, words: str, title: str) -> Figure:
