@@ -66,7 +66,7 @@ def write_fit(folder: Path, name: str, k: int, *, dense: bool = False, stages: b
     folder.mkdir(parents=True, exist_ok=True)
     told = record(name, k, **more)
     if told["status"] != "failed":
-        shape = model().reconstruct(np.array(told["b"])) + [5000.0, -300.0, 1e5]
+        shape = model().reconstruct(np.array(told["b"])) + np.array([5000.0, -300.0, 1e5])
         for kind, shift in (("fitted", 0.0), ("dense", 0.25)):
             if kind == "fitted" or dense:
                 write_mesh(folder / f"{name}.{kind}.ply", model().mesh().with_vertices(shape + shift))

@@ -102,6 +102,8 @@ class Store:
             FileError: something cannot be removed.
             FileFormatError: the manifest is damaged.
         """
+        for path in self.folder.glob(f".{Path(Manifest.FILE).stem}.*{Path(Manifest.FILE).suffix}"):
+            remove_file(path)
         manifest = read_manifest(self.folder)
         if manifest is None:
             return []
@@ -168,8 +170,9 @@ class Store:
             # Fits without a surface go with those that have one.
             if len(groups) > 1 and (bare := groups.pop("", None)):
                 next(iter(groups.values())).extend(bare)
+            place = {name: k for k, name in enumerate(wanted)}
             for group in groups.values():
-                self._move(group)
+                self._move(sorted(group, key=lambda result: place[result.name]))
                 out.moved.extend(result.name for result in group)
         return out
 

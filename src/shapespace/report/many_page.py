@@ -191,8 +191,7 @@ class ManyPage(FolderPage):
         return self.page.figure(
             figures.density_figure(self._trusted_z(), self._far[trusted], title="Where in the shape space"),
             "How many trusted fits lie where, darker for more, by the logarithm; the farthest are left out. Dashed: "
-            "three standard deviations. "
-            "Right: how far each fit is from the mean in all coefficients.",
+            "three standard deviations. Right: how far each fit is from the mean in all coefficients.",
             alt="Density of z1 against z2 and z3, and a histogram of the root mean square of all coefficients",
             chart=True,
         )

@@ -88,7 +88,8 @@ class Store:
                 try:
                     columns = shard.columns(("scan", "id", "status", ROW, *FLAGS))
                 except ShapespaceError as error:
-                    self.problems.append(str(error))
+                    if str(error) not in self.problems:
+                        self.problems.append(str(error))
                     continue
                 for row, (name, identity, status, at, *flags) in enumerate(zip(*columns.values(), strict=True)):
                     found.pop(name, None)
@@ -184,7 +185,7 @@ class Results:
     @property
     def problems(self) -> list[str]:
         """One sentence for each shard, and each single record, that could not be read so far."""
-        return [*(self.store.problems if self.store else ()), *self._problems]
+        return list(dict.fromkeys([*(self.store.problems if self.store else ()), *self._problems]))
 
     @property
     def _stored(self) -> Mapping[str, Stored]:
@@ -228,9 +229,9 @@ class Results:
             FileFormatError: it is damaged.
             InputError: there is no such fit.
         """
-        where = str(self.folder / f"{name}{ENDING}")
+        where, content = str(self.folder / f"{name}{ENDING}"), self.record_bytes(name)
         try:
-            record: object = json.loads(self.record_bytes(name))
+            record: object = json.loads(content)
         except (ValueError, RecursionError) as error:
             raise FileFormatError(f"{where} is not JSON, or it is cut short; fit the scan again.") from error
         FitRecord.from_json(record, where)
@@ -308,8 +309,7 @@ class Results:
             try:
                 found |= shard.column_names()
             except ShapespaceError as error:
-                if str(error) not in self.problems:
-                    self._problems.append(str(error))
+                self._tell(str(error))
         return found.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
 
     def _row(self, name: str) -> dict[str, Any] | None:
@@ -320,9 +320,12 @@ class Results:
             told = str(error)
         except (KeyError, TypeError, AttributeError, ValueError):
             told = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
-        if told not in self._problems:
-            self._problems.append(told)
+        self._tell(told)
         return None
+
+    def _tell(self, problem: str) -> None:
+        if problem not in self.problems:
+            self._problems.append(problem)
 
     def known(self, name: str) -> None:
         """Check that there is a fit of that name.

@@ -69,9 +69,9 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         if np.isfinite(middle):
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
             axes.annotate(
-                f"median {middle:.3g}", (middle, 0.97), xycoords=("data", "axes fraction"), 
-                xytext=(4 if middle < (low + high) / 2 else -4, 0), textcoords="offset points", fontsize=SMALL, va="top",
-                ha="left" if middle < (low + high) / 2 else "right", color=INK,
+                f"median {middle:.3g}", (middle, 0.97), xycoords=("data", "axes fraction"),
+                xytext=(4 if middle < (low + high) / 2 else -4, 0), textcoords="offset points", fontsize=SMALL,
+                va="top", ha="left" if middle < (low + high) / 2 else "right", color=INK,
             )  # fmt: skip
     legend(plots[0], loc="center right")
     return finish(figure)
