@@ -58,6 +58,7 @@ def record(name: str, k: int, *, status: str = "converged", **more: Any) -> dict
         "distances_mm": {"final": distances(0.5)},
         "iterations": {"phase_1": 3, "phase_2": 5},
         "seconds": {"phase_1": 0.5, "phase_2": 1.0},
+        **more,
     }
 
 

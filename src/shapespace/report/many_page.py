@@ -77,7 +77,7 @@ class ManyPage(FolderPage):
         self.farthest = [int(k) for k in farthest if isfinite(self._far[k])]
         names = [name for kind, most in WORST.items() for name in self.population.worst(kind, most)]
         names += [self.population.names[k] for k in self.farthest]
-        fits = [saved_fit(folder, results, name) for name in dict.fromkeys(names)]
+        fits = [saved_fit(folder, results, name) for name in sorted(set(names))]
         super().__init__(folder, fits, model=model, labels=labels, on_step=on_step)
 
     def html(self) -> str:

@@ -5,6 +5,7 @@ Of each fit some forty bytes and its coefficients are kept (float32), no record 
 
 from __future__ import annotations
 
+import heapq
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -266,7 +267,7 @@ class Population:
             if np.isfinite(values).mean() > 0.95 and len(np.unique(values)) > _FEWEST_NUMBERS:
                 own = np.where(codes >= 0, values[codes], np.nan)
                 return Listed(name, "number" if kind == "number" else "time", own, codes)
-        if not 1 < len(texts) <= _MOST_VALUES:
+        if not 1 < len(texts) <= min(_MOST_VALUES, len(codes) // 2):
             if len(texts) > 1:
                 self.left_out.append(name)
             return None
@@ -274,6 +275,17 @@ class Population:
         rank = np.argsort(np.array(order))
         own_codes = np.where(codes >= 0, rank[codes], -1).astype(np.int32)
         return Listed(name, "level", np.zeros(0), own_codes, tuple(texts[k] for k in order))
+
+
+def neediest(results: Results, most: int) -> list[str]:
+    """Return the names of the fits that need a look most: by status, then by the error expected or seen."""
+    found: list[tuple[int, float, str]] = []
+    columns = ("scan", "status", "expected_error_mm", "scan_to_model_mean_mm")
+    for rows in results.iter_rows(columns):
+        for name, status, expected, seen in zip(*(rows[column] for column in columns), strict=True):
+            found.append((_code(status), -(seen or 0.0) if expected is None else -expected, name))
+        found = heapq.nsmallest(most, found)
+    return [name for _, _, name in found]
 
 
 _READ = (
