@@ -68,7 +68,13 @@ def test_the_page_tells_of_all_and_shows_some(folder: Path, few: None, sketched:
     at = [page.headings.index(heading) for heading in wanted]
     assert at == sorted(at) and 'class="broken"' not in text
     assert path.stat().st_size < LARGEST_REPORT_BYTES
-    for told in ("site Lima: The expected error is larger", "… has … points; scan it again.", "scan031", "scan077", "Of 160 fits these"):
+    for told in (
+        "site Lima: The expected error is larger",
+        "… has … points; scan it again.",
+        "scan031",
+        "scan077",
+        "Of 160 fits these",
+    ):
         assert told in text
     assert "site Oslo" not in text and "Not told of: person." in text
     # Of the other fits, none is named.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -32,7 +33,7 @@ from shapespace.store.manifest import (
     require_store_extra,
 )
 from shapespace.store.results import ENDING, ENDINGS, Results
-from shapespace.store.rows import FLAGS, META, RECORD, TEXTS, kind_of, store_row
+from shapespace.store.rows import FLAGS, META, RECORD, TEXTS, coefficient_columns, kind_of, store_row
 from shapespace.store.shard import KINDS, ROW, Shard, is_plain_name
 from shapespace.types import Mesh
 
@@ -216,7 +217,7 @@ class Store:
         at = {name: k for k, name in enumerate(result.name for result in group if "fitted" in result.kinds)}
         rows = [result.row | {ROW: at.get(result.name, -1), RECORD: result.text} for result in group]
         new = ShardEntry(
-            table=self._write_table(called, rows),
+            table=self._write_table(called, rows, self._columns_of(manifest)),
             surfaces=surfaces,
             stages=self._write_stages(called, [result.name for result in group if "stages" in result.kinds]),
             **_told(rows),
@@ -247,12 +248,21 @@ class Store:
             return None
         mark = hashlib.sha256("\n".join(row["scan"] for row in rows).encode()).hexdigest()[:12]
         called = f"{Path(entry.table.file).name[:5]}-{mark}"
-        return replaced(entry, table=self._write_table(called, rows), **_told(rows))
+        return replaced(entry, table=self._write_table(called, rows, columns), **_told(rows))
 
-    def _write_table(self, called: str, rows: Sequence[Mapping[str, Any]]) -> StoredFile:
+    def _columns_of(self, manifest: Manifest) -> Iterable[str]:
+        """Return the columns of the last shard that can be read: who reads all tables needs the same in each."""
+        for entry in reversed(manifest.shards):
+            with contextlib.suppress(ShapespaceError):
+                return Shard(self.folder, entry).column_names()
+        return ()
+
+    def _write_table(self, called: str, rows: Sequence[Mapping[str, Any]], also: Iterable[str]) -> StoredFile:
         pa = arrow()
         kinds: dict[str, Any] = {"text": pa.string(), "count": pa.int64(), "flag": pa.bool_(), "number": pa.float64()}
-        columns = _ordered({column for row in rows for column in row})
+        modes = max(row.get("modes") or 0 for row in rows)
+        every = {column for row in rows for column in row}
+        columns = _ordered(every.union(also, coefficient_columns(modes), TEXTS))
         types: dict[str, Any] = {column: kinds["count" if column == ROW else kind_of(column)] for column in columns}
         table: Any = pa.table({
             column: pa.array([row.get(column) for row in rows], type=kind) for column, kind in types.items()
@@ -320,8 +330,8 @@ class Store:
             size, digest = temporary.stat().st_size, sha256_of_file(temporary)
             end = _end_of_table(temporary) if part == TABLE else b""
         _to_disk(path.parent)
-        ended = {"end_bytes": len(end), "end_sha256": hashlib.sha256(end).hexdigest()} if end else {}
-        return StoredFile(file=f"{part}/{path.name}", bytes=size, sha256=digest, **ended)
+        ended = hashlib.sha256(end).hexdigest() if end else ""
+        return StoredFile(file=f"{part}/{path.name}", bytes=size, sha256=digest, end_bytes=len(end), end_sha256=ended)
 
 
 def _names_in(table: Path) -> set[str]:

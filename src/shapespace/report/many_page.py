@@ -204,7 +204,7 @@ class ManyPage(FolderPage):
             z = self.population.z[k]
             most = int(np.nanargmax(np.abs(z)))
             levels: list[Cell] = [
-                Cell(printable(column.levels[column.codes[k]])) if column.codes[k] >= 0 else Cell(DASH)
+                Cell(printable(column.levels[int(column.codes[k])])) if column.codes[k] >= 0 else Cell(DASH)
                 for column in listed_in
             ]
             name = self.population.names[k]
