@@ -275,6 +275,18 @@ def test_a_damaged_shard_is_named_and_the_others_are_read(store: Path) -> None:
         results.record("scan000")
 
 
+def test_a_shard_that_comes_back_after_its_scans_were_fitted_again_counts_nothing_twice(store: Path) -> None:
+    path = store / read_manifest(store).shards[0].table.file  # type: ignore[union-attr]
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100])
+    write_fit(store, "scan000", 77)
+    assert Store(store).compact().moved == ["scan000"]
+    path.write_bytes(whole)
+    results = Results(store)
+    assert len(results) == 12 == results.counts().total()
+    assert results.record("scan000")["id"] == f"{78:064x}"
+
+
 def test_a_flipped_bit_is_found_or_changes_nothing(template: Path, singles: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     entry = read_manifest(template).shards[0]  # type: ignore[union-attr]

@@ -8,7 +8,7 @@ import json
 import os
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -154,7 +154,8 @@ class Store:
         if read_manifest(self.folder) is None:
             # First of all, so that shards without a manifest are always those of a lost one.
             self._write_manifest(Manifest())
-        singles = Results(self.folder).singles
+        results = Results(self.folder)
+        singles, stored = results.files, self.identities().keys() if results.files else ()
         wanted = list(singles) if names is None else [name for name in dict.fromkeys(names) if name in singles]
         out = Compacted()
         for first in range(0, len(wanted), rows):
@@ -173,7 +174,7 @@ class Store:
                 next(iter(groups.values())).extend(bare)
             place = {name: k for k, name in enumerate(wanted)}
             for group in groups.values():
-                self._move(sorted(group, key=lambda result: place[result.name]))
+                self._move(sorted(group, key=lambda result: place[result.name]), stored)
                 out.moved.extend(result.name for result in group)
         return out
 
@@ -209,7 +210,7 @@ class Store:
     def _surface(self, name: str, kind: str) -> Mesh:
         return reading.read_mesh(self.folder / f"{name}{ENDINGS[kind]}")
 
-    def _move(self, group: Sequence[_Result]) -> None:
+    def _move(self, group: Sequence[_Result], stored: Container[str]) -> None:
         manifest = read_manifest(self.folder) or Manifest()
         mark = hashlib.sha256("\n".join(result.text for result in group).encode()).hexdigest()[:12]
         called = f"{len(manifest.shards):05d}-{mark}"
@@ -222,7 +223,8 @@ class Store:
             stages=self._write_stages(called, [result.name for result in group if "stages" in result.kinds]),
             **_told(rows),
         )
-        kept = [self._without(shard, {result.name for result in group}) for shard in manifest.shards]
+        older = {result.name for result in group if result.name in stored}
+        kept = [self._without(shard, older) if older else shard for shard in manifest.shards]
         shards = (*(shard for shard in kept if shard is not None), new)
         self._write_manifest(Manifest(shards=shards))
         for result in group:

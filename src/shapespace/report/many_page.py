@@ -27,7 +27,17 @@ from shapespace.report.folder_page import FolderPage
 from shapespace.report.page import Chapter, Step
 from shapespace.report.population import FEWEST, MEASURES, Group, Listed, Population
 from shapespace.report.saved import Folder, SavedFit, saved_fit
-from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, percent, printable
+from shapespace.report.wording import (
+    DASH,
+    STATUS_WORDS,
+    counted,
+    isfinite,
+    listed,
+    mm,
+    percent,
+    printable,
+    without_folders,
+)
 from shapespace.store.results import Results
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -109,7 +119,9 @@ class ManyPage(FolderPage):
         return [
             Tiles(tiles),
             *self.other_models(),
-            Notice("Cannot be read", [printable(told) for told in self.problems[:_MOST_NOTED]], "broken"),
+            Notice(
+                "Cannot be read", [without_folders(printable(told)) for told in self.problems[:_MOST_NOTED]], "broken"
+            ),
             *([] if len(self.population.models) < 2 else [Text(self._of_models())]),
             *self.page.tried(self.stands_out),
             *self.page.tried(self.reasons),
