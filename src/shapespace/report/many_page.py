@@ -191,7 +191,7 @@ class ManyPage(FolderPage):
         return self.page.figure(
             figures.coefficients_spread(self._trusted_z(), title="How widely each coefficient spreads"),
             "Percentiles of each coefficient over the trusted fits, in standard deviations of the model. Where the "
-            "scans vary as the training shapes did, the middle band ends at the dashed lines.",
+            "scans vary as the training shapes did, the band of 5 to 95 % ends at the dashed lines.",
             alt="Bands of the percentiles of each coefficient",
             chart=True,
         )

@@ -184,7 +184,7 @@ def over_time_figure(
             legend(axes, loc="upper left", ncols=4)
             low, high = axes.get_ylim()
             axes.set_ylim(low, high + 0.3 * (high - low))
-        axes.set_ylabel(_wrapped(words, 22))
+        axes.set_ylabel(_wrapped(words, 16))
     axes = plots[len(shown)]
     share = [100 * float(untrusted[places == k].mean()) if (places == k).any() else np.nan for k in range(len(middles))]
     axes.bar(middles, share, width=0.9 * (edges[1] - edges[0]), color=BACKWARD)
