@@ -156,7 +156,9 @@ def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
     from shapespace.report import figures
 
     for name in figures.__all__:
-        if name.endswith(("_figure", "_grid", "_maps", "_matrix", "_3d", "_curves", "_histograms")) or name in (
+        if name.endswith(
+            ("_figure", "_grid", "_maps", "_matrix", "_3d", "_curves", "_histograms", "_spread")
+        ) or name in (
             "b_plane",
             "b_space",
             "gallery",

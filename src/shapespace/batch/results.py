@@ -17,34 +17,17 @@ from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.surface import rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
-from shapespace.io.json_files import read_json
 from shapespace.io.ply import ply_comment, write_ply
-from shapespace.io.tables import CHECKSUM, checked_table_text
+from shapespace.io.tables import checked_table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
+from shapespace.store.results import json_at
+from shapespace.store.rows import META, coefficient_columns, safe_cells
+from shapespace.store.rows import coefficient_row as coefficient_row
 from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
-META = "meta_"
-"""Begins the names of columns that the list of scans had."""
 _LARGEST_RECORD = 2**24
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
-_DIRECTIONS = ("model_to_scan", "scan_to_model")
-_DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
-_SHARES = ("model_seen_share", "scan_covered_share")
-_EXPECTED = ("expected_error_mm", "beyond_model_mm")
-_AXES = "xyz"
-_TOLD_OF_FITS = (
-    *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
-    *_SHARES,
-    *(f"shown_{direction}_mean_scan_mm" for direction in _DIRECTIONS),
-    "path",
-    *_EXPECTED,
-    "size_mm",
-    *(f"rotation_{axis}_deg" for axis in _AXES),
-    *(f"translation_{axis}" for axis in _AXES),
-)
-"""Columns that stand before the last, `model_hash`, so that those that were there earlier keep their order."""
 
 
 @dataclass(frozen=True)
@@ -218,13 +201,13 @@ def record_text(record: Mapping[str, Any], where: str) -> str:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the record in a NAME.fit.json.
+    """Return the record in a NAME.fit.json, or the one of a store that such a file would hold.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is not the record of a fit.
     """
-    record = read_json(path, FIT_AGAIN, _LARGEST_RECORD)
+    record = json_at(path, FIT_AGAIN, _LARGEST_RECORD)
     if not isinstance(record, dict) or cast(dict[str, Any], record).get("format") != RECORD_FORMAT:
         raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
     FitRecord.from_json(cast(object, record), str(path))
@@ -254,73 +237,12 @@ def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers."""
-    row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
-    row |= {"model_hash": record["model"]["hash"], "path": record["scan"].get("path", "")}
-    row |= {f"{META}{column}": value for column, value in record.get("metadata", {}).items()}
-    if "b" not in record:
-        return row
-    for letter in ("b", "z"):
-        row |= {f"{letter}{k}": value for k, value in enumerate(record[letter], 1)}
-    final = record["distances_mm"]["final"]
-    for direction in _DIRECTIONS:
-        row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
-    row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
-    row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
-    row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
-    return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
-
-
-def _distance_column(direction: str, measure: str) -> str:
-    return f"{direction}_{measure}" + ("" if measure == "count" else "_mm")
-
-
-def _shown_cells(record: Mapping[str, Any]) -> dict[str, Any]:
-    if "shown" not in record:  # of a fit by an earlier version
-        return {}
-    shown, in_scan = record["shown"], record["shown_scan_mm"]
-    cells = {key: shown[key] for key in _SHARES}
-    for direction in _DIRECTIONS:
-        cells |= {f"shown_{direction}_{measure}_mm": shown[direction][measure] for measure in ("mean", "median")}
-        cells[f"shown_{direction}_mean_scan_mm"] = in_scan[direction]["mean"]
-    return cells
-
-
-def _pose_cells(pose: Mapping[str, Any]) -> dict[str, float]:
-    """Return scale, rotation vector (its direction the axis, its length the angle in degrees) and translation."""
-    from scipy.spatial.transform import Rotation  # a tenth of a second that only those who fit should wait
-
-    turn = Rotation.from_matrix(np.asarray(pose["rotation"], dtype=np.float64)).as_rotvec(degrees=True)
-    cells = {"scale": float(pose["scale"])}
-    cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
-    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose["translation"], strict=True)}
-
-
 def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: int) -> None:
     """Write the coefficient table, one row a scan, in the order given.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
-    modes = range(1, n_modes + 1)
-    # The two means come first: older readers look for them there.
-    lead = [_distance_column(direction, "mean") for direction in _DIRECTIONS]
-    every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
-    columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
-    columns += [column for column in every if column not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS]
-    columns += dict.fromkeys(column for row in rows for column in row if column.startswith(META))
-    columns += [CHECKSUM, "model_hash"]
-    cells = ([row.get(column) for column in columns] for row in map(_safe_cells, rows))
-    write_text(path, checked_table_text(columns, cells))
-
-
-def _safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
-    # A spreadsheet would run a cell that starts like a formula; only names and reasons are text.
-    return {
-        key: ("'" if value[:1] in _FORMULA else "") + value.encode("utf-8", "backslashreplace").decode("utf-8")
-        if isinstance(value, str) and value
-        else value
-        for key, value in row.items()
-    }
+    known = list(dict.fromkeys(column for row in rows for column in row if column.startswith(META)))
+    columns = coefficient_columns(n_modes, known)
+    write_text(path, checked_table_text(columns, ([row.get(c) for c in columns] for row in map(safe_cells, rows))))

@@ -32,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    _add_export(commands)
     return top
 
 
@@ -210,9 +211,11 @@ def _add_quality(commands: Any) -> None:
 
 
 def _add_info(commands: Any) -> None:
-    sub = _add(commands, "info", "facts of a model, a mesh, a fit or a folder in correspondence",
+    sub = _add(commands, "info", "facts of a model, a mesh, a fit, a store or a folder in correspondence",
                "shapespace info model.h5")  # fmt: skip
-    sub.add_argument("file", type=Path, metavar="FILE|DIR", help="a model, a mesh, a record, or what correspond wrote")
+    sub.add_argument(
+        "file", type=Path, metavar="FILE|DIR", help="a model, a mesh, a record, a store, or what correspond wrote"
+    )
     sub.set_defaults(run=run.info)
 
 
@@ -277,6 +280,19 @@ def _add_report(commands: Any) -> None:
                      help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.report)
+
+
+def _add_export(commands: Any) -> None:
+    sub = _add(commands, "export", "fits of a store as single files again, or all of them as one table",
+               "shapespace export out anna ben -o single\n"
+               "         shapespace export out --table fits.csv")  # fmt: skip
+    sub.add_argument("store", type=Path, metavar="STORE", help="a folder that shapespace fit wrote")
+    sub.add_argument("names", nargs="*", metavar="NAME", help="of the fits")
+    sub.add_argument("-o", "--output", type=Path, default=Path("exported"), metavar="DIR",
+                     help="where to write (default exported)")  # fmt: skip
+    sub.add_argument("--all", action="store_true", help="all fits")
+    sub.add_argument("--table", type=Path, metavar="FILE.csv", help="the coefficients of all fits, as CSV")
+    sub.set_defaults(run=run.export)
 
 
 def _add_recognise(commands: Any) -> None:

@@ -417,7 +417,9 @@ def recognise_predict(arguments: argparse.Namespace) -> int:
     """Answer for fitted scans."""
     from shapespace.commands.recognise import recognise_predict
 
-    rows, counts = recognise_predict(arguments.classifier, arguments.results, arguments.output, labels=arguments.labels)
+    rows, counts = recognise_predict(
+        arguments.classifier, arguments.results, arguments.output, labels=arguments.labels, say=warn
+    )
     if arguments.json:
         show_json({"file": str(arguments.output), **counts, "answers": rows})
     else:
@@ -491,6 +493,30 @@ def view(arguments: argparse.Namespace) -> int:
         say=now,
     )
     return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """Write fits of a store as single files, or all of them as a table."""
+    from shapespace.commands.export import export
+
+    written, failed = export(
+        arguments.store,
+        arguments.names,
+        arguments.output,
+        every=arguments.all,
+        table=arguments.table,
+        quiet=arguments.quiet,
+        say=warn,
+    )
+    if arguments.json:
+        table = None if arguments.table is None else str(arguments.table)
+        show_json({"folder": str(arguments.output), "written": len(written), "failed": failed, "table": table})
+    else:
+        if written:
+            show(f"{len(written)} {'fit' if len(written) == 1 else 'fits'} in {arguments.output}")
+        if arguments.table is not None:
+            show(f"The table is {arguments.table}")
+    return 0 if not failed else 1 if written else 2
 
 
 def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, int], folder: Path) -> None:

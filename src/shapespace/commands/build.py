@@ -20,11 +20,11 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
-from shapespace.io.meshes import read_mesh
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.scans import NEUTRAL
+from shapespace.store.results import is_result, mesh_at
 from shapespace.types import MM_PER_UNIT, Mesh, common_faces
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def _trusted(
     records: dict[Path, Mapping[str, Any]] = {}
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
-        if name is not None and (beside := file.with_name(f"{name}{RECORD}")).is_file():
+        if name is not None and is_result(beside := file.with_name(f"{name}{RECORD}")):
             records[file] = read_record(beside)
     doubtful = [file for file in files if file in records and records[file].get("status") == "doubtful"]
     if not doubtful:
@@ -202,7 +202,7 @@ def _odd_size(model: ShapeModel, unit: str) -> list[str]:
 
 def _training_mesh(path: Path) -> Mesh:
     try:
-        mesh = read_mesh(path)
+        mesh = mesh_at(path)
     except MeshError as error:
         raise MeshError(naming(path, str(error))) from error
     if not len(mesh.vertices):

@@ -10,6 +10,7 @@ from shapespace.errors import InputError
 from shapespace.io.folders import mesh_files
 from shapespace.io.json_files import read_json
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
+from shapespace.store.results import results_at, surfaces_of
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
@@ -66,7 +67,9 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     notes: list[str] = []
     for path in paths:
         summary = _summary_of(path)
-        if summary is None:
+        if summary is None and (kept := _kept_surfaces(path, notes)):
+            files += kept
+        elif summary is None:
             found = mesh_files([path], recursive=recursive)
             files += found.files
             notes += found.left_out
@@ -109,6 +112,20 @@ def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:
         raise InputError(
             f"{folder}: {', '.join(gone[:_NAMED]) or 'every surface'} is no longer in it; {CORRESPOND_AGAIN}."
         )
+    return files
+
+
+def _kept_surfaces(path: Path, notes: list[str]) -> list[Path]:
+    """Return the surfaces of the fits in a folder with a store, as files for `mesh_at`; none of other folders."""
+    results = results_at(path) if path.is_dir() else None
+    if results is None:
+        return []
+    files = surfaces_of(results)
+    if not files:
+        raise InputError(f"{path} holds no surfaces of fits; fit some scans first.")
+    if len(files) < len(results):
+        notes.append(f"{path}: of {len(results)} fits the {len(files)} surfaces that end as {files[0].name} are taken.")
+    notes += results.problems
     return files
 
 

@@ -19,6 +19,7 @@ from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
+from shapespace.store.results import Results, mesh_at, modes_of, results_at
 
 
 def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
@@ -52,11 +53,13 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
 
 
 def info(path: Path) -> dict[str, Any]:
-    """Return the facts of a model, a mesh, the record of a fit, or a folder in correspondence.
+    """Return the facts of a model, a mesh, the record of a fit, a folder with a store, or one in correspondence.
 
     Raises:
         FileError: it cannot be read, or is none of these.
     """
+    if path.is_dir() and (results := results_at(path)) is not None:
+        return {"kind": "store", **store_facts(results)}
     if path.is_dir() or path.name == CorrespondenceRecord.FILE:
         return {"kind": "correspondence", **correspondence_facts(path if path.is_dir() else path.parent)}
     if path.name.endswith(CorrespondRecord.ENDING):
@@ -67,8 +70,36 @@ def info(path: Path) -> dict[str, Any]:
         return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
     if path.suffix.lower() in (".h5", ".hdf5"):
         return {"kind": "model", **model_facts(ShapeModel.load(path))}
-    mesh = read_mesh(path)
+    mesh = mesh_at(path)
     return {"kind": "mesh", "file": str(path), **asdict(examine(mesh))}
+
+
+def store_facts(results: Results) -> dict[str, Any]:
+    """Return the facts of a folder with a store; every file of it is read and compared with its hash.
+
+    Raises:
+        FileError: the folder cannot be read.
+    """
+    store = results.store
+    assert store is not None
+    damaged: list[str] = []
+    for file in (file for shard in store.manifest.shards for file in shard.files):
+        try:
+            file.verify(store.folder)
+        except ShapespaceError as error:
+            damaged.append(str(error))
+    counts = results.counts()
+    return {
+        "folder": str(results.folder),
+        "fits": sum(counts.values()),
+        **dict(sorted(counts.items())),
+        "modes": modes_of(results),
+        "shards": len(store.shards),
+        "single_files": len(results.singles),
+        "bytes": sum(file.bytes for shard in store.manifest.shards for file in shard.files),
+        "damaged": list(dict.fromkeys([*damaged, *results.problems])),
+        "version": store.manifest.version,
+    }
 
 
 def correspondence_facts(folder: Path) -> dict[str, Any]:

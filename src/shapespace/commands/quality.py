@@ -21,6 +21,7 @@ from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measu
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
+from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
 _MODELS = (".h5", ".hdf5")
@@ -169,7 +170,7 @@ def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tup
     with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
         for file in files:
             try:
-                mesh = read_mesh(file)
+                mesh = mesh_at(file)
             except MeshError as error:
                 raise MeshError(naming(file, str(error))) from error
             if not len(mesh.vertices):

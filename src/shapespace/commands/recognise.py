@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,12 +17,22 @@ from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
 from shapespace.io.labels import read_labels
 from shapespace.io.meshes import write_mesh
-from shapespace.recognise.scans import ScanCoefficients, from_record, labelled, one_model, read_coefficients
+from shapespace.recognise.scans import (
+    ScanCoefficients,
+    from_record,
+    from_results,
+    labelled,
+    one_model,
+    read_coefficients,
+)
+from shapespace.store.results import results_at
 from shapespace.types import FloatArray
 
 
-def read_scans(path: Path) -> list[ScanCoefficients]:
+def read_scans(path: Path, say: Callable[[str], None] = lambda _: None) -> list[ScanCoefficients]:
     """Return the fits in a folder that `fit` wrote, or in a coefficients.csv, in the order of their names or rows.
+
+    `say` is told of shards of a store that cannot be read; the fits in them are left out.
 
     Raises:
         FileError: it cannot be read.
@@ -30,6 +41,11 @@ def read_scans(path: Path) -> list[ScanCoefficients]:
     """
     if not path.is_dir():
         return read_coefficients(path)
+    if (results := results_at(path)) is not None:
+        scans = from_results(results)
+        for problem in results.problems:
+            say(problem)
+        return scans
     try:
         files = sorted(p for p in path.iterdir() if p.name.endswith(RECORD) and p.is_file())
     except OSError as error:
@@ -65,7 +81,8 @@ def recognise_train(
     from shapespace.model.additive import AdditiveModel
     from shapespace.recognise.predict import train_classifier
 
-    scans = labelled(read_scans(results), read_labels(labels, of_subjects=False))
+    problems: list[str] = []
+    scans = labelled(read_scans(results, problems.append), read_labels(labels, of_subjects=False))
     projection: FloatArray | None = None
     if expression_of is not None:
         model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
@@ -81,16 +98,21 @@ def recognise_train(
     )  # fmt: skip
     make_folder(output.absolute().parent)
     saved.save(output)
-    return saved.facts(), notes
+    return saved.facts(), [*problems, *notes]
 
 
 def recognise_predict(
-    classifier: Path, results: Path, output: Path, *, labels: Path | None
+    classifier: Path,
+    results: Path,
+    output: Path,
+    *,
+    labels: Path | None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[dict[str, Any]], dict[str, int]]:
     """Write the classifier's answer for each fit in `results`; return the rows, and counts of what came out.
 
     The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
-    neutral face is missing) and `neutral` (faces that others are compared with).
+    neutral face is missing) and `neutral` (faces that others are compared with). `say` is told of what cannot be read.
 
     Raises:
         FileError: something cannot be read, or the answers not written.
@@ -107,7 +129,7 @@ def recognise_predict(
             f"{classifier} compares with each subject's neutral face; give --labels with the columns file, label and "
             "subject."
         )
-    scans = read_scans(results)
+    scans = read_scans(results, say)
     answers = predict_scans(saved, labelled(scans, read_labels(labels)) if labels is not None else scans)
     make_folder(output.absolute().parent)
     write_answers(output, answers, saved.classes)

@@ -7,7 +7,7 @@ import hashlib
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from shapespace.io.files import write_text
 
@@ -35,9 +35,19 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a CSV table as text, where the column `CHECKSUM` of `header` is filled in from the others."""
+    text = io.StringIO()
+    write_checked(text, header, rows)
+    return text.getvalue()
+
+
+def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write the same to `stream`, a row at a time."""
     at = header.index(CHECKSUM)
-    cells = (["" if cell is None else str(cell) for cell in row] for row in rows)
-    return table_text(header, ([*row[:at], row_checksum(header, row), *row[at + 1 :]] for row in cells))
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        cells = ["" if cell is None else str(cell) for cell in row]
+        writer.writerow([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
 
 
 def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from shapespace.io.files import read_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.labels import Label
 from shapespace.io.tables import table_rows
+from shapespace.store.results import Results, modes_of
 from shapespace.types import FloatArray, read_only
 
 NEUTRAL = "neutral"
@@ -70,6 +71,31 @@ def from_record(name: str, record: Mapping[str, Any]) -> ScanCoefficients:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.") from error
     return _checked(scan, f"The record of {name}")
+
+
+def from_results(results: Results) -> list[ScanCoefficients]:
+    """Return the fits of a folder with a store, in the order of their names.
+
+    Those in shards that cannot be read are left out, see `Results.problems`.
+
+    Raises:
+        FileFormatError: a fit lacks what recognition needs, or is damaged.
+        InputError: there are none.
+    """
+    texts = ("scan", "status", "reason", "model_hash", "scan_name")
+    columns = [f"z{k}" for k in range(1, modes_of(results) + 1)]
+    found: list[ScanCoefficients] = []
+    for rows in results.iter_rows((*texts, "modes", *columns)):
+        z = np.array([rows[column] for column in columns], dtype=np.float64).reshape(len(columns), -1).T
+        for told, modes, values in zip(
+            zip(*(rows[text] for text in texts), strict=True), rows["modes"], z, strict=True
+        ):
+            name, status, reason, model, file = (text or "" for text in told)
+            own = None if status == "failed" else read_only(values[: modes or 0])
+            found.append(_checked(ScanCoefficients(name, status, reason, own, model, file=file), f"The fit {name}"))
+    if not found:
+        raise InputError(f"{results.folder} holds no results of fits; fit some scans first.")
+    return sorted(found, key=lambda scan: scan.name)
 
 
 def read_coefficients(path: Path) -> list[ScanCoefficients]:

@@ -34,8 +34,9 @@ from shapespace.report.blocks import (
 from shapespace.report.labels import find_labels, labelled
 from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder, SavedFit, model_of, posed, raw_scan, staged_fit
-from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, setting, words
+from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable, setting, words
 from shapespace.schemas import Quality, read
+from shapespace.types import FloatArray
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
@@ -127,6 +128,15 @@ class FolderPage:
         lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
         made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
+
+    @property
+    def places(self) -> Mapping[str, str]:
+        """Where in the page a fit is shown, by its name."""
+        return self._cards | self._details
+
+    def place_of(self, name: str) -> str | None:
+        """Return where in the page a fit is shown, or None."""
+        return (self._details | self._cards).get(printable(name))
 
     def model_part(self) -> list[Block]:
         """Return the model, with what quality.json says of it where there is such a file."""
@@ -336,7 +346,7 @@ class FolderPage:
         """Return the table of all fits."""
         shown = self.fits[:MOST_ROWS]
         caption = "Every fit: distances and errors at the end in mm. A dash: not known."
-        out: list[Block] = [tables.fits_table(shown, self._cards | self._details, caption=caption)]
+        out: list[Block] = [tables.fits_table(shown, self.places, caption=caption)]
         if len(self.fits) > len(shown):
             left = counted(len(self.fits) - len(shown), "other fit")
             out.append(Text(f"{left} are left out here; coefficients.csv has all."))
@@ -381,11 +391,15 @@ class FolderPage:
     def detail(self, fit: SavedFit) -> list[Block]:
         """Return one fit with every picture, as far as the file's size allows."""
         staged = self.staged(fit)
-        same = self.of_one_model(fit.record.model.hash)
-        others = [other.numbers("z") for other in same if other.name != fit.name]
-        population = np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
+        population = self.others(fit)
         reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
         return [*sections.fit_facts(fit), *sections.fit_in_full(self.page, staged, population, reserve=reserve)]
+
+    def others(self, fit: SavedFit) -> FloatArray | None:
+        """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
+        same = self.of_one_model(fit.record.model.hash)
+        others = [other.numbers("z") for other in same if other.name != fit.name]
+        return np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
 
     # The rest
 

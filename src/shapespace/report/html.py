@@ -11,6 +11,7 @@ from shapespace.report.page import LARGEST_REPORT_BYTES, Step
 from shapespace.report.recognition import is_study, study_page
 from shapespace.report.saved import Folder, find_fits
 from shapespace.schemas import CorrespondenceRecord
+from shapespace.store.results import Results
 
 __all__ = ["LARGEST_REPORT_BYTES", "require_report_extra", "write_report"]
 
@@ -39,7 +40,8 @@ def write_report(
     """Write one HTML file on the results saved in `folder`, and return its path.
 
     A folder with a demo.json is reported as the demo, one with a correspondence.json as a correspondence, one with a
-    recognition.json and no fits as a study of recognition, any other as the results of `shapespace fit`. The page needs
+    recognition.json and no fits as a study of recognition, any other as the results of `shapespace fit`; of very many
+    fits those to look at have rows and pictures, and all are in the distributions. The page needs
     no network; without a script it loses what turns and sorts, and can be read.
 
     Args:
@@ -80,7 +82,12 @@ def write_report(
         page = study_page(results, on_step)
     else:
         from shapespace.report.folder_page import FolderPage
+        from shapespace.report.many_page import ManyPage, is_many
 
+        kept = Results(folder)
+        if is_many(kept):
+            write_text(path, ManyPage(results, kept, model=model, labels=labels, on_step=on_step).html())
+            return path
         fits = find_fits(results)
         if all(fit.status == "unreadable" for fit in fits):
             raise InputError(f"{folder}: none of its {len(fits)} records can be read; {fits[0].reason}")

@@ -15,18 +15,16 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
-from shapespace.io.archives import read_arrays
-from shapespace.io.files import read_error, sha256_of_file
-from shapespace.io.json_files import read_json
+from shapespace.io.files import sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.staged import StagedFit
 from shapespace.report.wording import counted, printable
 from shapespace.schemas import FitEntry, FitRecord
+from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "make it again with shapespace fit --stages"
-_RECORD = ".fit.json"
 _FEWEST_POINTS = 20
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
@@ -73,7 +71,7 @@ class Folder:
         """
         path = self.path(name)
         with self._named_shortly():
-            content: object = read_json(path, self.again)
+            content: object = json_at(path, self.again)
             if not isinstance(content, dict):
                 raise FileFormatError(f"{path} does not hold a JSON object; {self.again}.")
         return cast(dict[str, Any], _printable(cast(object, content)))
@@ -86,7 +84,7 @@ class Folder:
             FileFormatError: it is damaged, or declares arrays that it does not hold.
         """
         with self._named_shortly():
-            return read_arrays(self.path(name), self.again)
+            return arrays_at(self.path(name), self.again)
 
     def mesh(self, name: object) -> Mesh:
         """Return the mesh in a file.
@@ -96,7 +94,7 @@ class Folder:
             FileFormatError: it is damaged.
         """
         with self._named_shortly():
-            return read_mesh(self.path(name))
+            return mesh_at(self.path(name))
 
     @contextmanager
     def _named_shortly(self) -> Generator[None]:
@@ -212,7 +210,7 @@ def has_fits(folder: Folder) -> bool:
     Raises:
         FileError: the folder cannot be read.
     """
-    return bool(_records(folder))
+    return bool(len(_results(folder)))
 
 
 def find_fits(folder: Folder) -> list[SavedFit]:
@@ -224,32 +222,22 @@ def find_fits(folder: Folder) -> list[SavedFit]:
         FileError: the folder cannot be read.
         InputError: there is no fit in it.
     """
-    names = _records(folder)
-    if not names:
-        raise InputError(f"{folder.root} holds no fits (NAME{_RECORD}); give a folder that shapespace fit wrote.")
-    return [_found(folder, name) for name in names]
+    results = _results(folder)
+    if not results:
+        raise InputError(f"{folder.root} holds no fits (NAME{ENDING}); give a folder that shapespace fit wrote.")
+    return [saved_fit(folder, results, name) for name in results.names()]
 
 
-def _records(folder: Folder) -> list[str]:
-    try:
-        return sorted(path.name for path in folder.root.iterdir() if path.name.endswith(_RECORD))
-    except OSError as error:
-        raise read_error(folder.root, error) from error
+def _results(folder: Folder) -> Results:
+    return results_at(folder.root) or Results(folder.root)
 
 
-def _found(folder: Folder, file: str) -> SavedFit:
-    name = file.removesuffix(_RECORD)
-
-    def beside(ending: str) -> str | None:
-        return f"{name}.{ending}" if (folder.root / f"{name}.{ending}").is_file() else None
-
-    entry = FitEntry(
-        name=printable(name),
-        json=file,
-        stages=beside("stages.npz"),
-        fitted=beside("fitted.ply"),
-        dense=beside("dense.ply"),
+def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
+    """Return one fit of `results`, which are those of `folder`; `unreadable` where it cannot be read."""
+    fitted, dense, stages = (
+        f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )
+    entry = FitEntry(name=printable(name), json=f"{name}{ENDING}", fitted=fitted, dense=dense, stages=stages)
     try:
         return read_fit(folder, entry)
     except ShapespaceError as error:

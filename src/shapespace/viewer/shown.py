@@ -14,15 +14,20 @@ import numpy as np
 
 from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.saved import Folder, SavedFit, find_fits, model_of, staged_fit
+from shapespace.report.population import neediest
+from shapespace.report.saved import Folder, SavedFit, find_fits, has_fits, model_of, saved_fit, staged_fit
 from shapespace.report.scene import pack_model
 from shapespace.report.wording import without_folders
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
+from shapespace.store.manifest import Manifest
+from shapespace.store.results import results_at
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import packed
 
 MODEL_BYTES = 48 * 2**20
 """Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
+MOST_LISTED = 1000
+"""Fits of a store that the page lists: those that need a look most."""
 _ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
 
@@ -64,10 +69,10 @@ class Shown:
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
                 )
             return Shown(ShapeModel.load(path), path.name)
-        if not any(path.glob("*.fit.json")) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
+        if not has_fits(Folder(path)) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
             raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
         folder = Folder(path)
-        fits = find_fits(folder)
+        fits = listed_fits(folder)
         found = model_of(folder, fits, model)
         name = next(fit.record.model.name for fit in fits if fit.record.model.hash)
         return Shown(found, model.name if model else name, path)
@@ -86,13 +91,16 @@ class Shown:
         if self.folder is None:
             return {}
         try:
-            now = sorted((p.name, p.lstat().st_mtime_ns) for p in self.folder.root.glob("*.fit.json"))
+            now = sorted(
+                (p.name, p.lstat().st_mtime_ns)
+                for p in (*self.folder.root.glob("*.fit.json"), *self.folder.root.glob(Manifest.FILE))
+            )
         except OSError as error:
             raise FileError(
                 f"Cannot read {self.folder.root}: {error.strerror or error}; is the folder still there?"
             ) from error
         if self._read[0] != now:
-            self._read = (now, {fit.name: fit for fit in find_fits(self.folder)} if now else {})
+            self._read = (now, {fit.name: fit for fit in listed_fits(self.folder)} if now else {})
             self._picture.cache_clear()
         return self._read[1]
 
@@ -194,6 +202,19 @@ def _as_damaged(name: str) -> Generator[None]:
         raise
     except Exception as error:
         raise FileFormatError(f"The files of {name} are damaged: they hold what no fit writes; {FIT_AGAIN}.") from error
+
+
+def listed_fits(folder: Folder) -> list[SavedFit]:
+    """Return the fits in `folder`, in the order of their names; of a store with very many those to look at first.
+
+    Raises:
+        FileError: the folder cannot be read.
+        InputError: there is no fit in it.
+    """
+    results = results_at(folder.root)
+    if results is None or len(results) <= MOST_LISTED:
+        return find_fits(folder)
+    return [saved_fit(folder, results, name) for name in sorted(neediest(results, MOST_LISTED))]
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:

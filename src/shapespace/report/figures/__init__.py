@@ -46,6 +46,13 @@ from shapespace.report.figures.model import (
     save_figure,
     spectrum_figure,
 )
+from shapespace.report.figures.population import (
+    coefficients_spread,
+    density_figure,
+    distributions_figure,
+    levels_figure,
+    over_time_figure,
+)
 from shapespace.report.figures.recognition import (
     calibration_figure,
     confusion_figure,
@@ -69,10 +76,13 @@ __all__ = [
     "calibration_figure",
     "checkerboard_figure",
     "coefficients_figure",
+    "coefficients_spread",
     "confusion_figure",
     "curve_figure",
+    "density_figure",
     "distance_histograms",
     "distance_maps",
+    "distributions_figure",
     "encode_webp",
     "error_curves",
     "face_map_figure",
@@ -80,6 +90,7 @@ __all__ = [
     "history_figure",
     "importance_figure",
     "learning_curve_figure",
+    "levels_figure",
     "mean_figure",
     "mesh_rows_figure",
     "missing_figure",
@@ -87,6 +98,7 @@ __all__ = [
     "modes_figure",
     "movement_figure",
     "nearness_figure",
+    "over_time_figure",
     "overlay_figure",
     "portrait_figure",
     "quality_figure",

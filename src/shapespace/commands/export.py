@@ -1,0 +1,107 @@
+"""What `export` does: results of a store back as single files, and all of them as one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from shapespace.batch.progress import progress
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error
+from shapespace.io.meshes import write_mesh
+from shapespace.io.tables import CHECKSUM, write_checked
+from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
+from shapespace.store.rows import META, coefficient_columns, safe_cells
+
+
+def export(
+    folder: Path,
+    names: Sequence[str],
+    output: Path,
+    *,
+    every: bool,
+    table: Path | None,
+    quiet: bool,
+    say: Callable[[str], None],
+) -> tuple[list[str], list[str]]:
+    """Write fits of a folder as the single files that `fit` writes; return the names written, and those that failed.
+
+    Records are the same to the byte, surfaces to a 16-millionth of their half extent (float32).
+
+    Args:
+        folder: that `shapespace fit` wrote, with a store or without.
+        names: of the fits.
+        output: folder to write them to.
+        every: all fits instead.
+        table: a CSV file for the coefficients of all fits; None for none.
+        quiet: no progress.
+        say: told of what cannot be read; the rest is written.
+
+    Raises:
+        FileError: something cannot be written.
+        FileFormatError: the manifest is damaged.
+        InputError: a name that there is not, nothing asked for, or `output` is the folder itself.
+    """
+    results = Results(folder)
+    if not (names or every or table):
+        raise InputError("Give the names of the fits to export, or --all, or --table FILE.csv.")
+    wanted = results.names() if every else list(dict.fromkeys(names))
+    for name in wanted:
+        results.known(name)
+    if wanted and output.resolve() == folder.resolve():
+        raise InputError(f"{output} is the folder of the results itself; give another one.")
+    failed: list[str] = []
+    if wanted:
+        make_folder(output)
+    with progress(len(wanted), "exporting", "fit", quiet=quiet) as bar:
+        for name in wanted:
+            try:
+                _write(results, name, output)
+            except ShapespaceError as error:
+                failed.append(name)
+                say(str(error))
+            bar.update()
+    if table is not None:
+        write_table(results, table)
+    for problem in results.problems:
+        say(problem)
+    return [name for name in wanted if name not in failed], failed
+
+
+def _write(results: Results, name: str, output: Path) -> None:
+    # The record comes last, as in a fit: what lies there with a record is whole.
+    for kind, ending in ENDINGS.items():
+        if not results.has(name, kind):
+            continue
+        path = output / f"{name}{ending}"
+        if kind == "stages":
+            write_bytes(path, results.stages(name))
+        else:
+            write_mesh(path, results.surface(name, kind))
+    write_bytes(output / f"{name}{ENDING}", results.record_bytes(name))
+
+
+def write_table(results: Results, path: Path) -> None:
+    """Write the coefficients of all fits as CSV, with the columns of coefficients.csv, some rows at a time.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    known = [column for column in results.column_names() if column.startswith(META)]
+    columns = coefficient_columns(modes_of(results), known)
+    make_folder(path.absolute().parent)
+    with atomic_path(path) as temporary:
+        try:
+            with temporary.open("w", encoding="utf-8", newline="") as stream:
+                cells = ([row.get(c) for c in columns] for row in map(safe_cells, _rows(results, columns)))
+                write_checked(stream, columns, cells)
+        except OSError as error:
+            raise write_error(path, error) from error
+
+
+def _rows(results: Results, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    asked = [column for column in columns if column != CHECKSUM]
+    for rows in results.iter_rows(asked):
+        for values in zip(*rows.values(), strict=True):
+            yield dict(zip(asked, values, strict=True))

@@ -1,0 +1,196 @@
+"""The manifest of a store: which shards are in it, with the size and hash of each of their files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import msgspec
+from msgspec import Struct
+
+from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.io.files import read_bytes, read_error, sha256_of_file
+from shapespace.schemas import json_text, read
+from shapespace.version import __version__
+
+AGAIN = "copy it again from where it is whole, or take it out of the folder and fit its scans again"
+TABLE, SURFACES, STAGES = "table", "surfaces", "stages"
+"""Folders of a store."""
+PARTS: Mapping[str, str] = {TABLE: ".parquet", SURFACES: ".zarr.zip", STAGES: ".zip"}
+"""Folder -> ending of the files in it."""
+
+LARGEST_MANIFEST = 64 * 2**20
+MOST_ROWS = 100_000
+"""Rows that one shard may have."""
+
+_FILE = re.compile(r"(table/[\w-]{1,80}\.parquet|surfaces/[\w-]{1,80}\.zarr\.zip|stages/[\w-]{1,80}\.zip)", re.ASCII)
+
+
+class StoredFile(Struct, frozen=True, kw_only=True):
+    """A file of a store.
+
+    Args:
+        file: where it is, below the folder.
+        bytes: its size.
+        sha256: of all of it.
+        end_bytes: of a table, the size of its end, which says where everything else is; 0 for others.
+        end_sha256: and the SHA-256 of that; the rest of a table carries checksums of its own.
+    """
+
+    file: str
+    bytes: int
+    sha256: str
+    end_bytes: int = 0
+    end_sha256: str = ""
+
+    def path(self, root: Path) -> Path:
+        """Return where it lies, once it is known to be a file of this folder of the size it should have.
+
+        Raises:
+            FileFormatError: its name leads elsewhere, or it is absent, a link, or of another size.
+        """
+        path = root / self.file
+        if not _FILE.fullmatch(self.file) or path.is_symlink() or path.parent.is_symlink():
+            raise FileFormatError(
+                f"{root / Manifest.FILE} names {self.file[:80]!r}, which is no file of a store; {AGAIN}."
+            )
+        if not path.is_file():
+            raise FileFormatError(f"{path} is no longer there, and with it a part of the results; {AGAIN}.")
+        if path.stat().st_size != self.bytes:
+            raise FileFormatError(f"{path} is cut short or of another size than it was; {AGAIN}.")
+        return path
+
+    def verify_end(self, root: Path) -> Path:
+        """Return where it lies, once its end is known to be what was written; the rest is not read.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is something else.
+        """
+        path = self.path(root)
+        try:
+            with path.open("rb") as stream:
+                stream.seek(max(self.bytes - max(self.end_bytes, 0), 0))
+                end = stream.read()
+        except OSError as error:
+            raise read_error(path, error) from error
+        if hashlib.sha256(end).hexdigest() != self.end_sha256:
+            raise FileFormatError(f"{path} is damaged: its content is not what was written; {AGAIN}.")
+        return path
+
+    def verify(self, root: Path) -> Path:
+        """Return where it lies, once its content is known to be what was written.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is something else.
+        """
+        path = self.path(root)
+        if sha256_of_file(path) != self.sha256:
+            raise FileFormatError(f"{path} is damaged: its content is not what was written; {AGAIN}.")
+        return path
+
+
+class ShardEntry(Struct, frozen=True, kw_only=True):
+    """One shard: a table with a row for each fit, and the surfaces of those that have one.
+
+    Args:
+        table: its Parquet file.
+        surfaces: its Zarr file; None where no fit has a surface.
+        stages: a zip of NAME.stages.npz; None where none were kept.
+        rows: of the table.
+        counts: fits by status.
+        first: the first name in order,
+        last: and the last.
+    """
+
+    table: StoredFile
+    surfaces: StoredFile | None = None
+    stages: StoredFile | None = None
+    rows: int
+    counts: Mapping[str, int] = {}
+    first: str = ""
+    last: str = ""
+
+    @property
+    def files(self) -> list[StoredFile]:
+        """Its files."""
+        return [file for file in (self.table, self.surfaces, self.stages) if file is not None]
+
+
+class Manifest(Struct, frozen=True, kw_only=True):
+    """A manifest.json."""
+
+    FORMAT: ClassVar = "shapespace store"
+    VERSION: ClassVar = 1
+    FILE: ClassVar = "manifest.json"
+
+    format: Literal["shapespace store"] = "shapespace store"
+    format_version: int = 1
+    version: str = __version__
+    shards: tuple[ShardEntry, ...] = ()
+
+    def text(self) -> str:
+        """Return it as the text of its file."""
+        return json_text(self)
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Return the manifest of the store in `folder`, or None where there is none.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is damaged, or of a later version.
+    """
+    path = folder / Manifest.FILE
+    if not path.is_file():
+        if (folder / TABLE).is_dir() and any((folder / TABLE).glob(f"[!.]*{PARTS[TABLE]}")):
+            raise FileFormatError(f"{folder} holds shards without their {Manifest.FILE}; copy that file too.")
+        return None
+    if path.stat().st_size > LARGEST_MANIFEST:
+        raise FileFormatError(f"{path} is larger than a manifest can be; {AGAIN}.")
+    try:
+        content: object = json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        if not (folder / TABLE).is_dir():
+            return None  # of something else
+        raise FileFormatError(f"{path} is not JSON, or it is cut short; copy it again.") from error
+    known: Mapping[str, object] = cast(dict[str, object], content) if isinstance(content, dict) else {}
+    if known.get("format") != Manifest.FORMAT and not (folder / TABLE).is_dir():
+        return None
+    if known.get("format_version") != Manifest.VERSION and known.get("format") == Manifest.FORMAT:
+        raise FileFormatError(f"{path} is of a version of stores that this shapespace does not know; update it.")
+    found = read(Manifest, cast(object, content), str(path), "copy it again")
+    if any(not 0 < shard.rows <= MOST_ROWS for shard in found.shards):
+        raise FileFormatError(f"{path} is damaged: a shard has no rows, or too many; copy it again.")
+    return found
+
+
+def require_store_extra() -> None:
+    """Raise unless the packages that read and write stores are installed.
+
+    Raises:
+        ShapespaceError: they are not; the sentence says how to install them.
+    """
+    missing = [name for name in ("pyarrow", "zarr") if find_spec(name) is None]
+    if missing:
+        raise ShapespaceError(
+            f"These results are in a store, which needs {' and '.join(missing)}; run pip install 'shapespace[store]'."
+        )
+
+
+def arrow(part: str = "") -> Any:
+    """Return pyarrow, or a part of it such as `.parquet`: it has no types."""
+    require_store_extra()
+    return import_module(f"pyarrow{part}")
+
+
+def replaced(entry: ShardEntry, **changes: object) -> ShardEntry:
+    """Return `entry` with other fields."""
+    return msgspec.structs.replace(entry, **changes)

@@ -1,0 +1,476 @@
+"""The results of fits in a folder, be they single files, shards of a store, or both: read one at a time, or as rows."""
+
+from __future__ import annotations
+
+import difflib
+import io
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import msgspec
+import numpy.typing as npt
+
+from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.io.archives import arrays_in, read_arrays
+from shapespace.io.files import read_bytes, read_error
+from shapespace.io.json_files import LARGEST_BYTES, plain_json, read_json
+from shapespace.io.meshes import read_mesh
+from shapespace.schemas import FitRecord
+from shapespace.store.manifest import Manifest, read_manifest
+from shapespace.store.rows import FLAGS, store_row
+from shapespace.store.shard import ROW, Shard
+from shapespace.types import Mesh
+
+ENDING = ".fit.json"
+"""Of the record of a fit, after NAME."""
+
+ENDINGS: Mapping[str, str] = {"fitted": ".fitted.ply", "dense": ".dense.ply", "stages": ".stages.npz"}
+"""What may lie beside it, by what it is."""
+
+BATCH = 1000
+_NEAR = 3
+_OPEN = 4
+
+
+class Stored(NamedTuple):
+    """Where a store keeps a fit, and what it has of it.
+
+    Args:
+        shard: which one, in the order of the manifest.
+        row: of its table.
+        at: where in its arrays; -1 where there is no surface.
+        id: of the fit; empty where the record has none.
+        status: of the fit.
+        fitted: whether its surface is kept,
+        dense: the dense one,
+        stages: and its stages.
+    """
+
+    shard: int
+    row: int
+    at: int
+    id: str
+    status: str
+    fitted: bool
+    dense: bool
+    stages: bool
+
+
+class _Identity(msgspec.Struct, frozen=True):
+    id: str = ""
+
+
+class Store:
+    """The shards of a folder.
+
+    Args:
+        folder: of the store.
+        manifest: what `read_manifest` found there.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self.folder, self.manifest = folder, manifest
+        self.shards = [Shard(folder, entry) for entry in manifest.shards]
+        self.problems: list[str] = []
+        self._index: dict[str, Stored] | None = None
+
+    @property
+    def index(self) -> Mapping[str, Stored]:
+        """Name -> where it is kept, in the order of the shards; those of damaged shards are missing.
+
+        One sentence for each damaged shard goes to `problems`. A name that is in two shards is that of the later one.
+        """
+        if self._index is None:
+            found: dict[str, Stored] = {}
+            for number, shard in enumerate(self.shards):
+                try:
+                    columns = shard.columns(("scan", "id", "status", ROW, *FLAGS))
+                except ShapespaceError as error:
+                    if str(error) not in self.problems:
+                        self.problems.append(str(error))
+                    continue
+                for row, (name, identity, status, at, *flags) in enumerate(zip(*columns.values(), strict=True)):
+                    found.pop(name, None)
+                    found[name] = Stored(number, row, at, identity or "", status, *(flag is True for flag in flags))
+            self._index = found
+        return self._index
+
+    def identities(self) -> dict[str, str]:
+        """Return name -> identity of each fit in a shard that can be read."""
+        return {name: stored.id for name, stored in self.index.items()}
+
+    def record_text(self, name: str) -> str:
+        """Return the record of a fit as its file had it."""
+        stored = self.index[name]
+        return self.shards[stored.shard].record_text(stored.row)
+
+    def surface(self, name: str, kind: str) -> Mesh:
+        """Return a surface of a fit in the frame and unit of its scan."""
+        stored = self.index[name]
+        return self.shards[stored.shard].surface(stored.at, kind, f"{name}{ENDINGS[kind]}")
+
+    def stages(self, name: str) -> bytes:
+        """Return the content of NAME.stages.npz."""
+        return self.shards[self.index[name].shard].stages(name)
+
+    def iter_rows(self, columns: Sequence[str], without: Mapping[str, object]) -> Iterator[dict[str, list[Any]]]:
+        """Yield columns of the rows of each shard, without some names; damaged shards are passed over."""
+        index = self.index
+        for number, shard in enumerate(self.shards):
+            try:
+                found = shard.columns(("scan", *columns))
+            except ShapespaceError as error:
+                if str(error) not in self.problems:
+                    self.problems.append(str(error))
+                continue
+            kept = [
+                row
+                for row, name in enumerate(found["scan"])
+                if name not in without and (where := index.get(name)) and (where.shard, where.row) == (number, row)
+            ]
+            whole = len(kept) == len(found["scan"])
+            yield {column: found[column] if whole else [found[column][row] for row in kept] for column in columns}
+
+
+class Results:
+    """The results of fits in a folder, single files and those of a store alike.
+
+    A fit that is in both is that of the single files, which are newer. Names and flags are those of the moment when
+    this was made.
+
+    Args:
+        folder: that `shapespace fit` wrote.
+        store: its shards where they are open already; None opens them.
+
+    Raises:
+        FileError: the folder cannot be read.
+        FileFormatError: the manifest of its store is damaged.
+        ShapespaceError: there is a store, and the extra `store` is not installed.
+    """
+
+    def __init__(self, folder: Path, store: Store | None = None) -> None:
+        self.folder = Path(folder)
+        manifest = None if store is not None else read_manifest(self.folder)
+        self.store = store if manifest is None else Store(self.folder, manifest)
+        try:
+            there = {entry.name for entry in os.scandir(self.folder)}
+        except OSError as error:
+            raise read_error(self.folder, error) from error
+        self.files: Mapping[str, frozenset[str]] = {
+            name: frozenset(kind for kind, ending in ENDINGS.items() if f"{name}{ending}" in there)
+            for name in sorted(file.removesuffix(ENDING) for file in there if file.endswith(ENDING))
+        }
+        self._problems: list[str] = []
+
+    @cached_property
+    def singles(self) -> Mapping[str, frozenset[str]]:
+        """Name -> which of `ENDINGS` lie beside it, of fits that are single files.
+
+        Those that a killed run had moved to a shard, and not yet removed, are none.
+        """
+        return {
+            name: kinds for name, kinds in self.files.items() if name not in self._stored or not self.is_moved(name)
+        }
+
+    def is_moved(self, name: str) -> bool:
+        """Return whether the record of a single file stands in a shard, to the byte."""
+        try:
+            stored = self.store.record_text(name) if self.store and name in self._stored else None
+            return stored is not None and stored.encode() == read_bytes(self.folder / f"{name}{ENDING}")
+        except (ShapespaceError, UnicodeError):
+            return False
+
+    @property
+    def problems(self) -> list[str]:
+        """One sentence for each shard, and each single record, that could not be read so far."""
+        return list(dict.fromkeys([*(self.store.problems if self.store else ()), *self._problems]))
+
+    @property
+    def _stored(self) -> Mapping[str, Stored]:
+        return self.store.index if self.store else {}
+
+    def names(self) -> list[str]:
+        """Return the names of all fits, in order."""
+        return sorted({*self.singles, *self._stored})
+
+    def __len__(self) -> int:
+        return len(self.singles) + sum(name not in self.singles for name in self._stored)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.singles or name in self._stored
+
+    def has(self, name: str, kind: str) -> bool:
+        """Return whether `kind` of `ENDINGS` is kept of a fit."""
+        if name in self.singles:
+            return kind in self.singles[name]
+        return name in self._stored and bool(getattr(self._stored[name], kind))
+
+    def record_bytes(self, name: str) -> bytes:
+        """Return the record of a fit as its file has it.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: the shard that it is in is damaged.
+            InputError: there is no such fit.
+        """
+        if name in self.singles:
+            return read_bytes(self.folder / f"{name}{ENDING}")
+        self.known(name)
+        assert self.store is not None
+        return self.store.record_text(name).encode("utf-8", "surrogatepass")
+
+    def record(self, name: str) -> dict[str, Any]:
+        """Return the record of a fit, checked.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged.
+            InputError: there is no such fit.
+        """
+        where, content = str(self.folder / f"{name}{ENDING}"), self.record_bytes(name)
+        try:
+            record: object = json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise FileFormatError(f"{where} is not JSON, or it is cut short; fit the scan again.") from error
+        FitRecord.from_json(record, where)
+        return cast(dict[str, Any], record)
+
+    def surface(self, name: str, kind: str = "fitted") -> Mesh:
+        """Return the `fitted` or `dense` surface of a fit, in the frame and unit of its scan.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged, or was not kept.
+            InputError: there is no such fit.
+        """
+        if name in self.singles:
+            return read_mesh(self.folder / f"{name}{ENDINGS[kind]}")
+        self.known(name)
+        assert self.store is not None
+        if not self.has(name, kind):
+            raise FileFormatError(f"{self.folder}: no {kind} surface of {name} was kept; fit the scan again.")
+        return self.store.surface(name, kind)
+
+    def stages(self, name: str) -> bytes:
+        """Return the content of NAME.stages.npz.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged, or was not kept.
+            InputError: there is no such fit.
+        """
+        if name in self.singles:
+            return read_bytes(self.folder / f"{name}{ENDINGS['stages']}")
+        self.known(name)
+        assert self.store is not None
+        if not self.has(name, "stages"):
+            raise FileFormatError(f"{self.folder}: the stages of {name} were not kept; fit it again with --stages.")
+        return self.store.stages(name)
+
+    def identities(self) -> dict[str, str]:
+        """Return name -> identity of each fit; empty for records that have none, or cannot be read."""
+        found = dict(self.store.identities()) if self.store else {}
+        for name in self.singles:
+            try:
+                found[name] = msgspec.json.decode(self.record_bytes(name), type=_Identity).id
+            except (msgspec.DecodeError, ShapespaceError):
+                found[name] = ""
+        return found
+
+    def counts(self) -> Counter[str]:
+        """Return how many fits have which status."""
+        found: Counter[str] = Counter()
+        for rows in self.iter_rows(("status",)):
+            found.update(rows["status"])
+        return found
+
+    def iter_rows(self, columns: Sequence[str], batch: int = BATCH) -> Iterator[dict[str, list[Any]]]:
+        """Yield columns of all fits, some rows at a time: those of each shard in turn, then single ones by their names.
+
+        What cannot be read is left out, and one sentence about it goes to `problems`.
+
+        Args:
+            columns: of the tables of a store, see `store.rows`; what a fit does not tell is None.
+            batch: rows at a time of single files.
+        """
+        if self.store is not None:
+            yield from self.store.iter_rows(columns, self.singles)
+        names = list(self.singles)
+        for first in range(0, len(names), batch):
+            rows = [row for name in names[first : first + batch] if (row := self._row(name)) is not None]
+            yield {column: [row.get(column) for row in rows] for column in columns}
+
+    def column_names(self) -> set[str]:
+        """Return the columns that some shard, or the first single record that can be read, has."""
+        found: set[str] = set()
+        for shard in self.store.shards if self.store else ():
+            try:
+                found |= shard.column_names()
+            except ShapespaceError as error:
+                self._tell(str(error))
+        return found.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
+
+    def _row(self, name: str) -> dict[str, Any] | None:
+        try:
+            record = self.record(name)
+            return store_row(name, record) | {kind: kind in self.singles[name] for kind in FLAGS}
+        except ShapespaceError as error:
+            told = str(error)
+        except (KeyError, TypeError, AttributeError, ValueError):
+            told = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
+        self._tell(told)
+        return None
+
+    def _tell(self, problem: str) -> None:
+        if problem not in self.problems:
+            self._problems.append(problem)
+
+    def known(self, name: str) -> None:
+        """Check that there is a fit of that name.
+
+        Raises:
+            InputError: there is none; the sentence names those that are called nearly so.
+        """
+        if name not in self:
+            near = difflib.get_close_matches(name, [*self.singles, *self._stored], _NEAR, 0.6)
+            hint = f"; there is {', '.join(near)}" if near else ""
+            lost = "; some shards cannot be read" if self.problems else ""
+            raise InputError(f"{self.folder} holds no fit called {name[:80]}{hint}{lost}.")
+
+
+# Files of a store, by the names that they would have as single ones
+
+
+def named(file: str) -> tuple[str, str]:
+    """Return NAME and what it is of the name of a result file: `record`, one of `ENDINGS`, or nothing."""
+    for what, ending in {"record": ENDING, **ENDINGS}.items():
+        if file.endswith(ending) and file != ending:
+            return file.removesuffix(ending), what
+    return file, ""
+
+
+def results_at(folder: Path) -> Results | None:
+    """Return the results in a folder that holds a store, kept open while nothing changes; None of other folders.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: the manifest is damaged.
+    """
+    try:
+        changed = (folder / Manifest.FILE).stat().st_mtime_ns
+        return _results_at(folder.resolve(), folder, changed, folder.stat().st_mtime_ns)
+    except OSError:
+        return None if read_manifest(folder) is None else Results(folder)
+
+
+@lru_cache(maxsize=_OPEN)
+def _results_at(resolved: Path, called: Path, changed: int, _files_changed: int) -> Results | None:
+    # Shards stay open where only single files came.
+    store = _store_at(resolved, called, changed)
+    return None if store is None else Results(called, store)
+
+
+@lru_cache(maxsize=_OPEN)
+def _store_at(_resolved: Path, called: Path, _changed: int) -> Store | None:
+    manifest = read_manifest(called)
+    return None if manifest is None else Store(called, manifest)
+
+
+def kept_at(path: Path) -> bool:
+    """Return whether a store in the folder of `path` keeps what a single file of that name would hold."""
+    name, what = named(path.name)
+    if not what or path.is_file() or (results := results_at(path.parent)) is None:
+        return False
+    return name in results and (what == "record" or results.has(name, what))
+
+
+def is_result(path: Path) -> bool:
+    """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
+    return path.is_file() or kept_at(path)
+
+
+def mesh_at(path: Path) -> Mesh:
+    """Return the mesh in a file, or the surface of a store that such a file would hold.
+
+    Raises:
+        As `read_mesh`, and FileFormatError: the store is damaged.
+    """
+    if kept_at(path):
+        name, kind = named(path.name)
+        results = results_at(path.parent)
+        assert results is not None
+        return results.surface(name, kind)
+    return read_mesh(path)
+
+
+def bytes_at(path: Path) -> bytes:
+    """Return the content of a file, or of a record or stages of a store that such a file would hold.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: the store is damaged.
+    """
+    if kept_at(path):
+        name, what = named(path.name)
+        results = results_at(path.parent)
+        assert results is not None
+        return results.stages(name) if what == "stages" else results.record_bytes(name)
+    return read_bytes(path)
+
+
+def json_at(path: Path, again: str, most_bytes: int = LARGEST_BYTES) -> Any:
+    """Return the value in a JSON file, or in the record of a store that such a file would hold.
+
+    Args:
+        path: of the file.
+        again: what a reader can do about a file that is wrong.
+        most_bytes: that such a file can have.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is too large, or not plain JSON.
+    """
+    if not kept_at(path):
+        return read_json(path, again, most_bytes)
+    content = bytes_at(path)
+    try:
+        if len(content) > most_bytes:
+            raise ValueError("it is larger than such a file can be")
+        return plain_json(content)
+    except ValueError as error:
+        raise FileFormatError(f"{path} is not JSON, or it is cut short ({error}); {again}.") from error
+
+
+def arrays_at(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz file, or of stages of a store that such a file would hold, by name.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is damaged, or holds other things than arrays.
+    """
+    if not kept_at(path):
+        return read_arrays(path, again)
+    content = bytes_at(path)
+    try:
+        return arrays_in(io.BytesIO(content), len(content))
+    except ValueError as error:
+        raise FileFormatError(f"{path} is not an .npz file of arrays ({error}); {again}.") from error
+
+
+def surfaces_of(results: Results) -> list[Path]:
+    """Return the files that the surfaces of a store would be: the dense ones where there are any, else the fitted."""
+    for kind in ("dense", "fitted"):
+        if found := [results.folder / f"{name}{ENDINGS[kind]}" for name in results.names() if results.has(name, kind)]:
+            return found
+    return []
+
+
+def modes_of(results: Results) -> int:
+    """Return the largest number of coefficients that a fit has."""
+    return max((int(name[1:]) for name in results.column_names() if re.fullmatch(r"z\d{1,5}", name)), default=0)

@@ -1,0 +1,144 @@
+"""Fits as rows: what coefficients.csv holds of each, and what the tables of a store hold beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.io.tables import CHECKSUM
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_DIRECTIONS = ("model_to_scan", "scan_to_model")
+_DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
+_SHARES = ("model_seen_share", "scan_covered_share")
+_EXPECTED = ("expected_error_mm", "beyond_model_mm")
+_AXES = "xyz"
+_TOLD_OF_FITS = (
+    *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
+    *_SHARES,
+    *(f"shown_{direction}_mean_scan_mm" for direction in _DIRECTIONS),
+    "path",
+    *_EXPECTED,
+    "size_mm",
+    *(f"rotation_{axis}_deg" for axis in _AXES),
+    *(f"translation_{axis}" for axis in _AXES),
+)
+"""Columns that stand before the last, `model_hash`, so that those that were there earlier keep their order."""
+
+RECORD = "record"
+"""The column of a store that holds the whole record as its file had it."""
+
+META = "meta_"
+"""What columns begin with that were in the list of the scans."""
+
+_EVIDENCE = "evidence_"
+FLAGS = ("fitted", "dense", "stages")
+"""Columns of a store that say which surfaces are kept."""
+
+TEXTS = (
+    "scan", "id", "status", "reason", "start", "path", "scan_name", "scan_hash", "model_name", "model_hash", "method",
+    "version", RECORD,
+)  # fmt: skip
+"""Columns of text; those whose names begin with `META` are too."""
+
+COUNTS = (*(f"{direction}_count" for direction in _DIRECTIONS), "iterations", "modes")
+"""Columns of whole numbers."""
+
+
+def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers."""
+    row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
+    row |= {"model_hash": record["model"]["hash"], "path": record["scan"].get("path", "")}
+    known = cast(Mapping[str, Any], record.get("metadata") or {})
+    row |= {f"{META}{key}": "" if value is None else str(value) for key, value in known.items()}
+    if "b" not in record:
+        return row
+    for letter in ("b", "z"):
+        row |= {f"{letter}{k}": value for k, value in enumerate(record[letter], 1)}
+    final = record["distances_mm"]["final"]
+    for direction in _DIRECTIONS:
+        row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
+    row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
+    row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
+    row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
+    return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
+
+
+def _distance_column(direction: str, measure: str) -> str:
+    return f"{direction}_{measure}" + ("" if measure == "count" else "_mm")
+
+
+def _shown_cells(record: Mapping[str, Any]) -> dict[str, Any]:
+    if "shown" not in record:  # of a fit by an earlier version
+        return {}
+    shown, in_scan = record["shown"], record["shown_scan_mm"]
+    cells = {key: shown[key] for key in _SHARES}
+    for direction in _DIRECTIONS:
+        cells |= {f"shown_{direction}_{measure}_mm": shown[direction][measure] for measure in ("mean", "median")}
+        cells[f"shown_{direction}_mean_scan_mm"] = in_scan[direction]["mean"]
+    return cells
+
+
+def _pose_cells(pose: Mapping[str, Any]) -> dict[str, float]:
+    """Return scale, rotation vector (its direction the axis, its length the angle in degrees) and translation."""
+    from scipy.spatial.transform import Rotation  # a tenth of a second that only those who fit should wait
+
+    turn = Rotation.from_matrix(np.asarray(pose["rotation"], dtype=np.float64)).as_rotvec(degrees=True)
+    cells = {"scale": float(pose["scale"])}
+    cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
+    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose["translation"], strict=True)}
+
+
+def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
+    """Return the columns of coefficients.csv in order, for `n_modes` coefficients; `known` came with the scans."""
+    modes = range(1, n_modes + 1)
+    # The two means come first: older readers look for them there.
+    lead = [_distance_column(direction, "mean") for direction in _DIRECTIONS]
+    every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
+    columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
+    columns += [column for column in every if column not in lead]
+    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS]
+    return [*columns, *known, CHECKSUM, "model_hash"]
+
+
+def safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `row` for a CSV table, without what a spreadsheet would run."""
+    # Only names and reasons are text, and a cell that starts like a formula is one.
+    return {
+        key: ("'" if value[:1] in _FORMULA else "") + value.encode("utf-8", "backslashreplace").decode("utf-8")
+        if isinstance(value, str) and value
+        else value
+        for key, value in row.items()
+    }
+
+
+def store_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the row of a store for `record`, without the record itself: flat, its numbers numbers.
+
+    Raises:
+        AttributeError, KeyError, TypeError, ValueError: the record is damaged.
+    """
+    row = coefficient_row(name, record)
+    scan, model = cast(Mapping[str, Any], record["scan"]), cast(Mapping[str, Any], record["model"])
+    row |= {"id": str(record.get("id", "")), "scan_name": str(scan.get("name", "")), "scan_hash": scan.get("hash", "")}
+    row |= {"model_name": str(model.get("name", "")), "method": record.get("method"), "version": record.get("version")}
+    row |= {"start": record.get("start"), "modes": len(record.get("b", ()))}
+    if "seconds" in record:
+        row["seconds"] = float(sum(record["seconds"].values()))
+        row["iterations"] = int(sum(record["iterations"].values()))
+    evidence = cast(Mapping[str, Any], record.get("evidence", {}))
+    row |= {
+        f"{_EVIDENCE}{key}": float(value)
+        for key, value in evidence.items()
+        if isinstance(value, int | float) and key not in _EXPECTED
+    }
+    return row
+
+
+def kind_of(column: str) -> str:
+    """Return what a column of a store holds: `text`, `count`, `flag` or `number`."""
+    if column in TEXTS or column.startswith(META):
+        return "text"
+    return "count" if column in COUNTS else "flag" if column in FLAGS else "number"
