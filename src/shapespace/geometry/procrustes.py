@@ -161,11 +161,6 @@ class Poses:
         part = slice(start, start + len(shapes))
         return shapes @ self.linear[part].transpose(0, 2, 1) + self.offset[part, None]
 
-    def after(self, first: Poses) -> Poses:
-        """Return these poses of shapes that `first` was applied to, as poses of those before."""
-        offset = np.einsum("nab,nb->na", self.linear, first.offset) + self.offset
-        return Poses(self.linear @ first.linear, offset)
-
 
 @dataclass(frozen=True, eq=False)
 class Streamed:

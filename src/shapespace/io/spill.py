@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,7 @@ class Spill:
         self.path, self.rows, self.columns = path, rows, columns
         size = rows * columns * _FLOAT32.itemsize
         try:
-            self._file: BinaryIO = path.open("w+b" if new else "r+b", buffering=0)
+            self._file = FileIO(path, "w+" if new else "r+")
         except OSError as error:
             raise (write_error if new else read_error)(path, error) from error
         try:
@@ -69,6 +70,10 @@ class Spill:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
         self._file.close()
 
     @property
@@ -85,7 +90,7 @@ class Spill:
         single = block.astype(_FLOAT32)
         for columns in self._panels():
             self._seek(columns, start)
-            part = memoryview(np.ascontiguousarray(single[:, columns])).cast("B")
+            part = np.ascontiguousarray(single[:, columns]).data.cast("B")
             try:
                 while len(part):
                     part = part[self._file.write(part) :]
@@ -138,10 +143,10 @@ class Spill:
     def _read(self, columns: slice, start: int, stop: int) -> npt.NDArray[np.float32]:
         part = np.empty((stop - start, columns.stop - columns.start), dtype=_FLOAT32)
         self._seek(columns, start)
-        view = memoryview(part).cast("B")
+        view = part.data.cast("B")
         try:
             while len(view):
-                count = self._file.readinto(view)  # pyright: ignore[reportAttributeAccessIssue]
+                count = self._file.readinto(view)
                 if not count:
                     raise FileFormatError(f"{self.path} is cut short; start again.")
                 view = view[count:]

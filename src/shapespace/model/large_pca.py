@@ -189,7 +189,9 @@ def _gram(shapes: Spill, mean: FloatArray) -> FloatArray:
     return gram
 
 
-def _eigenvectors(gram: FloatArray, modes: int | float | None, trace: float, seed: int) -> tuple[FloatArray, FloatArray]:
+def _eigenvectors(
+    gram: FloatArray, modes: int | float | None, trace: float, seed: int
+) -> tuple[FloatArray, FloatArray]:
     """Return eigenvalues, falling, and vectors (N, K) of the lower triangle `gram`: as many as `modes`, or more."""
     from scipy.linalg import blas, eigh
 

@@ -19,7 +19,8 @@ from shapespace.version import __version__
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
 _HELD_OUT = "held out"
-_EVERY_MODEL = ("mean", "basis", "stddev", "faces")
+_RESIDUALS = "residuals"
+_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS)
 """What is not of one representation."""
 
 
@@ -39,6 +40,7 @@ class ModelFields(TypedDict):
     provenance: str
     licence: str
     held_out: bool
+    residuals: FloatArray | None
 
 
 def hash_of(model: ModelFields) -> str:
@@ -63,6 +65,8 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays: dict[str, npt.NDArray[Any]] = {name: model[name] for name in ("mean", "basis", "stddev")}
     if model["faces"] is not None:
         arrays["faces"] = model["faces"]
+    if model["residuals"] is not None:
+        arrays[_RESIDUALS] = model["residuals"]
     arrays.update(model["coding"])
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
@@ -114,6 +118,7 @@ def load(path: Path) -> ModelFields:
             "provenance": str(attributes["provenance"]),
             "licence": str(attributes["licence"]),
             "held_out": attributes.get("variance_divisor") == _HELD_OUT,
+            "residuals": arrays[_RESIDUALS].astype(np.float64) if _RESIDUALS in arrays else None,
         }
     except (AttributeError, KeyError, ValueError, TypeError) as error:
         raise ModelFileError(f"{path} is a shapespace model but a part of it is missing: {error}.") from error
