@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
-from shapespace.io.files import atomic_path
+from shapespace.io.arrays import read_arrays, write_arrays
 from shapespace.types import FloatArray
 
 _DEPENDENT = 1e-13
@@ -53,11 +52,8 @@ class KeptPasses:
 
     def recall(self, step: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Return what `keep` was given; None where there is nothing whole."""
-        try:
-            with np.load(self._file(step), allow_pickle=False) as stored:
-                return stored["block"], stored["products"], stored["step"]
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-            return None
+        stored = read_arrays(self._file(step))
+        return None if stored is None else (stored["block"], stored["products"], stored["beyond"])
 
     def keep(self, step: int, block: FloatArray, products: FloatArray, beyond: FloatArray) -> None:
         """Keep the next block (D, b), the products of the basis (m, b) and what leads beyond it (b, b).
@@ -65,8 +61,7 @@ class KeptPasses:
         Raises:
             FileError: the disk is full.
         """
-        with atomic_path(self._file(step)) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, block=block, products=products, step=beyond)
+        write_arrays(self._file(step), {"block": block, "products": products, "beyond": beyond})
 
 
 @dataclass(frozen=True)
@@ -183,7 +178,8 @@ def _orthonormal(W: FloatArray, basis: list[FloatArray], least: float) -> tuple[
     Q = Q @ U[:, there]
     # Short directions were blown up together with the rounding along the basis.
     _taken_off(Q, basis)
-    return np.linalg.qr(Q)[0], lengths[there, None] * Vt[there]
+    Q, R = np.linalg.qr(Q)
+    return Q, R @ (lengths[there, None] * Vt[there])
 
 
 def _bordered(T: FloatArray, products: FloatArray) -> FloatArray:

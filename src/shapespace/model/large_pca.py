@@ -46,7 +46,6 @@ def large_components(
     seed: int = 0,
     kept: KeptPasses | None = None,
     on_pass: Callable[[int, float], None] | None = None,
-    exact: int = EXACT,
 ) -> PrincipalComponents:
     """Return the principal components of the rows of `shapes`, each with its residual.
 
@@ -56,7 +55,6 @@ def large_components(
         seed: of the first block of directions.
         kept: where the passes over many shapes are kept; None keeps nothing.
         on_pass: called with the number of a pass and the largest residual after it as a share of the first variance.
-        exact: shapes up to which the Gram matrix is made.
 
     Raises:
         InputError: values that are not finite, no variation, more modes than the shapes give, or than memory holds.
@@ -66,10 +64,10 @@ def large_components(
     modes = checked_modes(modes, n)
     if isinstance(modes, float):
         check_share(modes)
-    _refuse_too_many(modes, n, d, exact)
+    _refuse_too_many(modes, n, d)
     mean, total = _mean_and_total(shapes)
     covariance = _Covariance(shapes, mean)
-    if n <= exact:
+    if n <= EXACT:
         variance, rows = _by_gram(shapes, mean, modes, total, seed)
         CV = covariance(rows.T)
         residuals = np.linalg.norm(CV - rows.T * variance, axis=0)
@@ -88,9 +86,9 @@ def large_components(
     return PrincipalComponents(mean, rows.T, variance, total, n, residuals)
 
 
-def _refuse_too_many(modes: int | float | None, n: int, d: int, exact: int) -> None:
+def _refuse_too_many(modes: int | float | None, n: int, d: int) -> None:
     count = n - 1 if modes is None else modes if isinstance(modes, int) else 1
-    if modes is None and n > exact:
+    if modes is None and n > EXACT:
         raise InputError(
             f"All modes of {n} shapes cannot be found; ask for a number of them (--modes) or a share of the variance "
             "(--variance)."

@@ -280,6 +280,7 @@ class ShapeModel:
             )
         if not len(meshes):
             raise InputError("There are no meshes to be added; give at least one.")
+        kept.check()
         stream = aligned_on_disk(
             meshes,
             kept.gauge,

@@ -15,7 +15,6 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias, cast
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +29,8 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.files import atomic_path, make_folder, remove_file, write_error, write_text
+from shapespace.io.arrays import read_arrays, write_arrays
+from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory import available_bytes
 from shapespace.io.spill import Spill
 from shapespace.model.choose_modes import choose_modes, drawn
@@ -78,6 +78,7 @@ class KeptShapes:
     Args:
         folder: that holds them.
         model_hash: of that model.
+        digest: SHA-256 of the file of shapes.
         faces: (F, 3) of the shapes, or None.
         template: (V, 3) mm; the shapes are stored as differences from it.
         reference: (V, 3) mm, whose orientation is the frame.
@@ -90,6 +91,7 @@ class KeptShapes:
 
     folder: Path
     model_hash: str
+    digest: str
     faces: IntArray | None
     template: FloatArray
     reference: FloatArray
@@ -107,30 +109,31 @@ class KeptShapes:
             FileError: there is nothing.
             FileFormatError: it is damaged.
         """
-        try:
-            with np.load(folder / _KEPT, allow_pickle=False) as stored:
-                told = json.loads(str(stored["told"]))
-                arrays = {name: np.asarray(stored[name]) for name in stored.files if name != "told"}
-            return KeptShapes(
-                folder,
-                str(told["model_hash"]),
-                arrays.get("faces"),
-                arrays["template"],
-                arrays["reference"],
-                arrays["sizes"],
-                cast(Gauge, told["gauge"]),
-                bool(told["align"]),
-                arrays.get("alignment_vertices"),
-                float(told["rounding"]),
-            )
-        except FileNotFoundError as error:
+        path = folder / _KEPT
+        if not path.is_file():
             raise FileError(
                 f"There are no shapes in {folder}, so none can be added to them; build the model again with "
                 "--keep-shapes (keep_shapes), which keeps them there."
-            ) from error
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            )
+        try:
+            arrays = read_arrays(path) or {}
+            told = json.loads(str(arrays["told"]))
+            return KeptShapes(
+                folder=folder,
+                model_hash=str(told["model_hash"]),
+                digest=str(told["digest"]),
+                faces=arrays.get("faces"),
+                template=arrays["template"],
+                reference=arrays["reference"],
+                sizes=arrays["sizes"],
+                gauge=cast(Gauge, told["gauge"]),
+                align=bool(told["align"]),
+                alignment_vertices=arrays.get("alignment_vertices"),
+                rounding=float(told["rounding"]),
+            )
+        except (ValueError, KeyError, TypeError) as error:
             raise FileFormatError(
-                f"{folder / _KEPT} is damaged; build the model again with --keep-shapes (keep_shapes)."
+                f"{path} is damaged; build the model again with --keep-shapes (keep_shapes)."
             ) from error
 
     def save(self) -> None:
@@ -139,11 +142,24 @@ class KeptShapes:
         Raises:
             FileError: the disk is full.
         """
-        told = {name: getattr(self, name) for name in ("model_hash", "gauge", "align", "rounding")}
+        told = {name: getattr(self, name) for name in ("model_hash", "digest", "gauge", "align", "rounding")}
         arrays = {"template": self.template, "reference": self.reference, "sizes": self.sizes}
         optional = {"faces": self.faces, "alignment_vertices": self.alignment_vertices}
         there = {name: array for name, array in optional.items() if array is not None}
-        _save(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(told))})
+        write_arrays(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(told))})
+
+    def check(self) -> None:
+        """Refuse shapes that have changed since they were kept.
+
+        Raises:
+            FileError: they cannot be read.
+            FileFormatError: they have changed.
+        """
+        if sha256_of_file(self.folder / _SHAPES) != self.digest:
+            raise FileFormatError(
+                f"{self.folder / _SHAPES} is damaged: it does not match its checksum; copy it again, or build the "
+                "model again with --keep-shapes (keep_shapes)."
+            )
 
     def opened(self) -> Spill:
         """Return the shapes.
@@ -201,7 +217,8 @@ class Aligned:
             shutil.move(self.shapes.path, folder / _SHAPES)
         except OSError as error:
             raise write_error(folder / _SHAPES, error) from error
-        replace(self.kept, folder=folder, model_hash=model_hash).save()
+        digest = sha256_of_file(folder / _SHAPES)
+        replace(self.kept, folder=folder, model_hash=model_hash, digest=digest).save()
 
 
 def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
@@ -350,17 +367,26 @@ class _Work:
         else:
             reference, rounding = self.first.vertices, rounding_mm(self.first.vertices)
         return KeptShapes(
-            self.folder, "", self.first.faces, self.template, reference, self.sizes, self.gauge, self.align,
-            self.alignment_vertices, rounding,
-        )  # fmt: skip
+            folder=self.folder,
+            model_hash="",
+            digest="",
+            faces=self.first.faces,
+            template=self.template,
+            reference=reference,
+            sizes=self.sizes,
+            gauge=self.gauge,
+            align=self.align,
+            alignment_vertices=self.alignment_vertices,
+            rounding=rounding,
+        )
 
     @contextlib.contextmanager
     def aligned(self) -> Generator[Spill]:
         """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
-        poses = _load(self.folder / _POSES)
+        poses = read_arrays(self.folder / _POSES)
         whole = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
-        near = _load(start) if whole else None
+        near = read_arrays(start) if whole else None
         if whole and done.is_file() and poses is not None:
             self.template, self.sizes = poses["template"], poses["sizes"]
             with Spill(path, self.count, self.template.size, new=False) as shapes:
@@ -372,10 +398,10 @@ class _Work:
                 remove_file(start)
                 near = self._read(shapes)
                 shapes.to_disk()
-                _save(start, near)
+                write_arrays(start, near)
             if poses is None:
                 poses = self._posed(shapes, near)
-                _save(self.folder / _POSES, poses)
+                write_arrays(self.folder / _POSES, poses)
             self.template, self.sizes = poses["template"], poses["sizes"]
             # From here on the file is neither as read nor aligned, until it is.
             remove_file(start)
@@ -513,16 +539,3 @@ def _sample(shapes: Spill, seed: int) -> FloatArray:
     rows = drawn(shapes.rows, seed)
     every = max(1, -(-8 * len(rows) * shapes.columns // _SAMPLE_BYTES))
     return np.stack([shapes.rows_from(row, row + 1).reshape(-1, 3)[::every].reshape(-1) for row in rows])
-
-
-def _load(path: Path) -> dict[str, npt.NDArray[Any]] | None:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: np.asarray(stored[name]) for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return None
-
-
-def _save(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> None:
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, **cast(dict[str, Any], arrays))
