@@ -89,9 +89,9 @@ class Spill:
         """
         single = block.astype(_FLOAT32)
         for columns in self._panels():
-            self._seek(columns, start)
             part = np.ascontiguousarray(single[:, columns]).data.cast("B")
             try:
+                self._seek(columns, start)
                 while len(part):
                     part = part[self._file.write(part) :]
             except OSError as error:
@@ -142,9 +142,9 @@ class Spill:
 
     def _read(self, columns: slice, start: int, stop: int) -> npt.NDArray[np.float32]:
         part = np.empty((stop - start, columns.stop - columns.start), dtype=_FLOAT32)
-        self._seek(columns, start)
         view = part.data.cast("B")
         try:
+            self._seek(columns, start)
             while len(view):
                 count = self._file.readinto(view)
                 if not count:
