@@ -235,6 +235,24 @@ def test_equal_streamed_meshes_are_refused(temporary: Path) -> None:
     assert left_in(temporary) == []
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"modes": 24}, "24 training shapes give at most 23 modes"),
+        ({"modes": 1.5}, "A share of the variance"),
+        ({"landmarks": {"tip": 200}}, "'tip' is at vertex 200"),
+        ({"alignment_vertices": np.array([0, 1, 200])}, "counted from 0 to 199"),
+        ({"gauge": "size"}, "no gauge 'size'"),
+    ],
+    ids=["modes", "share", "landmark", "vertex", "gauge"],
+)
+def test_what_cannot_be_had_is_refused_before_the_meshes_are_read(options: dict[str, object], said: str) -> None:
+    meshes = Lazy(24)
+    with pytest.raises(InputError, match=said):
+        ShapeModel.fit(meshes, out_of_core=True, **options)
+    assert not meshes.made[1:].any()
+
+
 def test_only_models_of_vertices_are_streamed() -> None:
     with pytest.raises(InputError, match="Only models of vertices"):
         ShapeModel.fit(posed(), representation="bspline", out_of_core=True)

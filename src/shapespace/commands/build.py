@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3
+_OF_RECORDS = ("status", "model")
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
@@ -160,8 +161,9 @@ def build(
     if settings.modes == "auto" and len(files) < 4:
         settings = replace(settings, modes=None)
         notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
-    if settings.modes == "auto" and len(files) > MOST_SHAPES:
-        notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {len(files)} meshes, drawn by --seed.")
+    count = len(files) + (0 if parent is None else parent.n_training)
+    if settings.modes == "auto" and count > MOST_SHAPES:
+        notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
         model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
         return model, notes + _told(model, settings)
@@ -332,7 +334,8 @@ def _trusted(
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
         if name is not None and (beside := file.with_name(f"{name}{RECORD}")).is_file():
-            records[file] = read_record(beside)
+            record = read_record(beside)
+            records[file] = {key: record.get(key) for key in _OF_RECORDS}  # all of each would be large
     doubtful = [file for file in files if file in records and records[file].get("status") == "doubtful"]
     if not doubtful:
         return list(files), records

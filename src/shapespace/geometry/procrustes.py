@@ -69,7 +69,7 @@ def align_in_place(
     Raises:
         InputError: unknown gauge, fewer than three vertices to align by, or some that do not exist.
     """
-    chosen = _checked(gauge, alignment_vertices, shapes.shape[1])
+    chosen = check_alignment(gauge, alignment_vertices, shapes.shape[1])
     with_scale = gauge == "shape"
     sizes = [centroid_size(shape[chosen]) for shape in shapes]
     size = float(np.mean(sizes))
@@ -99,7 +99,12 @@ def align_in_place(
     return Alignment(shapes.mean(axis=0), iteration, converged=True)
 
 
-def _checked(gauge: Gauge, alignment_vertices: IntArray | None, n_vertices: int) -> IntArray | slice:
+def check_alignment(gauge: Gauge, alignment_vertices: IntArray | None, n_vertices: int) -> IntArray | slice:
+    """Return the index of the vertices that carry the alignment, of `n_vertices`.
+
+    Raises:
+        InputError: unknown gauge, fewer than three vertices to align by, or some that do not exist.
+    """
     if gauge not in ("form", "shape"):
         raise InputError(f"There is no gauge {gauge!r}; choose form (rigid) or shape (with scale).")
     if alignment_vertices is None:
@@ -205,7 +210,7 @@ def align_streamed(
     Raises:
         InputError: as `align_in_place`, or a shape that determines no rotation.
     """
-    chosen = _checked(gauge, alignment_vertices, len(shapes.template))
+    chosen = check_alignment(gauge, alignment_vertices, len(shapes.template))
     with_scale = gauge == "shape"
     reference = mean = _start(reference, chosen, size, with_scale)
     poses = Poses(np.empty((shapes.count, 3, 3)), np.empty((shapes.count, 3)))

@@ -61,10 +61,7 @@ def large_components(
         FileError: the file cannot be read, or a pass not kept.
     """
     n, d = shapes.rows, shapes.columns
-    modes = checked_modes(modes, n)
-    if isinstance(modes, float):
-        check_share(modes)
-    _refuse_too_many(modes, n, d)
+    modes = checked_large_modes(modes, n, d)
     mean, total = _mean_and_total(shapes)
     covariance = _Covariance(shapes, mean)
     if n <= EXACT:
@@ -86,7 +83,15 @@ def large_components(
     return PrincipalComponents(mean, rows.T, variance, total, n, residuals)
 
 
-def _refuse_too_many(modes: int | float | None, n: int, d: int) -> None:
+def checked_large_modes(modes: int | float | None, n: int, d: int) -> int | float | None:
+    """Return `modes` as asked for of n shapes of d numbers on a disk, before they are looked at.
+
+    Raises:
+        InputError: more modes than the shapes give, or than memory holds.
+    """
+    modes = checked_modes(modes, n)
+    if isinstance(modes, float):
+        check_share(modes)
     count = n - 1 if modes is None else modes if isinstance(modes, int) else 1
     if modes is None and n > EXACT:
         raise InputError(
@@ -99,6 +104,7 @@ def _refuse_too_many(modes: int | float | None, n: int, d: int) -> None:
             f"{count} modes of {d // 3} vertices take {3 * 8 * count * d / 1e9:.1f} GB while they are found, of which "
             f"{free / 1e9:.1f} are free; ask for fewer modes."
         )
+    return modes
 
 
 def _mean_and_total(shapes: Spill) -> tuple[FloatArray, float]:

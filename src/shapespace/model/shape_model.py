@@ -127,9 +127,7 @@ class ShapeModel:
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
-        for name, vertex in self.landmarks.items():
-            if not 0 <= vertex < len(checked.vertices):
-                raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
+        _refuse_far_landmarks(self.landmarks, len(checked.vertices))
 
     @classmethod
     def fit(
@@ -194,8 +192,17 @@ class ShapeModel:
             out_of_core = too_large(bytes_in_memory(len(meshes), meshes[0], choose=modes == "auto"))
         if out_of_core or keep_shapes is not None:
             stream = aligned_on_disk(
-                meshes, gauge, align=align, alignment_vertices=alignment_vertices, scratch=scratch, onto=None, tell=tell
+                meshes,
+                gauge,
+                align=align,
+                alignment_vertices=alignment_vertices,
+                scratch=scratch,
+                onto=None,
+                modes=modes,
+                tell=tell,
             )
+            if len(meshes):
+                _refuse_far_landmarks(landmarks or {}, len(meshes[0].vertices))
             about = {"landmarks": landmarks or {}, "provenance": provenance, "licence": licence}
             return cls._of_streamed(stream, modes, seed, keep_shapes, tell, about)
         meshes = [meshes[index] for index in range(len(meshes))]
@@ -288,6 +295,7 @@ class ShapeModel:
             alignment_vertices=kept.alignment_vertices,
             scratch=scratch,
             onto=kept,
+            modes=modes,
             tell=tell,
         )
         about = {
@@ -571,6 +579,12 @@ def _components_of_codes(
     shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
     mean = codes.mean(axis=0)
     return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
+
+
+def _refuse_far_landmarks(landmarks: Mapping[str, int], n_vertices: int) -> None:
+    for name, vertex in landmarks.items():
+        if not 0 <= vertex < n_vertices:
+            raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
 
 
 def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:

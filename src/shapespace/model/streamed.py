@@ -26,6 +26,7 @@ from shapespace.geometry.procrustes import (
     Streamed,
     align_streamed,
     centroid_size,
+    check_alignment,
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
@@ -35,7 +36,7 @@ from shapespace.io.memory import available_bytes
 from shapespace.io.spill import Spill
 from shapespace.model.choose_modes import choose_modes, drawn
 from shapespace.model.krylov import KeptPasses
-from shapespace.model.large_pca import large_components
+from shapespace.model.large_pca import checked_large_modes, large_components
 from shapespace.model.pca import ALL_EQUAL, PrincipalComponents
 from shapespace.model.spurious import rounding_mm
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
@@ -118,6 +119,9 @@ class KeptShapes:
         try:
             arrays = read_arrays(path) or {}
             told = json.loads(str(arrays["told"]))
+            shape = arrays["template"].shape
+            if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
+                raise ValueError
             return KeptShapes(
                 folder=folder,
                 model_hash=str(told["model_hash"]),
@@ -249,6 +253,7 @@ def aligned_on_disk(
     alignment_vertices: IntArray | None,
     scratch: Scratch | None,
     onto: KeptShapes | None,
+    modes: int | float | Literal["auto"] | None,
     tell: Tell,
 ) -> Generator[Aligned]:
     """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that vanishes with the block.
@@ -260,6 +265,7 @@ def aligned_on_disk(
         alignment_vertices: as of `align_in_place`.
         scratch: for what a build that is killed goes on with; None takes a temporary folder and keeps nothing.
         onto: shapes to which these are added.
+        modes: that will be asked for; what cannot be had is refused before anything is read.
         tell: told what is being done.
 
     Raises:
@@ -269,6 +275,8 @@ def aligned_on_disk(
     """
     with _folder(scratch) as folder:
         work = _Work(folder, meshes, gauge, align, alignment_vertices, onto, tell)
+        if modes != "auto":
+            checked_large_modes(modes, work.count, work.first.vertices.size)
         path = folder / _SHAPES
         try:
             with work.aligned() as shapes:
@@ -327,10 +335,12 @@ def _only_one(folder: Path) -> Generator[None]:
     with (folder / _LOCK).open("w") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             raise FileError(
                 f"Another build is at work in {folder}; wait for it, or give another name for the model."
             ) from error
+        except OSError:
+            pass  # a file system without locks
         yield
 
 
@@ -354,10 +364,10 @@ class _Work:
         self.folder, self.meshes, self.align, self.onto, self.tell = folder, meshes, align, onto, tell
         self.gauge: Gauge = gauge
         self.alignment_vertices = alignment_vertices
-        self.chosen: IntArray | slice = slice(None) if alignment_vertices is None else alignment_vertices
         self.before = 0 if onto is None else len(onto.sizes)
         self.count = self.before + len(meshes)
         self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
+        self.chosen = check_alignment(gauge, alignment_vertices, len(self.first.vertices))
         self.template: FloatArray = np.empty((0, 3))
         self.sizes: FloatArray = np.empty(0)
 
