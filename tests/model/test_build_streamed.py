@@ -112,6 +112,18 @@ def test_added_meshes_make_the_model_of_all(folder: Path, tmp_path: Path, capsys
     assert model.provenance == "thirty; 10 meshes, m30.ply to m39.ply"
 
 
+def test_the_modes_of_one_mesh_and_a_model_are_chosen_by_all(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, one = tmp_path / "old.h5", folder / "new" / f"m{OLD}.ply"
+    assert build(folder / "old", "-o", old, "--modes", 4, "--keep-shapes") == 0
+    assert build("--add", old, one, "-o", tmp_path / "new.h5") == 0
+    assert "cross-validated" not in capsys.readouterr().err
+    assert build(folder / "old", one, "-o", tmp_path / "all.h5") == 0
+    new, everyone = ShapeModel.load(tmp_path / "new.h5"), ShapeModel.load(tmp_path / "all.h5")
+    assert new.n_training == OLD + 1 and new.n_modes == everyone.n_modes < OLD
+
+
 def test_what_cannot_be_added_to_ends_in_a_sentence(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -158,10 +158,10 @@ def build(
         notes.append(found.told_units(settings.unit))
     marks = {} if parent is not None else _landmarks(files, records, first, settings, notes)
     settings = _with_origin(files, settings, notes)
-    if settings.modes == "auto" and len(files) < 4:
-        settings = replace(settings, modes=None)
-        notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
     count = len(files) + (0 if parent is None else parent.n_training)
+    if settings.modes == "auto" and count < 4:
+        settings = replace(settings, modes=None)
+        notes.append(f"With {count} meshes the number of modes cannot be cross-validated, so all modes are kept.")
     if settings.modes == "auto" and count > MOST_SHAPES:
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
