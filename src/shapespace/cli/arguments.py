@@ -161,7 +161,7 @@ def _add_build(commands: Any) -> None:
     how_many.add_argument("--variance", type=_share, metavar="SHARE", help="modes that hold this share, such as 0.98")
     how_many.add_argument("--modes", type=_modes, default="auto", metavar="K|auto|all",
                           help="a number; auto for cross-validation on held-out vertices (default); all")  # fmt: skip
-    sub.add_argument("--gauge", choices=("form", "shape"), default="shape",
+    sub.add_argument("--gauge", choices=("form", "shape"),
                      help="form: size lives in the modes; shape: size is divided out (default)")  # fmt: skip
     sub.add_argument("--representation", choices=("vertices", "bspline", "bspline-detail"), default="vertices",
                      help="what the modes move: vertices (default), or control points of a B-spline surface, without "
@@ -175,6 +175,13 @@ def _add_build(commands: Any) -> None:
                           "--variance then count modes of identity (default 0.995 of the variance)")  # fmt: skip
     sub.add_argument("--expression-variance", type=_share, metavar="SHARE",
                      help="with --additive: modes of expression that hold this share (default 0.99)")  # fmt: skip
+    sub.add_argument("--out-of-core", action="store_true",
+                     help="stream the meshes through a file beside the model, as is done where they would take more "
+                          "than four fifths of the free memory; a build that is killed goes on there")  # fmt: skip
+    sub.add_argument("--keep-shapes", action="store_true",
+                     help="keep that file in MODEL.h5.shapes, for --add (4 bytes a coordinate of a mesh)")  # fmt: skip
+    sub.add_argument("--add", type=Path, metavar="OLD.h5",
+                     help="add the meshes to this model, which was built with --keep-shapes")  # fmt: skip
     sub.add_argument("--no-align", action="store_true", help="take the meshes as they stand")
     sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
     sub.add_argument("--landmarks", type=Path, metavar="FILE",

@@ -249,9 +249,14 @@ def build(arguments: argparse.Namespace) -> int:
         provenance=arguments.provenance,
         licence=arguments.licence,
         seed=arguments.seed,
+        out_of_core=arguments.out_of_core or None,
+        keep_shapes=arguments.keep_shapes,
+        add=arguments.add,
         recursive=arguments.recursive,
         with_doubtful=arguments.with_doubtful,
     )
+    if settings.streams:
+        arguments.goes_on = "; the same command goes on from there"
     model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
     for note in notes:
         say(note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,15 +18,18 @@ from shapespace.commands.about import ABOUT, read_about
 from shapespace.commands.corresponding import surface_files
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.procrustes import Gauge
-from shapespace.io.files import make_folder
+from shapespace.io.files import make_folder, read_error
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
+from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
+from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.scans import NEUTRAL
 from shapespace.store.results import is_result, mesh_at
 from shapespace.types import MM_PER_UNIT, Mesh, common_faces
+from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3
+_OF_RECORDS = ("status", "model")
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
@@ -43,7 +48,7 @@ class BuildSettings:
 
     Args:
         modes: as of `ShapeModel.fit`; with `labels`, those of identity.
-        gauge: `form` or `shape`.
+        gauge: `form` or `shape`; None for that of the model added to, or `shape`.
         align: whether to align the meshes.
         unit: of the meshes.
         representation: what the modes move.
@@ -54,7 +59,10 @@ class BuildSettings:
         expression_variance: with `labels`, the share that the modes of expression hold.
         provenance: what the meshes are.
         licence: of the meshes.
-        seed: of the cross-validation.
+        seed: of the cross-validation, and of the first directions of streamed modes.
+        out_of_core: whether to stream the meshes through a file; None where they do not fit into memory.
+        keep_shapes: whether to keep that file beside the model, for shapes to be added later.
+        add: a model that kept its shapes, to which the meshes are added.
         recursive: whether to take what lies in folders below those given too.
         with_doubtful: whether to take surfaces of doubtful fits.
 
@@ -63,7 +71,7 @@ class BuildSettings:
     """
 
     modes: int | float | Literal["auto"] | None = "auto"
-    gauge: Gauge = "shape"
+    gauge: Gauge | None = None
     align: bool = True
     unit: str = "mm"
     representation: str = "vertices"
@@ -75,6 +83,9 @@ class BuildSettings:
     provenance: str = ""
     licence: str = ""
     seed: int = 0
+    out_of_core: bool | None = None
+    keep_shapes: bool = False
+    add: Path | None = None
     recursive: bool = False
     with_doubtful: bool = False
 
@@ -90,6 +101,28 @@ class BuildSettings:
             raise InputError(
                 "A model that parts identity and expression aligns its faces itself; leave --no-align out."
             )
+        if self.streams and (self.labels is not None or self.representation != "vertices"):
+            raise InputError(
+                "--out-of-core, --keep-shapes and --add are for models of vertices without --additive; leave them out, "
+                "or --representation and --additive."
+            )
+        if self.streams and self.min_seen is not None:
+            raise InputError("Streamed meshes must be whole, so leave --min-seen out.")
+        if self.add is not None and (self.gauge is not None or not self.align or self.landmarks is not None):
+            raise InputError(
+                "--add takes gauge, alignment and landmarks from the model; leave --gauge, --no-align and --landmarks "
+                "out."
+            )
+
+    @property
+    def streams(self) -> bool:
+        """Whether the meshes are streamed even where they would fit."""
+        return bool(self.out_of_core) or self.keep_shapes or self.add is not None
+
+    @property
+    def of_vertices(self) -> bool:
+        """Whether it is a plain model of vertices, whose meshes can be streamed."""
+        return self.labels is None and self.representation == "vertices"
 
 
 def build(
@@ -105,28 +138,39 @@ def build(
         FileFormatError: the record beside a surface is damaged.
         MeshError: a mesh without vertices, or with faces that point past their end.
         CorrespondenceError: the meshes differ in vertices or triangles.
-        InputError: too few meshes, no variation, too many modes asked for.
+        InputError: too few meshes, no variation, too many modes asked for; a model that none can be added to.
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
     found = surface_files(meshes, recursive=settings.recursive)
     notes = list(found.notes)
-    if settings.gauge == "form" or not settings.align:
+    parent = None if settings.add is None else _parent(settings.add, output)
+    gauge = parent.gauge if parent is not None else settings.gauge or "shape"
+    if gauge == "form" or not settings.align:
         found.refuse_mixed_units()
     files, records = _trusted(found.files, notes, with_doubtful=settings.with_doubtful)
     make_folder(output.absolute().parent)
-    loaded = _read(files, settings.unit, found.unit_ratios, quiet=quiet)
+    on_disk = _OnDisk(files, settings.unit, found.unit_ratios)
+    streamed = settings.streams or (settings.of_vertices and _too_large(on_disk, settings, notes))
+    loaded = on_disk if streamed else _read(on_disk, quiet=quiet)
+    first = on_disk[0] if streamed else loaded[0]
     if found.unit_ratios:
         notes.append(found.told_units(settings.unit))
-    marks = _landmarks(files, records, loaded[0], settings, notes)
+    marks = {} if parent is not None else _landmarks(files, records, first, settings, notes)
     settings = _with_origin(files, settings, notes)
-    if settings.modes == "auto" and len(files) < 4:
+    count = len(files) + (0 if parent is None else parent.n_training)
+    if settings.modes == "auto" and count < 4:
         settings = replace(settings, modes=None)
-        notes.append(f"With {len(files)} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+        notes.append(f"With {count} meshes the number of modes cannot be cross-validated, so all modes are kept.")
+    if settings.modes == "auto" and count > MOST_SHAPES:
+        notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
+    if not isinstance(loaded, list):
+        model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
+        return model, notes + _told(model, settings)
     notes += _missing(loaded, marks, settings)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if settings.labels is not None:
-            additive = _additive(files, loaded, settings.labels, settings, marks)
+            additive = _additive(files, loaded, settings.labels, settings, gauge, marks)
             additive.save(output)
             notes.append(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
@@ -136,8 +180,9 @@ def build(
         model = ShapeModel.fit(
             loaded,
             modes=settings.modes,
-            gauge=settings.gauge,
+            gauge=gauge,
             align=settings.align,
+            out_of_core=False,
             landmarks=marks,
             representation=settings.representation,
             control_points=settings.control_points,
@@ -147,11 +192,138 @@ def build(
             seed=settings.seed,
         )
         model.save(output)
-    notes += _odd_size(model, settings.unit)
+    return model, notes + _told(model, settings)
+
+
+def _told(model: ShapeModel, settings: BuildSettings) -> list[str]:
+    """Return what the user should know of the model itself."""
+    notes = _odd_size(model, settings.unit)
     if model.left_out:
         what = "1 mode is" if model.left_out == 1 else f"{model.left_out} modes are"
         notes.append(f"{what} left out, since alignment or rounding made them and no shape did.")
-    return model, notes
+    return notes
+
+
+def shapes_folder(model: Path) -> Path:
+    """Return the folder where --keep-shapes keeps the shapes of the model in that file."""
+    return model.with_name(f"{model.name}.shapes")
+
+
+def _parent(path: Path, output: Path) -> ShapeModel:
+    """Return the model that meshes are added to.
+
+    Raises:
+        InputError: it is none that meshes can be added to.
+    """
+    if path.absolute() == output.absolute():
+        raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
+    model = ShapeModel.load(path)
+    if model.held_out or model.representation != "vertices":
+        what = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
+        raise InputError(f"{path} {what}, and meshes can be added only to plain models of vertices; build it again.")
+    return model
+
+
+def _too_large(meshes: _OnDisk, settings: BuildSettings, notes: list[str]) -> bool:
+    """Return whether the meshes do not fit into memory, and say so."""
+    needed = bytes_in_memory(len(meshes), meshes[0], choose=settings.modes == "auto")
+    if settings.out_of_core is not None or not too_large(needed):
+        return False
+    notes.append(
+        f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
+        "free, so they are streamed through a file (--out-of-core)."
+    )
+    return True
+
+
+def _streamed(
+    meshes: _OnDisk,
+    output: Path,
+    settings: BuildSettings,
+    gauge: Gauge,
+    landmarks: Mapping[str, int],
+    parent: ShapeModel | None,
+    notes: list[str],
+    *,
+    quiet: bool,
+) -> ShapeModel:
+    """Build a model of meshes that are not held in memory, and save it."""
+    folder = output.with_name(f"{output.name}.build")
+    scratch = Scratch(folder, _identity(meshes, settings, parent))
+    kept = shapes_folder(output) if settings.keep_shapes else None
+    with progress(None, "streaming", "mesh", quiet=quiet) as bar:
+        if parent is not None and settings.add is not None:
+            model = parent.with_more(
+                meshes,
+                shapes_folder(settings.add),
+                modes=settings.modes,
+                provenance=_joined(parent.provenance, settings.provenance),
+                licence=_joined(parent.licence, settings.licence),
+                seed=settings.seed,
+                scratch=scratch,
+                keep_shapes=kept,
+                tell=bar.set_description_str,
+            )
+        else:
+            model = ShapeModel.fit(
+                meshes,
+                modes=settings.modes,
+                gauge=gauge,
+                align=settings.align,
+                landmarks=landmarks,
+                provenance=settings.provenance,
+                licence=settings.licence,
+                seed=settings.seed,
+                out_of_core=True,
+                scratch=scratch,
+                keep_shapes=kept,
+                tell=bar.set_description_str,
+            )
+        model.save(output)
+    if kept is not None:
+        size = sum(file.stat().st_size for file in kept.iterdir())
+        notes.append(f"The shapes are kept in {kept} ({size / 1e6:.1f} MB), for --add.")
+    return model
+
+
+def _joined(old: str, new: str) -> str:
+    return old if new in ("", old) else f"{old}; {new}" if old else new
+
+
+def _identity(meshes: _OnDisk, settings: BuildSettings, parent: ShapeModel | None) -> str:
+    """Return a hash of all that decides what a streamed build comes to."""
+    digest = hashlib.sha256(repr((__version__, replace(settings, provenance="", licence=""))).encode())
+    digest.update(repr(None if parent is None else parent.content_hash).encode())
+    for file in meshes.files:
+        try:
+            about = file.stat()
+        except OSError as error:
+            raise read_error(file, error) from error
+        digest.update(repr((str(file.absolute()), about.st_size, about.st_mtime_ns)).encode())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class _OnDisk:
+    """Meshes in mm, each read when it is asked for; those with a unit ratio are in other units than most.
+
+    Args:
+        files: of the meshes.
+        unit: of most.
+        unit_ratios: as of `SurfaceFiles`.
+    """
+
+    files: Sequence[Path]
+    unit: str
+    unit_ratios: Mapping[Path, float]
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int, /) -> Mesh:
+        file = self.files[index]
+        mesh, mm = _training_mesh(file), MM_PER_UNIT[self.unit] / self.unit_ratios.get(file, 1.0)
+        return mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm)
 
 
 def _trusted(
@@ -162,7 +334,8 @@ def _trusted(
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
         if name is not None and is_result(beside := file.with_name(f"{name}{RECORD}")):
-            records[file] = read_record(beside)
+            record = read_record(beside)
+            records[file] = {key: record.get(key) for key in _OF_RECORDS}  # all of each would be large
     doubtful = [file for file in files if file in records and records[file].get("status") == "doubtful"]
     if not doubtful:
         return list(files), records
@@ -180,13 +353,11 @@ def _trusted(
     return left, {file: records[file] for file in left if file in records}
 
 
-def _read(files: Sequence[Path], unit: str, unit_ratios: Mapping[Path, float], *, quiet: bool) -> list[Mesh]:
-    """Return the meshes in mm; those with a `unit_ratios` are in other units than most, of which `unit` is told."""
+def _read(meshes: _OnDisk, *, quiet: bool) -> list[Mesh]:
     loaded: list[Mesh] = []
-    with progress(len(files), "reading", "mesh", quiet=quiet) as bar:
-        for file in files:
-            mesh, mm = _training_mesh(file), MM_PER_UNIT[unit] / unit_ratios.get(file, 1.0)
-            loaded.append(mesh if mm == 1.0 else mesh.with_vertices(mesh.vertices * mm))
+    with progress(len(meshes), "reading", "mesh", quiet=quiet) as bar:
+        for index in range(len(meshes)):
+            loaded.append(meshes[index])
             bar.update()
     return loaded
 
@@ -322,7 +493,12 @@ def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str
 
 
 def _additive(
-    files: Sequence[Path], meshes: Sequence[Mesh], labels: Path, settings: BuildSettings, landmarks: Mapping[str, int]
+    files: Sequence[Path],
+    meshes: Sequence[Mesh],
+    labels: Path,
+    settings: BuildSettings,
+    gauge: Gauge,
+    landmarks: Mapping[str, int],
 ) -> AdditiveModel:
     from shapespace.model.additive import AdditiveModel
 
@@ -341,7 +517,7 @@ def _additive(
         [label.text == NEUTRAL for label in own],
         identity_modes=_IDENTITY_VARIANCE if settings.modes == "auto" else settings.modes,
         expression_modes=_EXPRESSION_VARIANCE if expression_modes is None else expression_modes,
-        gauge=settings.gauge,
+        gauge=gauge,
         landmarks=landmarks,
         provenance=settings.provenance,
         licence=settings.licence,

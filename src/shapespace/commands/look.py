@@ -164,6 +164,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "variance_of": "people left out" if model.held_out else "training shapes",
         "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
+        **({} if model.residuals is None else _residual_facts(model)),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
         "representation": model.representation,
@@ -171,4 +172,12 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "provenance": model.provenance,
         "licence": model.licence,
         "hash": model.content_hash,
+    }
+
+
+def _residual_facts(model: ShapeModel) -> dict[str, Any]:
+    residuals = np.zeros(0) if model.residuals is None else model.residuals
+    return {
+        "residuals_mm2": residuals.tolist(),
+        "largest_residual_share": float(residuals.max() / model.stddev[0] ** 2),
     }

@@ -13,6 +13,8 @@ from scipy.linalg import eigh
 from shapespace.errors import InputError
 from shapespace.types import BoolArray, FloatArray, IntArray
 
+MOST_SHAPES = 2000
+"""Of more, so many are drawn: the choice takes the cube of their number, and its standard error is small by then."""
 _LEAST_NOISE = 1e-6
 _NO_VARIANCE = 1e-10
 """Of the first mode's, as in `pca`."""
@@ -40,6 +42,8 @@ class ModeChoice:
 def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: BoolArray | None = None) -> ModeChoice:
     """Choose the number of modes by held-out vertices with the one-standard-error rule.
 
+    Of more than `MOST_SHAPES` shapes only those of `drawn` are looked at, so that the time does not grow any more.
+
     In each fold the model is made without some shapes; half of the vertices of each are shown, coefficients are
     their maximum a posteriori, and the hidden half is predicted.
 
@@ -58,6 +62,9 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: Bo
             f"Choosing the number of modes by cross-validation needs at least four shapes, not {n}; "
             "ask for a number of modes or a share of the variance instead."
         )
+    if n > MOST_SHAPES:
+        rows = drawn(n, seed)
+        data, counted, n = data[rows], None if counted is None else counted[rows], len(rows)
     folds = min(folds, n)
     rng = np.random.default_rng(seed)
     parts = np.array_split(rng.permutation(n).astype(np.int32), folds)
@@ -77,6 +84,13 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: Bo
     best = int(mean.argmin())
     choice = int(np.flatnonzero(mean <= mean[best] + standard_error[best])[0])
     return ModeChoice(int(candidates[choice]), candidates, mean, standard_error)
+
+
+def drawn(n: int, seed: int) -> IntArray:
+    """Return the shapes, of n, that the number of modes is chosen by, in order: all, or `MOST_SHAPES` of them."""
+    if n <= MOST_SHAPES:
+        return np.arange(n, dtype=np.int32)
+    return np.sort(np.random.default_rng(seed).permutation(n)[:MOST_SHAPES]).astype(np.int32)
 
 
 def _at(centred: FloatArray, vertices: BoolArray) -> FloatArray:

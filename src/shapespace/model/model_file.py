@@ -22,7 +22,8 @@ from shapespace.version import __version__
 FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
 _HELD_OUT = "held out"
-_EVERY_MODEL = ("mean", "basis", "stddev", "faces")
+_RESIDUALS = "residuals"
+_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS)
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3
 _TOLD = 200
@@ -58,6 +59,7 @@ class ModelFields(TypedDict):
     provenance: str
     licence: str
     held_out: bool
+    residuals: FloatArray | None
 
 
 def hash_of(model: ModelFields) -> str:
@@ -82,6 +84,8 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays: dict[str, npt.NDArray[Any]] = {name: model[name] for name in ("mean", "basis", "stddev")}
     if model["faces"] is not None:
         arrays["faces"] = model["faces"]
+    if model["residuals"] is not None:
+        arrays[_RESIDUALS] = model["residuals"]
     arrays.update(model["coding"])
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
@@ -145,6 +149,7 @@ def load(path: Path) -> ModelFields:
             "provenance": told.provenance,
             "licence": told.licence,
             "held_out": told.variance_divisor == _HELD_OUT,
+            "residuals": owned.get(_RESIDUALS),
         }
     except (KeyError, ValueError) as error:
         what = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")

@@ -20,6 +20,7 @@ _CANCELLATION = 1e4
 """Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
 _NO_VARIANCE = 1e-10
 """Modes with less than this share of the first mode's variance are rounding, not shape (erratum to eq 4)."""
+ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 
@@ -34,6 +35,7 @@ class PrincipalComponents:
         variance: (K,) of the coefficients, mm^2, divisor N - 1.
         total_variance: of all modes together, kept or not, mm^2.
         n_samples: N.
+        residuals: (K,) mm^2, |C v - lambda v| of each mode by a product with the covariance; None where none was taken.
     """
 
     mean: FloatArray
@@ -41,17 +43,32 @@ class PrincipalComponents:
     variance: FloatArray
     total_variance: float
     n_samples: int
+    residuals: FloatArray | None = None
 
 
-def modes_for_variance(variance: FloatArray, share: float) -> int:
-    """Return the smallest number of modes that hold `share` (0 < share <= 1) of the sum of `variance` (R,).
+def check_share(share: float) -> None:
+    """Refuse a share of the variance that is none.
+
+    Raises:
+        InputError: it is outside (0, 1].
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"A share of the variance lies above 0 and at most at 1, not at {share:g}.")
+
+
+def modes_for_variance(variance: FloatArray, share: float, total: float | None = None) -> int:
+    """Return the smallest number of modes that hold `share` (0 < share <= 1) of `total`, or of the sum of `variance`.
+
+    Args:
+        variance: (R,) falling.
+        share: of the variance.
+        total: of all modes, where `variance` is not of all.
 
     Raises:
         InputError: a share outside (0, 1].
     """
-    if not 0 < share <= 1:
-        raise InputError(f"A share of the variance lies above 0 and at most at 1, not at {share:g}.")
-    cumulative = np.cumsum(variance) / variance.sum()
+    check_share(share)
+    cumulative = np.cumsum(variance) / (variance.sum() if total is None else total)
     return int(min(np.searchsorted(cumulative, share * (1 - 1e-12)) + 1, len(variance)))
 
 
@@ -69,19 +86,17 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
     n, d = data.shape
     from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
 
-    if n < 2:
-        raise InputError(f"A shape model needs at least two training shapes, not {n}.")
     modes = checked_modes(modes, n)
     data = np.ascontiguousarray(data)
     gram = _centred_gram(data)
     total = float(gram.trace())
     if total <= n * d * (64 * np.finfo(float).eps * float(np.abs(data[0]).max())) ** 2:
-        raise InputError("The training shapes are all equal, so there is no variation to model; give different ones.")
+        raise InputError(ALL_EQUAL)
 
     wanted = modes if isinstance(modes, int) else n - 1
     values, vectors = eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True)
     variance = values[::-1] / (n - 1)  # eq 4
-    variance = variance[variance > _NO_VARIANCE * variance[0]]
+    variance = varying(variance)
     if isinstance(modes, float):
         variance = variance[: modes_for_variance(variance, modes)]
     weights = vectors[:, ::-1][:, : len(variance)] / np.sqrt(variance * (n - 1))
@@ -93,8 +108,10 @@ def checked_modes(modes: int | float | None, n: int) -> int | float | None:
     """Return `modes` as asked for of n shapes: a plain number, a share of the variance, or None for all.
 
     Raises:
-        InputError: it is something else, or more than so many shapes give.
+        InputError: it is something else, or more than so many shapes give, or there are fewer than two shapes.
     """
+    if n < 2:
+        raise InputError(f"A shape model needs at least two training shapes, not {n}.")
     if isinstance(modes, np.integer):
         modes = int(modes)
     if modes is not None and not isinstance(cast(object, modes), (int, float)):
@@ -109,6 +126,11 @@ def checked_modes(modes: int | float | None, n: int) -> int | float | None:
     return modes
 
 
+def varying(variance: FloatArray) -> FloatArray:
+    """Return those of the falling variances (K,) that are shape and not rounding."""
+    return variance[variance > _NO_VARIANCE * variance[0]]
+
+
 def fix_signs(rows: FloatArray) -> None:
     """Give each mode (K, D), in place, the sign that makes the first of its largest entries positive."""
     for row in rows:
@@ -117,7 +139,7 @@ def fix_signs(rows: FloatArray) -> None:
             row *= -1.0
 
 
-def _syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
+def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
     """Return the lower triangle of block @ block.T, (N, N) Fortran-ordered, added to `onto` where given."""
     from scipy.linalg import blas
 
@@ -131,7 +153,7 @@ def _syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
 def _centred_gram(data: FloatArray) -> FloatArray:
     """Return the lower triangle of X^T X (N, N), X the centred shapes (eqs 1-3)."""
     n = len(data)
-    raw = _syrk(data)
+    raw = syrk(data)
     if not np.isfinite(raw.diagonal()).all():
         raise InputError("The training shapes hold values that are not finite.")
     raw_trace = raw.trace()
@@ -152,7 +174,7 @@ def _centred_gram_by_blocks(data: FloatArray) -> FloatArray:
     for start in range(0, d, _BLOCK):
         block = data[:, start : start + _BLOCK] - data[0, start : start + _BLOCK]
         block -= block.mean(axis=0)
-        gram = _syrk(block, onto=gram)
+        gram = syrk(block, onto=gram)
     return gram
 
 
@@ -164,14 +186,19 @@ def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, 
     column_sums = weights.sum(axis=0)
     for row, column_sum in zip(rows, column_sums, strict=True):
         row -= column_sum * mean
+    orthonormal_rows(rows)
+    return mean, rows.T
+
+
+def orthonormal_rows(rows: FloatArray) -> None:
+    """Give modes (K, D), orthonormal but for rounding, their signs, and take the rounding out, in place."""
     fix_signs(rows)
     # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
     overlap = rows @ rows.T
-    if np.abs(overlap - np.eye(k)).max() > 1e-12:
+    if np.abs(overlap - np.eye(len(rows))).max() > 1e-12:
         from scipy.linalg import solve_triangular
 
         factor = np.linalg.cholesky(overlap)
         for start in range(0, rows.shape[1], _BLOCK):
             part = slice(start, start + _BLOCK)
             rows[:, part] = np.asarray(solve_triangular(factor, rows[:, part], lower=True))
-    return mean, rows.T

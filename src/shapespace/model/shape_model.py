@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import weakref
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +25,17 @@ from shapespace.model.missing import MIN_SEEN, Kept, complete
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
+from shapespace.model.streamed import (
+    Aligned,
+    KeptShapes,
+    Meshes,
+    Scratch,
+    Tell,
+    aligned_on_disk,
+    bytes_in_memory,
+    refuse_without_extent,
+    too_large,
+)
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _PROJECTION_ITERATIONS = 200
@@ -57,6 +69,8 @@ class ShapeModel:
         provenance: what it was made from, in words.
         licence: licence of the training data.
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
+        residuals: (K,) mm^2, |C v - lambda v| of each mode where it was found by passes over the shapes (PCA beyond
+            memory); None where the modes are exact to rounding.
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
@@ -76,6 +90,7 @@ class ShapeModel:
     provenance: str = ""
     licence: str = ""
     held_out: bool = False
+    residuals: FloatArray | None = None
     left_out: int = 0
 
     def __post_init__(self) -> None:
@@ -96,6 +111,13 @@ class ShapeModel:
             raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
         if self.representation not in REPRESENTATIONS:
             raise InputError(f"There is no representation {self.representation!r} in this version of shapespace.")
+        if self.residuals is not None:
+            residuals = read_only(self.residuals)
+            if residuals.shape != (k,) or not (residuals >= 0).all():
+                raise InputError(
+                    f"The residuals of {k} modes must be as many numbers from 0 up, not {residuals.shape}."
+                )
+            object.__setattr__(self, "residuals", residuals)
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "basis", basis)
         object.__setattr__(self, "stddev", stddev)
@@ -106,14 +128,12 @@ class ShapeModel:
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
-        for name, vertex in self.landmarks.items():
-            if not 0 <= vertex < len(checked.vertices):
-                raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
+        _refuse_far_landmarks(self.landmarks, len(checked.vertices))
 
     @classmethod
     def fit(
         cls,
-        meshes: Sequence[Mesh],
+        meshes: Meshes,
         *,
         modes: int | float | Literal["auto"] | None = None,
         gauge: Gauge = "shape",
@@ -126,11 +146,16 @@ class ShapeModel:
         provenance: str = "",
         licence: str = "",
         seed: int = 0,
+        out_of_core: bool | None = None,
+        scratch: Scratch | None = None,
+        keep_shapes: Path | None = None,
+        tell: Tell = lambda _: None,
     ) -> ShapeModel:
         """Build the shape space of corresponding `meshes` (eqs 1-5), in mm.
 
         Args:
-            meshes: at least two, same vertices in the same order, same triangles. Vertices that are not-a-number are
+            meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
+                and items that loads a mesh when it is asked for it. Vertices that are not-a-number are
                 missing: a model of vertices learns from those that are there, one of B-splines from filled ones.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
                 vertices; None for every mode that varies.
@@ -145,15 +170,43 @@ class ShapeModel:
                 their triangles and landmarks. Where nothing is missing it does nothing.
             provenance: what the meshes are, in words.
             licence: of the meshes.
-            seed: of the cross-validation.
+            seed: of the cross-validation, and of the first directions where modes are found by passes.
+            out_of_core: whether to stream the meshes, each loaded once and not held, through a file of single
+                precision as large as they are: the same model but for that rounding, with `residuals`. None does so
+                where a model of vertices would need more than four fifths of the memory that is free.
+            scratch: for the file, and for what a build that is killed goes on with; None takes the system's folder
+                for temporary files and does not go on.
+            keep_shapes: a folder to keep that file in, for `with_more`; the meshes are then streamed.
+            tell: told what is being done while meshes are streamed.
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.
             MeshError: for B-splines: the surface cannot be spread out on a square.
             InputError: too few meshes, values that are not finite, no variation, too many modes asked for, an unknown
-                representation, control points that cannot be.
+                representation, control points that cannot be; streamed meshes with missing vertices, or for B-splines.
+            FileError: the disk has no room for the file.
         """
         kind = representation_named(representation, control_points)
+        if kind is not Vertices and (out_of_core or keep_shapes is not None):
+            raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
+        if out_of_core is None and kind is Vertices and len(meshes) > 1:
+            out_of_core = too_large(bytes_in_memory(len(meshes), meshes[0], choose=modes == "auto"))
+        if out_of_core or keep_shapes is not None:
+            stream = aligned_on_disk(
+                meshes,
+                gauge,
+                align=align,
+                alignment_vertices=alignment_vertices,
+                scratch=scratch,
+                onto=None,
+                modes=modes,
+                tell=tell,
+            )
+            if len(meshes):
+                _refuse_far_landmarks(landmarks or {}, len(meshes[0].vertices))
+            about = {"landmarks": landmarks or {}, "provenance": provenance, "licence": licence}
+            return cls._of_streamed(stream, modes, seed, keep_shapes, tell, about)
+        meshes = [meshes[index] for index in range(len(meshes))]
         faces = common_faces(meshes)
         if not kind.takes_holes and len(meshes) > 1:
             kept = Kept.of(meshes, min_seen)
@@ -162,7 +215,8 @@ class ShapeModel:
         shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
         rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
         if align:
-            _refuse_without_extent(shapes, names)
+            for shape, name in zip(shapes, names, strict=True):
+                refuse_without_extent(shape, name)
         completed = None
         if np.isnan(shapes).any():
             completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
@@ -179,10 +233,122 @@ class ShapeModel:
             pc = _components(coder.encode(shapes), modes, seed)
         else:
             pc = _components_of_codes(coder, shapes, modes, seed)
-        spurious = below_precision(pc.variance, len(meshes), shapes[0].size, rounding)
+        return cls._of_components(
+            pc,
+            coder,
+            rounding=rounding,
+            align=align,
+            alignment_vertices=alignment_vertices,
+            faces=faces,
+            gauge=gauge,
+            landmarks=landmarks or {},
+            representation=representation,
+            provenance=provenance,
+            licence=licence,
+        )
+
+    def with_more(
+        self,
+        meshes: Meshes,
+        shapes: Path,
+        *,
+        modes: int | float | Literal["auto"] | None = None,
+        provenance: str = "",
+        licence: str = "",
+        seed: int = 0,
+        scratch: Scratch | None = None,
+        keep_shapes: Path | None = None,
+        tell: Tell = lambda _: None,
+    ) -> ShapeModel:
+        """Return the model of the shapes that this one was made of and of `meshes`, without the first ones' meshes.
+
+        It is the model that `fit` makes of all of them, but for rounding to single precision: all shapes are aligned
+        anew, beginning from the poses that are known.
+
+        Args:
+            meshes: at least one, corresponding to the model.
+            shapes: the folder that `fit` was given as `keep_shapes`.
+            modes: as of `fit`.
+            provenance: of the new model; empty for that of this one.
+            licence: the same.
+            seed: as of `fit`.
+            scratch: as of `fit`.
+            keep_shapes: a folder to keep all shapes in, other than `shapes`.
+            tell: as of `fit`.
+
+        Raises:
+            CorrespondenceError: a mesh differs from the model in vertices or triangles.
+            InputError: shapes of another model, or what `fit` refuses.
+            FileError: there are no shapes, or the disk is full.
+        """
+        kept = KeptShapes.load(shapes)
+        if kept.model_hash != self.content_hash:
+            raise InputError(
+                f"The shapes in {shapes} are those of another model; give the model that was built with them."
+            )
+        if not len(meshes):
+            raise InputError("There are no meshes to be added; give at least one.")
+        kept.check()
+        stream = aligned_on_disk(
+            meshes,
+            kept.gauge,
+            align=kept.align,
+            alignment_vertices=kept.alignment_vertices,
+            scratch=scratch,
+            onto=kept,
+            modes=modes,
+            tell=tell,
+        )
+        about = {
+            "landmarks": self.landmarks,
+            "provenance": provenance or self.provenance,
+            "licence": licence or self.licence,
+        }
+        return self._of_streamed(stream, modes, seed, keep_shapes, tell, about)
+
+    @classmethod
+    def _of_streamed(
+        cls,
+        stream: AbstractContextManager[Aligned],
+        modes: int | float | Literal["auto"] | None,
+        seed: int,
+        keep_shapes: Path | None,
+        tell: Tell,
+        about: Mapping[str, Any],
+    ) -> ShapeModel:
+        with stream as aligned:
+            told = aligned.kept
+            model = cls._of_components(
+                aligned.components(modes, seed, tell),
+                Vertices(),
+                rounding=told.rounding,
+                align=told.align,
+                alignment_vertices=told.alignment_vertices,
+                faces=told.faces,
+                gauge=told.gauge,
+                **about,
+            )
+            if keep_shapes is not None:
+                aligned.keep(keep_shapes, model.content_hash)
+        return model
+
+    @classmethod
+    def _of_components(
+        cls,
+        pc: PrincipalComponents,
+        coder: Representation,
+        *,
+        rounding: float,
+        align: bool,
+        alignment_vertices: IntArray | None,
+        gauge: Gauge,
+        **about: Any,
+    ) -> ShapeModel:
+        """Return the model of these components, without modes that no shape made."""
+        mean = coder.decode(pc.mean)
+        spurious = below_precision(pc.variance, pc.n_samples, mean.size, rounding)
         if align:
-            basis = coder.directions(pc.basis)
-            spurious |= made_by_alignment(coder.decode(pc.mean), basis, gauge, alignment_vertices)
+            spurious |= made_by_alignment(mean, coder.directions(pc.basis), gauge, alignment_vertices)
         if spurious.all():
             raise InputError(
                 "The training meshes differ by no more than their alignment and their rounding make of them, so there "
@@ -192,16 +358,13 @@ class ShapeModel:
             mean=pc.mean,
             basis=pc.basis[:, ~spurious],
             stddev=np.sqrt(pc.variance[~spurious]),
+            residuals=None if pc.residuals is None else pc.residuals[~spurious],
             left_out=int(spurious.sum()),
             total_variance=pc.total_variance,
             n_training=pc.n_samples,
-            faces=faces,
             gauge=gauge,
-            landmarks=landmarks or {},
-            representation=representation,
             coding=coder.arrays(),
-            provenance=provenance,
-            licence=licence,
+            **about,
         )
 
     @cached_property
@@ -354,7 +517,8 @@ class ShapeModel:
         """
         if not 1 <= modes <= self.n_modes:
             raise InputError(f"This model has {self.n_modes} modes, so it cannot be cut to {modes}.")
-        return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes])
+        residuals = None if self.residuals is None else self.residuals[:modes]
+        return dataclasses.replace(self, basis=self.basis[:, :modes], stddev=self.stddev[:modes], residuals=residuals)
 
     def fields(self) -> model_file.ModelFields:
         """Return what the model is made of, by the names of its arguments."""
@@ -420,6 +584,12 @@ def _components_of_codes(
     return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
 
 
+def _refuse_far_landmarks(landmarks: Mapping[str, int], n_vertices: int) -> None:
+    for name, vertex in landmarks.items():
+        if not 0 <= vertex < n_vertices:
+            raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
+
+
 def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:
     """Refuse modes that vary by less than the vertices are rounded to, or by far more than the shape is large."""
     norm = float(np.linalg.norm(mean_vertices - mean_vertices.mean(axis=0)))
@@ -467,12 +637,3 @@ def _refuse_equal(shapes: FloatArray) -> None:
     spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
     if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
         raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
-
-
-def _refuse_without_extent(shapes: FloatArray, names: Sequence[str]) -> None:
-    for whole, name in zip(shapes, names, strict=True):
-        shape = whole[~np.isnan(whole).any(axis=1)]
-        centred = shape - shape.mean(axis=0)
-        extent = np.linalg.eigvalsh(centred.T @ centred)
-        if extent[1] <= 1e-9 * extent[2]:
-            raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out.")

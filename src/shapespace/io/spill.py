@@ -1,0 +1,155 @@
+"""Rows of single precision in one file, for tables that do not fit into memory.
+
+The file holds panels of columns one after the other, each a C-ordered (rows, width) block of little-endian float32, so
+that both a block of rows and a block of columns are read in long runs. There is no header.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from io import FileIO
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileFormatError
+from shapespace.io.files import read_error, write_error
+from shapespace.types import FloatArray
+
+_PANEL = 1024
+_BLOCK_BYTES = 64 << 20
+_FLOAT32 = np.dtype("<f4")
+
+
+class Spill:
+    """A table (rows, columns) of float32 on the disk; what is read of it is float64.
+
+    Args:
+        path: its file.
+        rows: N.
+        columns: D.
+        new: whether to make the file, as large as the table at once; otherwise it is there.
+
+    Raises:
+        FileError: it cannot be written or read, or the disk is full.
+        FileFormatError: an old file is of another size.
+    """
+
+    def __init__(self, path: Path, rows: int, columns: int, *, new: bool) -> None:
+        self.path, self.rows, self.columns = path, rows, columns
+        size = rows * columns * _FLOAT32.itemsize
+        try:
+            self._file = FileIO(path, "w+" if new else "r+")
+        except OSError as error:
+            raise (write_error if new else read_error)(path, error) from error
+        try:
+            if new:
+                self._reserve(size)
+            elif path.stat().st_size != size:
+                raise FileFormatError(f"{path} is {path.stat().st_size} bytes long, not {size}; it is cut short.")
+        except OSError as error:
+            self._file.close()
+            path.unlink(missing_ok=True)
+            raise write_error(path, error) from error
+        except FileFormatError:
+            self._file.close()
+            raise
+
+    def _reserve(self, size: int) -> None:
+        # A disk that is too small is told now, and not after an hour.
+        if hasattr(os, "posix_fallocate") and size:
+            os.posix_fallocate(self._file.fileno(), 0, size)
+        else:
+            self._file.truncate(size)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+    @property
+    def block_rows(self) -> int:
+        """Rows of a block that takes some 64 MB as float64."""
+        return max(1, min(self.rows, _BLOCK_BYTES // (8 * max(self.columns, 1))))
+
+    def write_rows(self, start: int, block: FloatArray) -> None:
+        """Write `block` (n, D) as the rows from `start` on.
+
+        Raises:
+            FileError: the disk is full.
+        """
+        single = block.astype(_FLOAT32)
+        for columns in self._panels():
+            part = np.ascontiguousarray(single[:, columns]).data.cast("B")
+            try:
+                self._seek(columns, start)
+                while len(part):
+                    part = part[self._file.write(part) :]
+            except OSError as error:
+                raise write_error(self.path, error) from error
+
+    def rows_from(self, start: int, stop: int) -> FloatArray:
+        """Return the rows (stop - start, D).
+
+        Raises:
+            FileError: they cannot be read.
+        """
+        out = np.empty((stop - start, self.columns))
+        for columns in self._panels():
+            out[:, columns] = self._read(columns, start, stop)
+        return out
+
+    def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
+        """Yield (start, rows) of the whole table, in order."""
+        for start in range(0, self.rows, self.block_rows):
+            yield start, self.rows_from(start, min(start + self.block_rows, self.rows))
+
+    def column_blocks(self) -> Iterator[FloatArray]:
+        """Yield blocks of columns (N, w) of the whole table, in order."""
+        for columns in self._panels():
+            out = np.empty((self.rows, columns.stop - columns.start))
+            for start in range(0, self.rows, 4096):
+                stop = min(start + 4096, self.rows)
+                out[start:stop] = self._read(columns, start, stop)
+            yield out
+
+    def to_disk(self) -> None:
+        """Wait until all that was written is on the disk.
+
+        Raises:
+            FileError: the disk is full.
+        """
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise write_error(self.path, error) from error
+
+    def _panels(self) -> list[slice]:
+        return [slice(at, min(at + _PANEL, self.columns)) for at in range(0, self.columns, _PANEL)]
+
+    def _seek(self, columns: slice, row: int) -> None:
+        width = columns.stop - columns.start
+        self._file.seek(_FLOAT32.itemsize * (columns.start * self.rows + row * width))
+
+    def _read(self, columns: slice, start: int, stop: int) -> npt.NDArray[np.float32]:
+        part = np.empty((stop - start, columns.stop - columns.start), dtype=_FLOAT32)
+        view = part.data.cast("B")
+        try:
+            self._seek(columns, start)
+            while len(view):
+                count = self._file.readinto(view)
+                if not count:
+                    raise FileFormatError(f"{self.path} is cut short; start again.")
+                view = view[count:]
+        except OSError as error:
+            raise read_error(self.path, error) from error
+        return part

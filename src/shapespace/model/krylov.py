@@ -1,0 +1,206 @@
+"""The leading eigenvectors of a large symmetric matrix that is known by its products alone: block Krylov.
+
+Block Lanczos with full reorthogonalisation and Rayleigh-Ritz over all blocks: Golub and Underwood, Mathematical
+Software III, 1977; Musco and Musco, NeurIPS 2015, for how few products it takes. Each step is one product, so where the
+matrix is that of shapes on a disk, one pass over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.io.arrays import read_arrays, write_arrays
+from shapespace.types import FloatArray
+
+_DEPENDENT = 1e-13
+"""New directions shorter than this share of the first eigenvalue are rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leading:
+    """Eigenvalues and eigenvectors.
+
+    Args:
+        values: (K,), falling.
+        vectors: (D, K), orthonormal.
+        residuals: (K,) |C v - lambda v| of each, as found by a product with them.
+        passes: products that were taken, this and former runs together.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+    residuals: FloatArray
+    passes: int
+
+
+@dataclass(frozen=True)
+class KeptPasses:
+    """Where the blocks of a run are kept, so that one that is killed goes on with the pass it was in.
+
+    Args:
+        folder: it must belong to this matrix, these modes and this seed alone.
+    """
+
+    folder: Path
+
+    def _file(self, step: int) -> Path:
+        return self.folder / f"pass-{step:03d}.npz"
+
+    def recall(self, step: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return what `keep` was given; None where there is nothing whole."""
+        stored = read_arrays(self._file(step))
+        return None if stored is None else (stored["block"], stored["products"], stored["beyond"])
+
+    def keep(self, step: int, block: FloatArray, products: FloatArray, beyond: FloatArray) -> None:
+        """Keep the next block (D, b), the products of the basis (m, b) and what leads beyond it (b, b).
+
+        Raises:
+            FileError: the disk is full.
+        """
+        write_arrays(self._file(step), {"block": block, "products": products, "beyond": beyond})
+
+
+@dataclass(frozen=True)
+class Stop:
+    """When the eigenvectors are good enough: |C v - lambda v| bounds how far each is turned, by its gap.
+
+    Args:
+        radians: that a mode may be turned by.
+        least_gap: eigenvalues nearer than this share of the first are not told apart.
+        enough: residual, as a share of the first eigenvalue, that will do where the basis may not grow any more.
+    """
+
+    radians: float = 1e-6
+    least_gap: float = 1e-6
+    enough: float = 1e-6
+
+    def reached(self, values: FloatArray, residuals: FloatArray) -> bool:
+        """Return whether all modes are: `values` (K + 1,) with the next one, `residuals` (K,)."""
+        steps = -np.diff(values)
+        gaps = np.minimum(steps, np.concatenate([steps[:1], steps[:-1]]))
+        return bool((residuals <= self.radians * np.maximum(gaps, self.least_gap * values[0])).all())
+
+
+def leading(
+    apply: Callable[[FloatArray], FloatArray],
+    size: int,
+    modes: int | float,
+    total: float,
+    *,
+    block: int,
+    most_columns: int,
+    stop: Stop,
+    seed: int = 0,
+    kept: KeptPasses | None = None,
+    on_pass: Callable[[int, float], None] | None = None,
+) -> Leading | None:
+    """Return the leading eigenvectors of C (D, D); None where a basis of `most_columns` does not hold them.
+
+    Args:
+        apply: Q (D, b) -> C Q; C is symmetric and positive.
+        size: D.
+        modes: how many; a float for as many as hold that share of `total`.
+        total: trace of C.
+        block: columns of a product.
+        most_columns: of the basis.
+        stop: when to.
+        seed: of the first block.
+        kept: where to keep each pass; None keeps nothing.
+        on_pass: called with the number of a pass and the largest residual after it as a share of the first eigenvalue.
+    """
+    Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, min(block, size))))[0]
+    basis: list[FloatArray] = []
+    T = np.empty((0, 0))
+    while True:
+        basis.append(Q)
+        step = len(basis)
+        told = kept.recall(step) if kept is not None else None
+        if told is None:
+            W = apply(Q)
+            products = _taken_off(W, basis)
+            products += _taken_off(W, basis)
+            Q, beyond = _orthonormal(W, basis, _DEPENDENT * float(np.abs(T).max(initial=np.abs(products).max())))
+            if kept is not None:
+                kept.keep(step, Q, products, beyond)
+        else:
+            Q, products, beyond = told
+        T = _bordered(T, products)
+        full, exhausted = len(T) + Q.shape[1] > most_columns, not Q.shape[1]
+        wanted = _wanted(T, modes, total)
+        if wanted is not None or exhausted:
+            count = len(T) if wanted is None else wanted
+            values, S = _first(T, count + 1)
+            residuals = np.linalg.norm(beyond @ S[len(S) - beyond.shape[1] :, :count], axis=0)
+            if on_pass is not None:
+                on_pass(step, float(residuals.max() / values[0]))
+            if exhausted or stop.reached(values, residuals) or (full and residuals.max() <= stop.enough * values[0]):
+                found = _refined(apply, basis, S[:, :count])
+                if exhausted or found.residuals.max() <= stop.enough * found.values[0]:
+                    return found
+        if full:
+            return None
+
+
+def _wanted(T: FloatArray, modes: int | float, total: float) -> int | None:
+    """Return how many modes to look for, or None where the basis is yet too small for them and one more."""
+    if isinstance(modes, int):
+        return modes if len(T) > modes else None
+    held = np.cumsum(np.linalg.eigvalsh(T)[::-1]) >= modes * total
+    return int(held.argmax()) + 1 if held[:-1].any() else None
+
+
+def _first(T: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the first `count` eigenvalues, falling, and vectors; a last value of 0 where `T` has fewer."""
+    from scipy.linalg import eigh
+
+    m = len(T)
+    values, S = eigh(T, subset_by_index=(max(m - count, 0), m - 1), check_finite=False)
+    return np.append(values[::-1], np.zeros(max(count - m, 0))), np.asarray(S[:, ::-1])
+
+
+def _taken_off(W: FloatArray, basis: list[FloatArray]) -> FloatArray:
+    """Take the part of `W` (D, b) along the basis off it, and return its products with it (m, b)."""
+    products = [Q.T @ W for Q in basis]
+    for Q, product in zip(basis, products, strict=True):
+        W -= Q @ product
+    return np.vstack(products)
+
+
+def _orthonormal(W: FloatArray, basis: list[FloatArray], least: float) -> tuple[FloatArray, FloatArray]:
+    """Return Q (D, b') and B (b', b) so that W is Q B but for what is shorter than `least`, Q orthogonal to `basis`."""
+    Q, R = np.linalg.qr(W)
+    U, lengths, Vt = np.linalg.svd(R)
+    there = lengths > least
+    Q = Q @ U[:, there]
+    # Short directions were blown up together with the rounding along the basis.
+    _taken_off(Q, basis)
+    Q, R = np.linalg.qr(Q)
+    return Q, R @ (lengths[there, None] * Vt[there])
+
+
+def _bordered(T: FloatArray, products: FloatArray) -> FloatArray:
+    m = len(T)
+    out = np.empty((len(products), len(products)))
+    out[:m, :m] = T
+    out[:, m:] = products
+    out[m:, :m] = products[:m].T
+    out[m:, m:] = (products[m:] + products[m:].T) / 2
+    return out
+
+
+def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray], S: FloatArray) -> Leading:
+    """Return the eigenvectors within the span of the sums `S` (m, K) of the basis, and what a product says of them."""
+    V, at = np.zeros((len(basis[0]), S.shape[1])), 0
+    for Q in basis:
+        V += Q @ S[at : at + Q.shape[1]]
+        at += Q.shape[1]
+    CV = apply(V)
+    small = V.T @ CV
+    values, R = np.linalg.eigh((small + small.T) / 2)
+    values, R = values[::-1].copy(), R[:, ::-1]
+    V, CV = V @ R, CV @ R
+    return Leading(values, V, np.linalg.norm(CV - V * values, axis=0), len(basis) + 1)

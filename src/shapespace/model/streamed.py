@@ -1,0 +1,551 @@
+"""Shapes that do not fit into memory, made ready for PCA: read one by one, aligned by passes over one file.
+
+The file holds each shape as its difference from a template, in single precision: first in a pose near that of the
+template, then, when the poses are known, aligned and about the mean. Nothing else grows with the number of shapes but
+the poses, 96 bytes each.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.geometry.procrustes import (
+    Gauge,
+    Poses,
+    Streamed,
+    align_streamed,
+    centroid_size,
+    check_alignment,
+    scale_to_tangent_streamed,
+)
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.arrays import read_arrays, write_arrays
+from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
+from shapespace.io.memory import available_bytes
+from shapespace.io.spill import Spill
+from shapespace.model.choose_modes import choose_modes, drawn
+from shapespace.model.krylov import KeptPasses
+from shapespace.model.large_pca import checked_large_modes, large_components
+from shapespace.model.pca import ALL_EQUAL, PrincipalComponents
+from shapespace.model.spurious import rounding_mm
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
+
+Tell: TypeAlias = Callable[[str], None]
+_SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
+_IDENTITY, _LOCK = "identity.txt", "lock"
+_KEPT = "shapes.npz"
+_COPIES, _COPIES_TO_CHOOSE, _MOST_OF_MEMORY = 2.0, 4.5, 0.8
+_SAMPLE_BYTES = 256 << 20
+_TOLD_EVERY = 200
+_ROUNDING = 64 * float(np.finfo(float).eps)
+
+
+class Meshes(Protocol):
+    """Meshes that may be loaded when they are asked for: a list, or anything with a length and an item."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Mesh: ...
+
+
+@dataclass(frozen=True)
+class Scratch:
+    """Where a build keeps what it would need to go on after it is killed; the folder vanishes when it is done.
+
+    Args:
+        folder: of this build alone.
+        identity: of the meshes and settings; what is kept of another one is dropped.
+    """
+
+    folder: Path
+    identity: str
+
+
+@dataclass(frozen=True, eq=False)
+class KeptShapes:
+    """The aligned shapes of a model, beside its file, to which others can be added.
+
+    Args:
+        folder: that holds them.
+        model_hash: of that model.
+        digest: SHA-256 of the file of shapes.
+        faces: (F, 3) of the shapes, or None.
+        template: (V, 3) mm; the shapes are stored as differences from it.
+        reference: (V, 3) mm, whose orientation is the frame.
+        sizes: (N,) centroid sizes of the meshes as they were given, mm.
+        gauge: of the model.
+        align: whether they were aligned.
+        alignment_vertices: that carried the alignment, or None for all.
+        rounding: of the first mesh, mm.
+    """
+
+    folder: Path
+    model_hash: str
+    digest: str
+    faces: IntArray | None
+    template: FloatArray
+    reference: FloatArray
+    sizes: FloatArray
+    gauge: Gauge
+    align: bool
+    alignment_vertices: IntArray | None
+    rounding: float
+
+    @staticmethod
+    def load(folder: Path) -> KeptShapes:
+        """Return what a build kept in `folder`.
+
+        Raises:
+            FileError: there is nothing.
+            FileFormatError: it is damaged.
+        """
+        path = folder / _KEPT
+        if not path.is_file():
+            raise FileError(
+                f"There are no shapes in {folder}, so none can be added to them; build the model again with "
+                "--keep-shapes (keep_shapes), which keeps them there."
+            )
+        try:
+            arrays = read_arrays(path) or {}
+            told = json.loads(str(arrays["told"]))
+            shape = arrays["template"].shape
+            if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
+                raise ValueError
+            return KeptShapes(
+                folder=folder,
+                model_hash=str(told["model_hash"]),
+                digest=str(told["digest"]),
+                faces=arrays.get("faces"),
+                template=arrays["template"],
+                reference=arrays["reference"],
+                sizes=arrays["sizes"],
+                gauge=cast(Gauge, told["gauge"]),
+                align=bool(told["align"]),
+                alignment_vertices=arrays.get("alignment_vertices"),
+                rounding=float(told["rounding"]),
+            )
+        except (ValueError, KeyError, TypeError) as error:
+            raise FileFormatError(
+                f"{path} is damaged; build the model again with --keep-shapes (keep_shapes)."
+            ) from error
+
+    def save(self) -> None:
+        """Write all but the shapes themselves to `folder`.
+
+        Raises:
+            FileError: the disk is full.
+        """
+        told = {name: getattr(self, name) for name in ("model_hash", "digest", "gauge", "align", "rounding")}
+        arrays = {"template": self.template, "reference": self.reference, "sizes": self.sizes}
+        optional = {"faces": self.faces, "alignment_vertices": self.alignment_vertices}
+        there = {name: array for name, array in optional.items() if array is not None}
+        write_arrays(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(told))})
+
+    def check(self) -> None:
+        """Refuse shapes that have changed since they were kept.
+
+        Raises:
+            FileError: they cannot be read.
+            FileFormatError: they have changed.
+        """
+        if sha256_of_file(self.folder / _SHAPES) != self.digest:
+            raise FileFormatError(
+                f"{self.folder / _SHAPES} is damaged: it does not match its checksum; copy it again, or build the "
+                "model again with --keep-shapes (keep_shapes)."
+            )
+
+    def opened(self) -> Spill:
+        """Return the shapes.
+
+        Raises:
+            FileError: they cannot be read.
+            FileFormatError: they are cut short.
+        """
+        return Spill(self.folder / _SHAPES, len(self.sizes), self.template.size, new=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """Aligned shapes on the disk, and what is known of them.
+
+    Args:
+        shapes: N rows of 3V numbers about `kept.template`.
+        kept: all the rest; its folder and model are not told yet.
+        passes: where those of the PCA are kept; None keeps nothing.
+    """
+
+    shapes: Spill
+    kept: KeptShapes
+    passes: KeptPasses | None
+
+    def components(self, modes: int | float | Literal["auto"] | None, seed: int, tell: Tell) -> PrincipalComponents:
+        """Return mean and modes, as `principal_components` does of shapes in memory.
+
+        Raises:
+            InputError: as `large_components`, or too few shapes to choose the number of modes.
+        """
+        if modes == "auto":
+            tell("choosing the number of modes")
+            modes = choose_modes(_sample(self.shapes, seed), seed=seed).modes
+        pc = large_components(
+            self.shapes,
+            modes,
+            seed=seed,
+            kept=self.passes,
+            on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
+        )
+        mean = pc.mean + self.kept.template.reshape(-1)
+        return PrincipalComponents(mean, pc.basis, pc.variance, pc.total_variance, pc.n_samples, pc.residuals)
+
+    def keep(self, folder: Path, model_hash: str) -> None:
+        """Move the shapes to `folder`, for later shapes to be added to theirs.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        make_folder(folder)
+        remove_file(folder / _KEPT)
+        try:
+            self.shapes.close()
+            shutil.move(self.shapes.path, folder / _SHAPES)
+        except OSError as error:
+            raise write_error(folder / _SHAPES, error) from error
+        digest = sha256_of_file(folder / _SHAPES)
+        replace(self.kept, folder=folder, model_hash=model_hash, digest=digest).save()
+
+
+def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
+    """Return about how many bytes a model of `count` meshes like this one takes while it is made in memory.
+
+    Args:
+        count: N.
+        mesh: one of them.
+        choose: whether the number of modes is chosen by cross-validation.
+    """
+    vertices = (_COPIES_TO_CHOOSE if choose else _COPIES) * mesh.vertices.nbytes
+    triangles = 0 if mesh.faces is None else mesh.faces.nbytes
+    return int(count * (vertices + triangles) + 2 * 8 * count**2)
+
+
+def too_large(needed: int) -> bool:
+    """Return whether so many bytes are more than four fifths of the memory that is free."""
+    free = available_bytes()
+    return free is not None and needed > _MOST_OF_MEMORY * free
+
+
+@contextlib.contextmanager
+def aligned_on_disk(
+    meshes: Meshes,
+    gauge: Gauge,
+    *,
+    align: bool,
+    alignment_vertices: IntArray | None,
+    scratch: Scratch | None,
+    onto: KeptShapes | None,
+    modes: int | float | Literal["auto"] | None,
+    tell: Tell,
+) -> Generator[Aligned]:
+    """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that vanishes with the block.
+
+    Args:
+        meshes: whole, one corresponding to the other.
+        gauge: as of `align_in_place`.
+        align: False takes them as they stand.
+        alignment_vertices: as of `align_in_place`.
+        scratch: for what a build that is killed goes on with; None takes a temporary folder and keeps nothing.
+        onto: shapes to which these are added.
+        modes: that will be asked for; what cannot be had is refused before anything is read.
+        tell: told what is being done.
+
+    Raises:
+        CorrespondenceError: the meshes differ in vertices or triangles.
+        InputError: missing vertices, values that are not finite, no variation, or too few meshes.
+        FileError: a mesh cannot be read, the disk is full, or another build uses the folder.
+    """
+    with _folder(scratch) as folder:
+        work = _Work(folder, meshes, gauge, align, alignment_vertices, onto, tell)
+        if modes != "auto":
+            checked_large_modes(modes, work.count, work.first.vertices.size)
+        path = folder / _SHAPES
+        try:
+            with work.aligned() as shapes:
+                passes = None if scratch is None else KeptPasses(folder)
+                yield Aligned(shapes, work.told(), passes)
+        finally:
+            path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _folder(scratch: Scratch | None) -> Generator[Path]:
+    if scratch is None:
+        with tempfile.TemporaryDirectory(prefix="shapespace-") as name:
+            yield Path(name)
+        return
+    folder = make_folder(scratch.folder)
+    with _only_one(folder):
+        identity = folder / _IDENTITY
+        if not identity.is_file() or identity.read_text("utf-8", "replace") != scratch.identity:
+            _empty(folder)
+            write_text(identity, scratch.identity)
+        try:
+            yield folder
+        except InputError:
+            _remove(folder)
+            raise
+        except BaseException:
+            # Without a pose or a pass there is nothing to go on with.
+            if not (folder / _POSES).is_file():
+                _remove(folder)
+            raise
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    _empty(folder)
+    with contextlib.suppress(OSError):
+        (folder / _LOCK).unlink()
+        folder.rmdir()
+
+
+def _empty(folder: Path) -> None:
+    for file in folder.iterdir():
+        if file.name != _LOCK:
+            file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _only_one(folder: Path) -> Generator[None]:
+    """Hold the folder for this process; the system lets go of it whatever ends the process."""
+    try:
+        import fcntl
+    except ImportError:  # Windows refuses to remove open files, which does as well
+        yield
+        return
+    with (folder / _LOCK).open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FileError(
+                f"Another build is at work in {folder}; wait for it, or give another name for the model."
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+
+
+class _Work:
+    """One build: what is read of the meshes, where it stands, and the poses that it comes to."""
+
+    def __init__(
+        self,
+        folder: Path,
+        meshes: Meshes,
+        gauge: Gauge,
+        align: bool,
+        alignment_vertices: IntArray | None,
+        onto: KeptShapes | None,
+        tell: Tell,
+    ) -> None:
+        if len(meshes) + (0 if onto is None else len(onto.sizes)) < 2:
+            raise InputError(
+                f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
+            )
+        self.folder, self.meshes, self.align, self.onto, self.tell = folder, meshes, align, onto, tell
+        self.gauge: Gauge = gauge
+        self.alignment_vertices = alignment_vertices
+        self.before = 0 if onto is None else len(onto.sizes)
+        self.count = self.before + len(meshes)
+        self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
+        self.chosen = check_alignment(gauge, alignment_vertices, len(self.first.vertices))
+        self.template: FloatArray = np.empty((0, 3))
+        self.sizes: FloatArray = np.empty(0)
+
+    def told(self) -> KeptShapes:
+        if self.onto is not None:
+            reference, rounding = self.onto.reference, self.onto.rounding
+        else:
+            reference, rounding = self.first.vertices, rounding_mm(self.first.vertices)
+        return KeptShapes(
+            folder=self.folder,
+            model_hash="",
+            digest="",
+            faces=self.first.faces,
+            template=self.template,
+            reference=reference,
+            sizes=self.sizes,
+            gauge=self.gauge,
+            align=self.align,
+            alignment_vertices=self.alignment_vertices,
+            rounding=rounding,
+        )
+
+    @contextlib.contextmanager
+    def aligned(self) -> Generator[Spill]:
+        """Yield the file of aligned shapes: as a build that was killed left it, or made anew."""
+        path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
+        poses = read_arrays(self.folder / _POSES)
+        whole = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
+        near = read_arrays(start) if whole else None
+        if whole and done.is_file() and poses is not None:
+            self.template, self.sizes = poses["template"], poses["sizes"]
+            with Spill(path, self.count, self.template.size, new=False) as shapes:
+                yield shapes
+            return
+        remove_file(done)
+        with Spill(path, self.count, self.first.vertices.size, new=near is None) as shapes:
+            if near is None:
+                remove_file(start)
+                near = self._read(shapes)
+                shapes.to_disk()
+                write_arrays(start, near)
+            if poses is None:
+                poses = self._posed(shapes, near)
+                write_arrays(self.folder / _POSES, poses)
+            self.template, self.sizes = poses["template"], poses["sizes"]
+            # From here on the file is neither as read nor aligned, until it is.
+            remove_file(start)
+            self._move(shapes, near["template"], Poses(poses["linear"], poses["offset"]))
+            shapes.to_disk()
+            write_text(done, "")
+            yield shapes
+
+    def _read(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
+        """Fill the file with shapes in poses near the template's, and return what is known of them."""
+        if self.onto is None:
+            template = self.first.vertices - (self.first.vertices[self.chosen].mean(axis=0) if self.align else 0.0)
+        else:
+            template = self.onto.template
+        sizes, posed, spread = np.empty(self.count), np.empty(self.count), _Spread()
+
+        def near(index: int, vertices: FloatArray) -> FloatArray:
+            sizes[index] = centroid_size(vertices[self.chosen])
+            if index >= self.before:
+                spread.take(vertices)
+                if self.align:
+                    with_scale = self.gauge == "shape"
+                    T = fit_similarity(vertices[self.chosen], template[self.chosen], with_scale=with_scale)
+                    vertices = T.apply(vertices)
+            posed[index] = centroid_size(vertices[self.chosen])
+            return vertices - template
+
+        self._fill(shapes, near)
+        if self.onto is None and spread.is_nothing():
+            raise InputError(ALL_EQUAL)
+        if self.onto is not None:
+            sizes[: self.before] = self.onto.sizes
+        return {"template": template, "sizes": sizes, "posed": posed}
+
+    def _fill(self, shapes: Spill, row: Callable[[int, FloatArray], FloatArray]) -> None:
+        block = np.empty((shapes.block_rows, shapes.columns))
+        for start in range(0, self.count, len(block)):
+            stop = min(start + len(block), self.count)
+            for index, vertices in self._shapes(start, stop):
+                block[index - start] = row(index, vertices).reshape(-1)
+            shapes.write_rows(start, block[: stop - start])
+
+    def _shapes(self, start: int, stop: int) -> Iterator[tuple[int, FloatArray]]:
+        """Yield (index, vertices (V, 3)) of shapes, checked."""
+        if self.onto is not None and start < self.before:
+            with self.onto.opened() as old:
+                rows = old.rows_from(start, min(stop, self.before))
+            yield from enumerate(rows.reshape(len(rows), -1, 3) + self.onto.template, start)
+        for index in range(max(start, self.before), stop):
+            if index % _TOLD_EVERY == 0:
+                self.tell(f"reading mesh {index - self.before + 1} of {len(self.meshes)}")
+            mesh = self.meshes[index - self.before]
+            common_faces((self.first, mesh))
+            _refuse_holes(mesh)
+            if self.align:
+                refuse_without_extent(mesh.vertices, mesh.name)
+            yield index, mesh.vertices
+
+    def _posed(self, shapes: Spill, near: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+        """Return the poses of the shapes in the file, and their mean."""
+        template: FloatArray = near["template"]
+        poses = Poses(np.broadcast_to(np.eye(3), (self.count, 3, 3)).copy(), np.zeros((self.count, 3)))
+        if self.align:
+            source = Streamed(shapes.row_blocks, self.count, template, near["posed"])
+            found, poses = align_streamed(
+                source,
+                self.gauge,
+                size=float(near["sizes"].mean()),
+                reference=self.first.vertices if self.onto is None else self.onto.reference,
+                alignment_vertices=self.alignment_vertices,
+                on_iteration=lambda n, moved: self.tell(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
+            )
+            mean = found.mean
+            if self.gauge == "shape" and self.alignment_vertices is None:
+                self.tell("scaling to the tangent")
+                mean = scale_to_tangent_streamed(source, mean, poses)
+        else:
+            summed = np.zeros(shapes.columns)
+            for _, block in shapes.row_blocks():
+                summed += block.sum(axis=0)
+            mean = template + summed.reshape(-1, 3) / self.count
+        return {"template": mean, "sizes": near["sizes"], "linear": poses.linear, "offset": poses.offset}
+
+    def _move(self, shapes: Spill, template: FloatArray, poses: Poses) -> None:
+        """Turn differences from `template` in the file into those of the posed shapes from their mean."""
+        for at, block in shapes.row_blocks():
+            vertices = block.reshape(len(block), -1, 3) + template
+            shapes.write_rows(at, (poses.apply(at, vertices) - self.template).reshape(len(block), -1))
+
+
+class _Spread:
+    """Whether shapes differ at all, as they are read one by one."""
+
+    def __init__(self) -> None:
+        self.least: FloatArray | None = None
+        self.most = self.least
+
+    def take(self, vertices: FloatArray) -> None:
+        self.least = vertices if self.least is None else np.minimum(self.least, vertices)
+        self.most = vertices if self.most is None else np.maximum(self.most, vertices)
+
+    def is_nothing(self) -> bool:
+        if self.least is None or self.most is None:
+            return True
+        largest = max(float(np.abs(self.least).max()), float(np.abs(self.most).max()))
+        return float((self.most - self.least).max()) <= _ROUNDING * largest
+
+
+def refuse_without_extent(vertices: FloatArray, name: str) -> None:
+    """Refuse a shape (V, 3), of which vertices may be missing, that determines no rotation.
+
+    Raises:
+        InputError: its vertices lie on a line or coincide.
+    """
+    shape = vertices[~np.isnan(vertices).any(axis=1)]
+    centred = shape - shape.mean(axis=0)
+    extent = np.linalg.eigvalsh(centred.T @ centred)
+    if extent[1] <= 1e-9 * extent[2]:
+        raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out.")
+
+
+def _refuse_holes(mesh: Mesh) -> None:
+    missing: BoolArray = np.isnan(mesh.vertices)
+    if missing.any():
+        raise InputError(
+            f"{mesh.name}: vertices are missing, and meshes that are streamed from the disk must be whole; leave it "
+            "out, or build from fewer meshes in memory."
+        )
+    if not (np.abs(mesh.vertices) < np.finfo(np.float32).max).all():
+        raise InputError(f"{mesh.name} holds vertices that are not finite; repair it or leave it out.")
+
+
+def _sample(shapes: Spill, seed: int) -> FloatArray:
+    """Return shapes (n, 3v) to choose the number of modes by: all, or as many as are looked at, within a bound."""
+    rows = drawn(shapes.rows, seed)
+    every = max(1, -(-8 * len(rows) * shapes.columns // _SAMPLE_BYTES))
+    return np.stack([shapes.rows_from(row, row + 1).reshape(-1, 3)[::every].reshape(-1) for row in rows])
