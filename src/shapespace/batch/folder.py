@@ -14,10 +14,12 @@ from typing import Any, cast
 from shapespace.batch.results import Source, coefficient_row, read_record, write_coefficients
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.files import sha256_of_file
+from shapespace.store.results import results_at
 
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"
 _LONGEST_NAME = 200
+_OF_SCANS = ("scan", "scan_name", "path", "scan_hash")
 
 
 def records_in(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -61,9 +63,9 @@ def names_for(
     """
     taken: dict[str, _Scan] = {}
     hashes: dict[str, str] = {}
-    for name, record in records_in(folder) if folder is not None else ():
-        if isinstance(record.get("scan"), dict):
-            source = cast(dict[str, Any], record["scan"])
+    for name, told in _sources_in(folder) if folder is not None else ():
+        if isinstance(told, dict):
+            source = cast(dict[str, Any], told)
             taken[name] = _Scan.of(source)
             hashes[name] = str(source.get("hash", ""))
     own = {scan: name for name, scan in reversed(taken.items())}
@@ -83,6 +85,17 @@ def names_for(
         else:
             names |= _told_apart(group, used)
     return [names[keys[scan]] for scan in scans]
+
+
+def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
+    """Yield NAME of each result in `folder`, of a store too, and what its record says of the scan."""
+    if (results := results_at(folder)) is not None:
+        for rows in results.iter_rows(_OF_SCANS):
+            for name, called, path, content_hash in zip(*(rows[column] for column in _OF_SCANS), strict=True):
+                yield name, {"name": called, "path": path, "hash": content_hash}
+    else:
+        for name, record in records_in(folder):
+            yield name, record.get("scan")
 
 
 def _key(scan: Path, folder: Path | None, address: str) -> _Scan:

@@ -110,7 +110,7 @@ def fit_record(
     return {
         "format": RECORD_FORMAT,
         "format_version": RECORD_VERSION,
-        "id": fit_identity(scan.content_hash, model.content_hash, result.config, marks),
+        "id": fit_identity(scan.content_hash, model.content_hash, _settings(result), marks),
         "scan": scan.as_dict(),
         "model": model.as_dict(),
         "landmarks": landmarks.as_dict() if landmarks else None,
@@ -150,6 +150,11 @@ def fit_record(
         "seconds": dict(result.seconds),
         "version": __version__,
     }
+
+
+def _settings(result: FitResult) -> dict[str, Any]:
+    """Return the settings as `FitConfig.as_dict` gives them."""
+    return {key: value for key, value in result.config.items() if key not in ("version", "scale_in_effect")}
 
 
 def _shown(result: FitResult) -> dict[str, Any]:

@@ -258,6 +258,8 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--dense", action="store_true",
                      help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
+    sub.add_argument("--store", action="store_true",
+                     help="keep results in few files, as is done by itself from 10,000 scans on")  # fmt: skip
     sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.fit, goes_on="; the same command goes on from there")

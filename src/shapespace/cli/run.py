@@ -362,18 +362,24 @@ def fit(arguments: argparse.Namespace) -> int:
         dense=arguments.dense,
     )
     settings = BatchSettings(
-        config, arguments.landmarks, _where(arguments), arguments.again, arguments.stages, arguments.recursive
+        config,
+        arguments.landmarks,
+        _where(arguments),
+        arguments.again,
+        arguments.stages,
+        arguments.recursive,
+        arguments.store,
     )
-    records = fit_scans(arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn)
-    counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
-    for record in records.values():
-        counts[record["status"]] += 1
+    counts, records = fit_scans(
+        arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn
+    )
+    every = sum(counts.values())
     if arguments.json:
         told = [{"name": name, **_without_history(record)} for name, record in records.items()]
-        show_json({"folder": str(arguments.output), "scans": len(records), **counts, "records": told})
-    elif counts["failed"] < len(records):
+        show_json({"folder": str(arguments.output), "scans": every, **counts, "records": told})
+    elif counts["failed"] < every:
         _print_fits(records, counts, arguments.output)
-    if counts["failed"] == len(records):
+    if counts["failed"] == every:
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
 
@@ -531,8 +537,9 @@ def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, i
     if len(fitted) > _LISTED:
         more = len(fitted) - _LISTED
         show(f"and {more} more {'scan' if more == 1 else 'scans'}; all are in {folder / 'coefficients.csv'}")
+    every = sum(counts.values())
     show(
-        f"{len(records)} {'scan' if len(records) == 1 else 'scans'}: "
+        f"{every} {'scan' if every == 1 else 'scans'}: "
         + ", ".join(f"{count} {status}" for status, count in counts.items() if count)
         + f"; results in {folder}"
     )

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from shapespace.batch.executors import Where
 from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
+from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.commands.inputs import Given, given_scans
@@ -21,6 +22,7 @@ from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder, remove_file, write_bytes
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.manifest import read_manifest
 
 _SURFACES = (".fitted.ply", ".dense.ply")
 _ROOT = "/"
@@ -37,6 +39,7 @@ class BatchSettings:
         again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.
+        store: keep results in a store, as is done from `FROM` scans on, and where there is one.
     """
 
     config: FitConfig = field(default_factory=FitConfig)
@@ -45,6 +48,7 @@ class BatchSettings:
     again: bool = False
     stages: bool = False
     recursive: bool = False
+    store: bool = False
 
 
 def fit_scans(
@@ -55,8 +59,10 @@ def fit_scans(
     *,
     quiet: bool,
     say: Callable[[str], None],
-) -> dict[str, dict[str, Any]]:
-    """Fit scans from files into `folder`, and return NAME -> record of each, in order.
+) -> tuple[dict[str, int], dict[str, dict[str, Any]]]:
+    """Fit scans into `folder`; return how many have which status, and NAME -> record of each, in order.
+
+    Of a store there are the counts alone.
 
     Args:
         model_path: the model's file.
@@ -80,9 +86,24 @@ def fit_scans(
     work = list({job.name: job for job in _jobs(given, settings.landmarks, folder)}.values())
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
+    counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
+    stored = settings.store or len(work) >= FROM or read_manifest(folder) is not None
+    if stored and not settings.store:
+        say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
     with progress(len(work), "fitting", "scan", quiet=quiet) as bar:
-        records = _fit(work, model, model_path, folder, settings, _Watch(bar, say), quiet=quiet)
-    return {job.name: record for job, record in zip(work, records, strict=True)}
+        watch = _Watch(bar, say)
+        if stored:
+            executor = settings.where.executor(len(work), quiet=quiet)
+            with telling_of_compiling(quiet=quiet or executor is not None):
+                found = fit_into_store(
+                    work, model, model_path, folder, settings.config, executor=executor, again=settings.again,
+                    stages=settings.stages, on_plan=watch.plan, on_done=watch.done,
+                )  # fmt: skip
+            return counts | found, {}
+        records = _fit(work, model, model_path, folder, settings, watch, quiet=quiet)
+    for record in records:
+        counts[record["status"]] += 1
+    return counts, {job.name: record for job, record in zip(work, records, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -101,7 +122,7 @@ class _Watch:
 
     def done(self, job: Job, record: Mapping[str, Any]) -> None:
         self.bar.update()
-        if record["status"] == "converged":
+        if record["status"] == "converged" or record["reason"] == "kept":
             return
         self.bar.clear()
         # The reason of a failure names the file already.

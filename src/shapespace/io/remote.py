@@ -107,10 +107,11 @@ def _copy(address: str, file: Path, most_bytes: int) -> None:
 
 def _files(address: str) -> tuple[Any, str]:
     try:
-        from fsspec.core import url_to_fs
+        from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
     except ImportError as error:
         raise _missing("remote") from error
-    return url_to_fs(address)
+    found: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
+    return found
 
 
 @contextlib.contextmanager

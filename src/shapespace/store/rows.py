@@ -38,12 +38,18 @@ FLAGS = ("fitted", "dense", "stages")
 """Columns of a store that say which surfaces are kept."""
 
 TEXTS = (
-    "scan", "id", "status", "reason", "start", "path", "scan_name", "scan_hash", "model_name", "model_hash", "method",
-    "version", RECORD,
+    "scan", "id", "status", "reason", "start", "path", "scan_name", "scan_hash", "scan_version", "model_name",
+    "model_hash", "method", "version", RECORD,
 )  # fmt: skip
 """Columns of text; those whose names begin with `META` are too."""
 
-COUNTS = (*(f"{direction}_count" for direction in _DIRECTIONS), "iterations", "modes")
+COUNTS = (
+    *(f"{direction}_count" for direction in _DIRECTIONS),
+    "iterations",
+    "modes",
+    "scan_size_bytes",
+    "scan_modified_ns",
+)
 """Columns of whole numbers."""
 
 
@@ -124,6 +130,8 @@ def store_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
     scan, model = cast(Mapping[str, Any], record["scan"]), cast(Mapping[str, Any], record["model"])
     row |= {"id": str(record.get("id", "")), "scan_name": str(scan.get("name", "")), "scan_hash": scan.get("hash", "")}
     row |= {"model_name": str(model.get("name", "")), "method": record.get("method"), "version": record.get("version")}
+    row |= {"scan_size_bytes": scan.get("size_bytes"), "scan_modified_ns": scan.get("modified_ns")}
+    row |= {"scan_version": str(scan.get("remote_version", ""))}
     row |= {"start": record.get("start"), "modes": len(record.get("b", ()))}
     if "seconds" in record:
         row["seconds"] = float(sum(record["seconds"].values()))

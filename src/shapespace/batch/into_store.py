@@ -1,0 +1,153 @@
+"""Fits of very many scans: finished ones are moved into a store as the run goes on, and nothing is held for each."""
+
+from __future__ import annotations
+
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from shapespace.batch.executors import Executor, Serial
+from shapespace.batch.fit_work import FitTask, FitWork, Job
+from shapespace.batch.lock import only_writer
+from shapespace.batch.results import Source, fit_identity
+from shapespace.batch.run import Plan
+from shapespace.batch.store import Store
+from shapespace.errors import FileError
+from shapespace.fit.fit import FitConfig
+from shapespace.io.files import make_folder, sha256_of_file
+from shapespace.io.remote import version_of
+from shapespace.model.shape_model import ShapeModel
+from shapespace.store.results import Results
+
+FROM = 10_000
+"""Scans from which on a store is chosen."""
+ROWS = 1000
+"""Fits that are moved at a time."""
+_COLUMNS = (
+    "scan", "scan_name", "path", "scan_hash", "id", "status", "scan_size_bytes", "scan_modified_ns", "scan_version",
+    "stages",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What a store has of one scan."""
+
+    scan_hash: str
+    identity: str
+    status: str
+    size_bytes: int | None
+    modified_ns: int | None
+    version: str
+    path: str
+    stages: bool
+
+    def is_of(self, job: Job, folder: Path) -> bool:
+        """Return whether the scan of `job` is the same: by place, size and time if they agree, else by its content."""
+        if job.address:
+            return self.path == job.address and self.version == version_of(job.address)
+        try:
+            there = job.scan.stat()
+            now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
+            return (self.size_bytes, self.modified_ns, self.path) == now or self.scan_hash == sha256_of_file(job.scan)
+        except (OSError, FileError):
+            return False
+
+
+def fit_into_store(
+    jobs: Sequence[Job],
+    model: ShapeModel,
+    model_file: Path,
+    folder: Path,
+    config: FitConfig,
+    *,
+    executor: Executor | None = None,
+    again: bool = False,
+    stages: bool = False,
+    on_plan: Callable[[Plan], None] | None = None,
+    on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
+) -> Counter[str]:
+    """Fit all `jobs` into the store in `folder`, which is made if absent; return how many have which status.
+
+    What was finished before, in shards or as single files, is kept where it holds, as by `fit_files`.
+
+    Args:
+        jobs: the scans.
+        model: the shape space.
+        model_file: where the model was read from.
+        folder: of the store.
+        config: settings of all fits.
+        executor: see `batch.executors`; None fits one after the other here.
+        again: fit also scans whose results still hold.
+        stages: also keep the surfaces at each stage.
+        on_plan: called once with what is to be done.
+        on_done: called with each job and its record; of one that was kept only its status and reason.
+
+    Raises:
+        FileError: the results cannot be written, or another run writes into the folder.
+        FitError: there are no workers, or none any more.
+        ShapespaceError: the extra `store` is not installed.
+    """
+    make_folder(folder)
+    with only_writer(folder):
+        store = Store(folder)
+        store.compact()
+        counts: Counter[str] = Counter()
+        tasks: list[FitTask] = []
+        before = 0
+        stored = {} if again else dict(_stored(folder))
+        for job in {job.name: job for job in jobs}.values():
+            there = stored.get(job.name)
+            if there is not None and _holds(there, job, model, config, folder, stages=stages):
+                counts[there.status] += 1
+                if on_done is not None:
+                    on_done(job, {"status": there.status, "reason": "kept"})
+                continue
+            before += there is not None and there.status != "failed"
+            tasks.append(FitTask(job, config, stages, resume=not again))
+        del stored
+        if on_plan is not None:
+            on_plan(Plan(counts.total(), before, len(tasks) - before))
+        work = FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex)
+        work.remember(model)
+        finished: list[str] = []
+        try:
+            with closing((executor or Serial()).run(work, tasks)) as ended:
+                for task, record in ended:
+                    counts[record["status"]] += 1
+                    finished.append(task.job.name)
+                    if on_done is not None:
+                        on_done(task.job, record)
+                    if len(finished) >= ROWS:
+                        store.compact(finished)
+                        finished.clear()
+        finally:
+            store.compact()
+    return counts
+
+
+def _stored(folder: Path) -> Iterator[tuple[str, _Stored]]:
+    for rows in Results(folder).iter_rows(_COLUMNS):
+        for name, _, path, scan_hash, identity, status, size, modified, version, stages in zip(
+            *(rows[column] for column in _COLUMNS), strict=True
+        ):
+            yield (
+                name,
+                _Stored(
+                    scan_hash or "", identity or "", status, size, modified, version or "", path or "", bool(stages)
+                ),
+            )
+
+
+def _holds(there: _Stored, job: Job, model: ShapeModel, config: FitConfig, folder: Path, *, stages: bool) -> bool:
+    """Return whether a stored fit is what is asked for, or more: a dense surface, or stages."""
+    if there.status == "failed" or not there.identity or (stages and not there.stages):
+        return False
+    marks = sha256_of_file(job.landmarks) if job.landmarks else ""
+    asked = [config] if config.dense else [config, replace(config, dense=True)]
+    identities = {fit_identity(there.scan_hash, model.content_hash, one.as_dict(), marks) for one in asked}
+    return there.identity in identities and there.is_of(job, folder)
