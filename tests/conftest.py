@@ -124,7 +124,7 @@ def cluster() -> Iterator[Any]:
     """A client of a Dask scheduler and two workers in processes of their own, for the contracts of executors."""
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
         distributed.Client(cluster) as client,
     ):
         yield client

@@ -444,6 +444,8 @@ def test_the_reference_lists_every_column_of_the_table(tmp_path: Path) -> None:
         for name in code_in(row[0]):
             if name.startswith("..."):
                 written += [f"{way}{name.removeprefix('...')}" for way in ("model_to_scan", "scan_to_model")]
+            elif name.startswith("meta_"):
+                continue  # of lists with such columns alone
             else:
                 written.append(name.replace("K", "2"))
     assert sorted(written) == sorted(header)

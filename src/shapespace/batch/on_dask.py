@@ -64,7 +64,9 @@ class OnDask:
         try:
             if not self.cluster:
                 made: Any = LocalCluster
-                return stack.enter_context(Client(stack.enter_context(made(threads_per_worker=1))))
+                return stack.enter_context(
+                    Client(stack.enter_context(made(threads_per_worker=1, dashboard_address="127.0.0.1:0")))
+                )
             if self.cluster.endswith(".json"):
                 return stack.enter_context(Client(scheduler_file=self.cluster, timeout=FINDS_S))
             return stack.enter_context(Client(self.cluster, timeout=FINDS_S))
