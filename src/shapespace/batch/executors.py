@@ -29,7 +29,10 @@ ATTEMPTS = 2
 GRACE_S = 5.0
 """What runs when a run is stopped may end within this; a second Ctrl-C ends it at once."""
 _STARTS = 3
-_NO_START = "The system ends worker processes as they start; use --jobs 1, or free some memory."
+_NO_START = (
+    "Worker processes end as they start; use --jobs 1, free some memory, or, in a script of your own, put what it does "
+    'under if __name__ == "__main__".'
+)
 
 
 class Work(Protocol[TaskT, AnswerT]):

@@ -6,14 +6,13 @@ import contextlib
 import json
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 from shapespace.batch.folder import RECORD
 from shapespace.batch.results import (
     Source,
-    coefficient_row,
     failed_record,
     fit_record,
     is_surface_of,
@@ -274,7 +273,6 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
         staged = files.stages.is_file()
         enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
         whole = len(record.get("b", ())) == len(record.get("z", ())) == len(record.get("b_stddev", ()))
-        coefficient_row(task.job.name, record)
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None
     if enough and whole and record["status"] != "failed":
@@ -285,10 +283,7 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
 
 def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Path) -> bool:
     """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
-    job = task.job
-    settings: dict[str, Any] = json.loads(json.dumps(task.config.as_dict()))
-    settings["version"] = __version__
-    del settings["dense"]
+    job, settings = task.job, _asked(task.config)
     marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
     return bool(
         record["model"]["hash"] == model_hash
@@ -296,6 +291,14 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
         and all(record["config"].get(key) == value for key, value in settings.items())
         and (_is_same_there(record["scan"], job.address) if job.address else _is_same(record["scan"], job.scan, folder))
     )
+
+
+@lru_cache(maxsize=4)
+def _asked(config: FitConfig) -> dict[str, Any]:
+    """Return the settings as a record of such a fit has them, without the dense stage."""
+    settings: dict[str, Any] = json.loads(json.dumps(config.as_dict()))
+    del settings["dense"]
+    return settings | {"version": __version__}
 
 
 def _is_same_there(told: Mapping[str, Any], address: str) -> bool:

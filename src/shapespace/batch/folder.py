@@ -6,14 +6,18 @@ import contextlib
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
+
 from shapespace.batch.results import Source, coefficient_row, read_record, write_coefficients
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.files import sha256_of_file
+from shapespace.io.json_files import LARGEST_BYTES, check_file
+from shapespace.schemas import FIT_AGAIN, File
 from shapespace.store.results import results_at
 
 COEFFICIENTS = "coefficients.csv"
@@ -22,9 +26,11 @@ _LONGEST_NAME = 200
 _OF_SCANS = ("scan", "scan_name", "path", "scan_hash")
 
 
-def records_in(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield NAME and record of each NAME.fit.json directly in `folder` that can be read, in order of the names."""
     for file in sorted(folder.glob(f"*{RECORD}")):
+        if file.name.removesuffix(RECORD) in without:
+            continue
         try:
             yield file.name.removesuffix(RECORD), read_record(file)
         except ShapespaceError:
@@ -94,8 +100,17 @@ def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
             for name, called, path, content_hash in zip(*(rows[column] for column in _OF_SCANS), strict=True):
                 yield name, {"name": called, "path": path, "hash": content_hash}
     else:
-        for name, record in records_in(folder):
-            yield name, record.get("scan")
+        for file in sorted(folder.glob(f"*{RECORD}")):
+            with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
+                check_file(file, LARGEST_BYTES, FIT_AGAIN)
+                told = msgspec.json.decode(file.read_bytes(), type=_OfScan).scan
+                yield file.name.removesuffix(RECORD), {"name": told.name, "path": told.path, "hash": told.hash}
+
+
+class _OfScan(msgspec.Struct, frozen=True):
+    """What is read of a record to know of which scan it is: the rest is passed over, twenty times as fast."""
+
+    scan: File = File()
 
 
 def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
@@ -148,6 +163,8 @@ def _shortened(stem: str, most: int = _LONGEST_NAME) -> str:
 class CoefficientTable:
     """coefficients.csv of a folder: a row for each record in it, those of this run last.
 
+    Those of this run come by `add` and `catch_up`, the others are read at once.
+
     Args:
         folder: of the results.
         names: of the results of this run, in order.
@@ -159,7 +176,8 @@ class CoefficientTable:
         self._names = tuple(dict.fromkeys(names))
         self._n_modes = n_modes
         self._rows: dict[str, dict[str, Any]] = {}
-        for name, record in records_in(folder):
+        of_this_run = set(self._names)
+        for name, record in records_in(folder, without=of_this_run):
             self._add_earlier(name, record)
 
     def add(self, name: str, record: Mapping[str, Any]) -> None:
@@ -168,7 +186,7 @@ class CoefficientTable:
         self._n_modes = max(self._n_modes, len(record.get("b", ())))
 
     def catch_up(self, names: Sequence[str]) -> None:
-        """Put in the records of `names` that were written without being added, by workers that were stopped."""
+        """Put in the records of `names` that are there: of earlier runs, or written by workers that were stopped."""
         for name in names:
             with contextlib.suppress(ShapespaceError):  # never written
                 self._add_earlier(name, read_record(self._folder / f"{name}{RECORD}"))

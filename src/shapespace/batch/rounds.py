@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +18,7 @@ from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FileError
+from shapespace.io.archives import read_arrays
 from shapespace.io.files import atomic_path, make_folder
 from shapespace.io.hdf5 import content_hash
 from shapespace.model.shape_model import ShapeModel
@@ -159,13 +159,9 @@ class RoundWork:
 
     def _load(self) -> Workbench:
         parts: dict[str, Arrays] = {}
-        try:
-            with np.load(self.file, allow_pickle=False) as kept:
-                for key in kept.files:
-                    part, _, name = key.partition(".")
-                    parts.setdefault(part, {})[name] = kept[key]
-        except (OSError, ValueError, EOFError, BadZipFile) as error:
-            raise FileError(f"Cannot read {self.file}, which this run wrote; remove it and run again.") from error
+        for key, array in read_arrays(self.file, "remove it and run again").items():
+            part, _, name = key.partition(".")
+            parts.setdefault(part, {})[name] = array
         arrays = parts.pop("bench")
         guide = parts.pop("guide", None)
         mesh = Mesh(arrays["vertices"], arrays["faces"])
@@ -259,10 +255,10 @@ def _write(file: Path, placed: Placed) -> None:
 def _read(file: Path, index: int) -> Placed | None:
     """Return what was kept, or None where nothing is or it is damaged."""
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as kept:
-            count = sum(name.startswith("vertices_") for name in kept.files)
-            first, *rivals = [_kept_one(kept, number, index) for number in range(count)]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        kept = read_arrays(file, "run again")
+        count = sum(name.startswith("vertices_") for name in kept)
+        first, *rivals = [_kept_one(kept, number, index) for number in range(count)]
+    except (FileError, ValueError, KeyError):
         return None
     return replace(first, rivals=tuple(rivals))
 

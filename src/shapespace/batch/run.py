@@ -111,10 +111,14 @@ def fit_files(
             task, earlier = FitTask(job, config, stages, resume), None
             if resume:
                 task, earlier = resumed(task, model.content_hash, folder)
-            if earlier is None:
-                tasks.append(task)
-            else:
-                kept.add(job, _with_metadata(earlier, job, folder))
+            if earlier is not None:
+                try:
+                    kept.add(job, _with_metadata(earlier, job, folder))
+                    continue
+                except (KeyError, TypeError, AttributeError, ValueError):  # damaged
+                    task = FitTask(job, config, stages, resume=False)
+            tasks.append(task)
+        kept.table.catch_up([task.job.name for task in tasks])
         if on_plan is not None:
             before = sum(has_surface(task.job, folder) for task in tasks)
             on_plan(Plan(len(kept.records), before, len(tasks) - before))
