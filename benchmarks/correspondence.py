@@ -27,8 +27,8 @@ from pathlib import Path
 import numpy as np
 from reliability import Femora
 
-from shapespace.batch.executors import Where
 from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.where import Where
 from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import peers
 
-from shapespace.batch.executors import Where
+from shapespace.batch.where import Where
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
 from shapespace.correspondence.rounds import CorrespondSettings

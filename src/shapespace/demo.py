@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from shapespace.batch.executors import Where
 from shapespace.batch.results import read_record
 from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.where import Where
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james

@@ -188,7 +188,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     format: str = FORMAT
     format_version: int = VERSION
     id: str = ""
-    metadata: Mapping[str, str] = {}
+    metadata: Mapping[str, str | int | float | None] = {}
     given_up: str = ""
     status: Status | Literal["unreadable"]
     reason: str = ""

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from shapespace.batch.executors import EXECUTORS, Executor, Local, Serial, Where
+from shapespace.batch.executors import Executor, Local, Serial
+from shapespace.batch.where import EXECUTORS, Where
 from shapespace.errors import FileError, FitError, InputError
 
 SEVERAL = [kind for kind in EXECUTORS if kind != "serial"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from raw_blobs import marked, raw_blob
-from shapespace.batch.executors import Where
 from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.where import Where
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import Run, World, leftovers
-from shapespace.batch.executors import EXECUTORS
+from shapespace.batch.where import EXECUTORS
 from shapespace.errors import FitError
 from shapespace.io.meshes import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
@@ -187,8 +187,8 @@ def test_ctrl_c_ends_with_130_and_whole_files(
             raise KeyboardInterrupt
         return read_mesh(path)
 
-    for module in ("shapespace.commands.build", "shapespace.commands.look", "shapespace.batch.fit_work"):
-        monkeypatch.setattr(f"{module}.read_mesh", interrupted)
+    for reader in ("commands.build.mesh_at", "commands.look.read_mesh", "batch.fit_work.read_mesh"):
+        monkeypatch.setattr(f"shapespace.{reader}", interrupted)
     arguments: dict[str, tuple[object, ...]] = {
         "build": ("build", world.meshes, "-o", tmp_path / "m.h5"),
         "fit": ("fit", world.model, *world.scans, "-o", tmp_path, "--jobs", 1, *FAST),

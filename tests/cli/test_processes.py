@@ -88,6 +88,11 @@ def test_standard_output_on_a_full_disk_is_one_sentence(world: World) -> None:
     assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("shapespace: ")
 
 
+def hear_hangups() -> None:
+    """Undo what nohup hands down."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 @pytest.mark.parametrize(("jobs", "by"), [(1, "SIGINT"), (2, "SIGINT"), (2, "SIGTERM"), (1, "SIGHUP")])
 def test_ended_in_a_batch_it_leaves_whole_files_that_the_same_command_takes_up(
@@ -101,8 +106,9 @@ def test_ended_in_a_batch_it_leaves_whole_files_that_the_same_command_takes_up(
     command = [*COMMAND, "fit", str(world.model), str(scans), "-o", str(out), "--jobs", str(jobs)]
     # A session of its own, so that like in a terminal the workers get the signal too.
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=hear_hangups,
+    )  # fmt: skip
     limit = time.monotonic() + 60
     while len(list(out.glob("*.fit.json"))) < 3 and time.monotonic() < limit:
         time.sleep(0.02)
@@ -170,7 +176,9 @@ def children_of(pid: int) -> list[int]:
 
 def told(folder: Path) -> list[dict[str, str]]:
     with (folder / "coefficients.csv").open(newline="") as stream:
-        return sorted(({**row, "path": ""} for row in csv.DictReader(stream)), key=lambda row: row["scan"])
+        return sorted(
+            ({**row, "path": "", "checksum": ""} for row in csv.DictReader(stream)), key=lambda row: row["scan"]
+        )
 
 
 def wait_for(count: int, out: Path) -> None:
@@ -261,5 +269,6 @@ def test_a_second_ctrl_c_ends_it_at_once(world: World, tmp_path: Path) -> None:
         time.sleep(0.02)
     began = time.monotonic()
     process.communicate(timeout=60)
-    assert process.returncode == 130 and time.monotonic() - began < 10
+    # The second one may meet an interpreter that is about to exit.
+    assert process.returncode in (130, -signal.SIGINT) and time.monotonic() - began < 10
     assert leftovers(tmp_path) == []

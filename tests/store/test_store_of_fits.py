@@ -112,6 +112,7 @@ def test_export_of_a_name_that_there_is_not_names_near_ones(store: Path, capsys:
 def test_the_exported_table_is_the_table_of_a_folder(store: Path, singles: Path, tmp_path: Path) -> None:
     names = sorted(Results(singles).names())
     table = CoefficientTable(singles, names, MODES)
+    table.catch_up(names)
     table.save()
     expected = (singles / "coefficients.csv").read_bytes()
     (singles / "coefficients.csv").unlink()

@@ -11,7 +11,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.batch.executors import Serial, Where
+from shapespace.batch.executors import Serial
+from shapespace.batch.where import Where
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks, Places
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.io.files import atomic_path, make_folder, remove_file, sha256_of_file, write_error
+from shapespace.io.files import atomic_path, make_folder, remove_file, sha256_of_file, sweep, write_error
 from shapespace.io.tables import CHECKSUM
 from shapespace.schemas import FitRecord
 from shapespace.store import results as reading
@@ -104,8 +104,7 @@ class Store:
             FileError: something cannot be removed.
             FileFormatError: the manifest is damaged.
         """
-        for path in self.folder.glob(f".{Path(Manifest.FILE).stem}.*{Path(Manifest.FILE).suffix}"):
-            remove_file(path)
+        sweep(self.folder)
         manifest = read_manifest(self.folder)
         if manifest is None:
             return []

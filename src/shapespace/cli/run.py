@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shapespace.cli.printing import now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
-    from shapespace.batch.executors import Where
+    from shapespace.batch.where import Where
     from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
 
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
@@ -385,7 +385,7 @@ def fit(arguments: argparse.Namespace) -> int:
 
 
 def _where(arguments: argparse.Namespace) -> Where:
-    from shapespace.batch.executors import Where
+    from shapespace.batch.where import Where
 
     return Where(arguments.executor, arguments.jobs, arguments.timeout, arguments.dask or "")
 

@@ -11,12 +11,12 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
-from shapespace.batch.executors import Where
 from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.where import Where
 from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.commands.inputs import files_of
 from shapespace.commands.landmark_files import LandmarkFiles

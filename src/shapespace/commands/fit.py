@@ -9,12 +9,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from shapespace.batch.executors import Where
 from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
 from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
+from shapespace.batch.where import Where
 from shapespace.commands.inputs import Given, given_scans
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig

@@ -9,10 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace.batch.executors import Where
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.results import read_record
+from shapespace.batch.where import Where
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
 from shapespace.io.labels import read_labels

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.batch.executors import Where
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
 from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.where import Where
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError, ModelFileError
 from shapespace.fit.fit import FitConfig
