@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import uuid
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -115,16 +116,11 @@ def fit_file(
             marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
-    except MemoryError:
+    except (MemoryError, ShapespaceError) as error:
         short = f"{job.called}: not enough memory to fit it; thin the scan first."
-        return _write_failed(
-            failed_record(scan_source, model_source, short, config.as_dict(), job.metadata), job, folder
-        )
-    except ShapespaceError as error:
-        reason = naming(job.called, str(error))
-        return _write_failed(
-            failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata), job, folder
-        )
+        reason = short if isinstance(error, MemoryError) else naming(job.called, str(error))
+        failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
+        return _write_failed(failed, job, folder)
     record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
     files = _Files.of(job, folder)
     writes: dict[Path, Callable[[Path], None]] = {}
@@ -230,6 +226,15 @@ class FitWork:
         record = failed_record(scan, model, told, task.config.as_dict(), task.job.metadata)
         return _write_failed(record | {"given_up": self.run}, task.job, self.folder)
 
+    @staticmethod
+    def of(
+        model: ShapeModel, model_file: Path, folder: Path, on_state: Callable[[IcpState], None] | None = None
+    ) -> FitWork:
+        """Return the work of a new run, with the model kept for fits in this process."""
+        work = FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex, on_state)
+        work.remember(model)
+        return work
+
     def remember(self, model: ShapeModel) -> None:
         """Keep the model for fits in this process, which then do not read it again."""
         _models.clear()
@@ -289,7 +294,7 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
         record["model"]["hash"] == model_hash
         and record.get("landmarks") == marks
         and all(record["config"].get(key) == value for key, value in settings.items())
-        and (_is_same_there(record["scan"], job.address) if job.address else _is_same(record["scan"], job.scan, folder))
+        and is_same_scan(record["scan"], job, folder)
     )
 
 
@@ -301,16 +306,24 @@ def _asked(config: FitConfig) -> dict[str, Any]:
     return settings | {"version": __version__}
 
 
-def _is_same_there(told: Mapping[str, Any], address: str) -> bool:
-    """Return whether what lies at `address` is what the record tells, by what its store says of its version."""
-    return bool(told.get("path") == address and told.get("remote_version") == version_of(address))
+def is_same_scan(told: Mapping[str, Any], job: Job, folder: Path) -> bool:
+    """Return whether the scan of `job` is the one that a result in `folder` was made of.
 
+    By place, size and time of change if they agree, else by its content; at an address by what is said of its version.
 
-def _is_same(told: Mapping[str, Any], scan: Path, folder: Path) -> bool:
-    """Return whether `scan` is what the record tells: by place, size and time if they agree, else by its content."""
+    Args:
+        told: of the scan, as in the record of the result.
+        job: the scan.
+        folder: of the result.
+
+    Raises:
+        FileError: it cannot be read or reached.
+    """
+    if job.address:
+        return bool(told.get("path") == job.address and told.get("remote_version") == version_of(job.address))
     with contextlib.suppress(OSError):
-        there = scan.stat()
-        now = (there.st_size, there.st_mtime_ns, Source.at(scan, "", folder).path)
+        there = job.scan.stat()
+        now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
         if (told.get("size_bytes"), told.get("modified_ns"), told.get("path")) == now:
             return True
-    return bool(told["hash"] == sha256_of_file(scan))
+    return bool(told["hash"] == sha256_of_file(job.scan))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -11,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.batch.executors import Executor, Serial
-from shapespace.batch.fit_work import FitTask, FitWork, Job
+from shapespace.batch.fit_work import FitTask, FitWork, Job, is_same_scan
 from shapespace.batch.lock import only_writer
-from shapespace.batch.results import Source, fit_identity
+from shapespace.batch.results import fit_identity
 from shapespace.batch.run import Plan
 from shapespace.batch.store import Store
 from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.files import make_folder, sha256_of_file
-from shapespace.io.remote import version_of
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.results import Results
 
@@ -27,35 +25,25 @@ FROM = 10_000
 """Scans from which on a store is chosen."""
 ROWS = 1000
 """Fits that are moved at a time."""
-_COLUMNS = (
-    "scan", "scan_name", "path", "scan_hash", "id", "status", "scan_size_bytes", "scan_modified_ns", "scan_version",
-    "stages",
-)  # fmt: skip
+_SCAN = {
+    "path": "path",
+    "hash": "scan_hash",
+    "size_bytes": "scan_size_bytes",
+    "modified_ns": "scan_modified_ns",
+    "remote_version": "scan_version",
+}
+"""What a record tells of its scan, by the column of a store that has it."""
+_COLUMNS = ("scan", "id", "status", "stages", *_SCAN.values())
 
 
 @dataclass(frozen=True)
 class _Stored:
-    """What a store has of one scan."""
+    """What a store has of one fit; `scan` is as in its record."""
 
-    scan_hash: str
     identity: str
     status: str
-    size_bytes: int | None
-    modified_ns: int | None
-    version: str
-    path: str
     stages: bool
-
-    def is_of(self, job: Job, folder: Path) -> bool:
-        """Return whether the scan of `job` is the same: by place, size and time if they agree, else by its content."""
-        if job.address:
-            return self.path == job.address and self.version == version_of(job.address)
-        try:
-            there = job.scan.stat()
-            now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
-            return (self.size_bytes, self.modified_ns, self.path) == now or self.scan_hash == sha256_of_file(job.scan)
-        except (OSError, FileError):
-            return False
+    scan: Mapping[str, Any]
 
 
 def fit_into_store(
@@ -112,8 +100,7 @@ def fit_into_store(
         del stored
         if on_plan is not None:
             on_plan(Plan(counts.total(), before, len(tasks) - before))
-        work = FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex)
-        work.remember(model)
+        work = FitWork.of(model, model_file, folder)
         finished: list[str] = []
         try:
             with closing((executor or Serial()).run(work, tasks)) as ended:
@@ -132,15 +119,8 @@ def fit_into_store(
 
 def _stored(folder: Path) -> Iterator[tuple[str, _Stored]]:
     for rows in Results(folder).iter_rows(_COLUMNS):
-        for name, _, path, scan_hash, identity, status, size, modified, version, stages in zip(
-            *(rows[column] for column in _COLUMNS), strict=True
-        ):
-            yield (
-                name,
-                _Stored(
-                    scan_hash or "", identity or "", status, size, modified, version or "", path or "", bool(stages)
-                ),
-            )
+        for name, identity, status, stages, *scan in zip(*(rows[column] for column in _COLUMNS), strict=True):
+            yield name, _Stored(identity or "", status, bool(stages), dict(zip(_SCAN, scan, strict=True)))
 
 
 def _holds(there: _Stored, job: Job, model: ShapeModel, config: FitConfig, folder: Path, *, stages: bool) -> bool:
@@ -149,5 +129,8 @@ def _holds(there: _Stored, job: Job, model: ShapeModel, config: FitConfig, folde
         return False
     marks = sha256_of_file(job.landmarks) if job.landmarks else ""
     asked = [config] if config.dense else [config, replace(config, dense=True)]
-    identities = {fit_identity(there.scan_hash, model.content_hash, one.as_dict(), marks) for one in asked}
-    return there.identity in identities and there.is_of(job, folder)
+    identities = {fit_identity(there.scan["hash"] or "", model.content_hash, one.as_dict(), marks) for one in asked}
+    try:
+        return there.identity in identities and is_same_scan(there.scan, job, folder)
+    except FileError:
+        return False  # the fit says why

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -104,8 +103,7 @@ def fit_files(
     make_folder(folder)
     with only_writer(folder):
         kept = _Kept(CoefficientTable(folder, [job.name for job in jobs], model.n_modes), on_done)
-        work = FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex, on_state if executor is None else None)
-        work.remember(model)
+        work = FitWork.of(model, model_file, folder, on_state if executor is None else None)
         tasks: list[FitTask] = []
         for job in {job.name: job for job in jobs}.values():
             task, earlier = FitTask(job, config, stages, resume), None

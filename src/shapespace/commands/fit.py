@@ -90,17 +90,22 @@ def fit_scans(
     stored = settings.store or len(work) >= FROM or read_manifest(folder) is not None
     if stored and not settings.store:
         say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
-    with progress(len(work), "fitting", "scan", quiet=quiet) as bar:
+    executor = settings.where.executor(len(work), quiet=quiet)
+    with (
+        progress(len(work), "fitting", "scan", quiet=quiet) as bar,
+        telling_of_compiling(quiet=quiet or executor is not None),
+    ):
         watch = _Watch(bar, say)
         if stored:
-            executor = settings.where.executor(len(work), quiet=quiet)
-            with telling_of_compiling(quiet=quiet or executor is not None):
-                found = fit_into_store(
-                    work, model, model_path, folder, settings.config, executor=executor, again=settings.again,
-                    stages=settings.stages, on_plan=watch.plan, on_done=watch.done,
-                )  # fmt: skip
+            found = fit_into_store(
+                work, model, model_path, folder, settings.config, executor=executor, again=settings.again,
+                stages=settings.stages, on_plan=watch.plan, on_done=watch.done,
+            )  # fmt: skip
             return counts | found, {}
-        records = _fit(work, model, model_path, folder, settings, watch, quiet=quiet)
+        records = fit_files(
+            work, model, model_path, folder, settings.config, executor=executor, resume=not settings.again,
+            stages=settings.stages, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
+        )  # fmt: skip
     for record in records:
         counts[record["status"]] += 1
     return counts, {job.name: record for job, record in zip(work, records, strict=True)}
@@ -128,24 +133,6 @@ class _Watch:
         # The reason of a failure names the file already.
         failed = record["status"] == "failed"
         self.say(record["reason"] if failed else f"{job.called}: {record['status']}: {record['reason']}")
-
-
-def _fit(
-    work: Sequence[Job],
-    model: ShapeModel,
-    model_path: Path,
-    folder: Path,
-    settings: BatchSettings,
-    watch: _Watch,
-    *,
-    quiet: bool,
-) -> list[dict[str, Any]]:
-    executor = settings.where.executor(len(work), quiet=quiet)
-    with telling_of_compiling(quiet=quiet or executor is not None):
-        return fit_files(
-            work, model, model_path, folder, settings.config, executor=executor, resume=not settings.again,
-            stages=settings.stages, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
-        )  # fmt: skip
 
 
 def _jobs(given: Sequence[Given], landmarks: Path | None, folder: Path) -> list[Job]:
