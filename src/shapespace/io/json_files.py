@@ -29,8 +29,17 @@ def read_json(path: Path, again: str, most_bytes: int = LARGEST_BYTES) -> Any:
         FileFormatError: it is no file of so few bytes, or not plain JSON.
     """
     check_file(path, most_bytes, again)
+    return json_of(read_bytes(path), path, again)
+
+
+def json_of(content: bytes, path: Path, again: str) -> Any:
+    """Return what `plain_json` makes of the content of the file `path`, wherever that was read.
+
+    Raises:
+        FileFormatError: it is not plain JSON.
+    """
     try:
-        return plain_json(read_bytes(path))
+        return plain_json(content)
     except ValueError as error:
         raise FileFormatError(f"{path} is not JSON, or it is cut short ({error}); {again}.") from error
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import io
-import json
 import os
 import re
 from collections import Counter
@@ -19,9 +18,9 @@ import numpy.typing as npt
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.archives import arrays_in, read_arrays
 from shapespace.io.files import read_bytes, read_error
-from shapespace.io.json_files import LARGEST_BYTES, plain_json, read_json
+from shapespace.io.json_files import LARGEST_BYTES, json_of, read_json
 from shapespace.io.meshes import read_mesh
-from shapespace.schemas import FitRecord
+from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
 from shapespace.store.rows import FLAGS, store_row
 from shapespace.store.shard import ROW, Shard
@@ -221,9 +220,7 @@ class Results:
         """
         if name in self.singles:
             return read_bytes(self.folder / f"{name}{ENDING}")
-        self.known(name)
-        assert self.store is not None
-        return self.store.record_text(name).encode("utf-8", "surrogatepass")
+        return self._store_of(name).record_text(name).encode("utf-8", "surrogatepass")
 
     def record(self, name: str) -> dict[str, Any]:
         """Return the record of a fit, checked.
@@ -233,12 +230,9 @@ class Results:
             FileFormatError: it is damaged.
             InputError: there is no such fit.
         """
-        where, content = str(self.folder / f"{name}{ENDING}"), self.record_bytes(name)
-        try:
-            record: object = json.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(f"{where} is not JSON, or it is cut short; fit the scan again.") from error
-        FitRecord.from_json(record, where)
+        path = self.folder / f"{name}{ENDING}"
+        record: object = json_of(self.record_bytes(name), path, FIT_AGAIN)
+        FitRecord.from_json(record, str(path))
         return cast(dict[str, Any], record)
 
     def surface(self, name: str, kind: str = "fitted") -> Mesh:
@@ -251,11 +245,10 @@ class Results:
         """
         if name in self.singles:
             return read_mesh(self.folder / f"{name}{ENDINGS[kind]}")
-        self.known(name)
-        assert self.store is not None
+        store = self._store_of(name)
         if not self.has(name, kind):
             raise FileFormatError(f"{self.folder}: no {kind} surface of {name} was kept; fit the scan again.")
-        return self.store.surface(name, kind)
+        return store.surface(name, kind)
 
     def stages(self, name: str) -> bytes:
         """Return the content of NAME.stages.npz.
@@ -267,11 +260,16 @@ class Results:
         """
         if name in self.singles:
             return read_bytes(self.folder / f"{name}{ENDINGS['stages']}")
-        self.known(name)
-        assert self.store is not None
+        store = self._store_of(name)
         if not self.has(name, "stages"):
             raise FileFormatError(f"{self.folder}: the stages of {name} were not kept; fit it again with --stages.")
-        return self.store.stages(name)
+        return store.stages(name)
+
+    def _store_of(self, name: str) -> Store:
+        """Return the store that holds a fit which is no single file, as `known` checks."""
+        self.known(name)
+        assert self.store is not None
+        return self.store
 
     def identities(self) -> dict[str, str]:
         """Return name -> identity of each fit; empty for records that have none, or cannot be read."""
@@ -439,12 +437,9 @@ def json_at(path: Path, again: str, most_bytes: int = LARGEST_BYTES) -> Any:
     if not kept_at(path):
         return read_json(path, again, most_bytes)
     content = bytes_at(path)
-    try:
-        if len(content) > most_bytes:
-            raise ValueError("it is larger than such a file can be")
-        return plain_json(content)
-    except ValueError as error:
-        raise FileFormatError(f"{path} is not JSON, or it is cut short ({error}); {again}.") from error
+    if len(content) > most_bytes:
+        raise FileFormatError(f"{path} is larger ({len(content) / 2**20:.0f} MiB) than such a file can be; {again}.")
+    return json_of(content, path, again)
 
 
 def arrays_at(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
