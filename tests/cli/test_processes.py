@@ -1,5 +1,6 @@
 """The command as the system runs it: start-up, signals, pipes, and workers of their own."""
 
+import argparse
 import csv
 import json
 import os
@@ -9,11 +10,13 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import pytest
 
 from conftest import World, leftovers, without_waiting
+from shapespace.cli import main
 from shapespace.io.meshes import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
@@ -134,6 +137,23 @@ def test_ended_in_a_batch_it_leaves_whole_files_that_the_same_command_takes_up(
     )
     assert done.returncode == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in records} == times
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_that_compiled_code_turns_into_another_error_is_ctrl_c_still(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def turned(_: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise SystemError("a compiled function returned a result with an exception set") from None
+        return 0
+
+    parsed = argparse.Namespace(run=turned)
+    monkeypatch.setattr("shapespace.cli.parser", lambda: types.SimpleNamespace(parse_args=lambda _: parsed))
+    assert main([]) == 130
+    assert capsys.readouterr().err == "shapespace: stopped; the files written so far are whole.\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")

@@ -20,7 +20,7 @@ from shapespace.errors import ShapespaceError
 
 __all__ = ["main", "parser"]
 
-_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     arguments = parser().parse_args(argv)
     try:
-        with _ended_as_by_ctrl_c():
+        with _ended_as_asked():
             code = int(arguments.run(arguments))
         sys.stdout.flush()
         return code
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class _Ended(KeyboardInterrupt):
-    """A signal asks this process to end, as Ctrl-C does."""
+    """A signal asks this process to end."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -63,22 +63,30 @@ class _Ended(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _ended_as_by_ctrl_c() -> Generator[None]:
-    """Take the signals by which clusters and closing terminals end a process as Ctrl-C is taken."""
+def _ended_as_asked() -> Generator[None]:
+    """End by the signals of Ctrl-C, of clusters and of closing terminals alike, whatever code they meet."""
+    asked: list[_Ended] = []
 
     def end(number: int, _frame: object) -> None:
-        raise _Ended(number)
+        asked.append(_Ended(number))
+        raise asked[-1]
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     taken = [number for name in _ENDING if (number := getattr(signal, name, None)) is not None]
+    before = {number: signal.getsignal(number) for number in taken}
     # Under nohup SIGHUP is ignored, and stays so.
-    before = {number: signal.getsignal(number) for number in taken if signal.getsignal(number) == signal.SIG_DFL}
+    before = {k: was for k, was in before.items() if was in (signal.SIG_DFL, signal.default_int_handler)}
     for number in before:
         signal.signal(number, end)
     try:
         yield
+    except Exception:
+        # Compiled code that a signal meets may raise another error in its place.
+        if asked:
+            raise asked[0] from None
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
