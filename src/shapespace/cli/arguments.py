@@ -33,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     _add_view(commands)
     _add_recognise(commands)
     _add_export(commands)
+    _add_convert(commands)
     return top
 
 
@@ -302,6 +303,17 @@ def _add_export(commands: Any) -> None:
     sub.add_argument("--all", action="store_true", help="all fits")
     sub.add_argument("--table", type=Path, metavar="FILE.csv", help="the coefficients of all fits, as CSV")
     sub.set_defaults(run=run.export)
+
+
+def _add_convert(commands: Any) -> None:
+    sub = _add(commands, "convert", "a shape model from the format of another tool, or to one",
+               "shapespace convert femur.h5.json femur.h5\n"
+               "         shapespace convert model.h5 model.bin --to eos")  # fmt: skip
+    sub.add_argument("source", type=Path, metavar="IN", help="a model in any format that is read")
+    sub.add_argument("output", type=Path, metavar="OUT", help="its ending tells the format; .h5 is shapespace's own")
+    sub.add_argument("--to", metavar="FORMAT", help="the format by its name, where the ending does not tell it")
+    sub.add_argument("--unit", choices=("um", "mm", "cm", "inch", "m"), help="of IN, where its format does not say")
+    sub.set_defaults(run=run.convert)
 
 
 def _add_recognise(commands: Any) -> None:

@@ -530,6 +530,22 @@ def export(arguments: argparse.Namespace) -> int:
     return 0 if not failed else 1 if written else 2
 
 
+def convert(arguments: argparse.Namespace) -> int:
+    """Write a model in another format."""
+    from shapespace.commands.convert import convert
+    from shapespace.types import MM_PER_UNIT
+
+    mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
+    source, target, notes = convert(arguments.source, arguments.output, to=arguments.to, mm=mm)
+    if arguments.json:
+        show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})
+    else:
+        show(f"{arguments.output} ({target}) holds the model of {arguments.source} ({source}).")
+        for note in notes:
+            show(f"  {note}")
+    return 0
+
+
 def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, int], folder: Path) -> None:
     fitted = {name: record for name, record in records.items() if record["status"] != "failed"}
     for name, record in list(fitted.items())[:_LISTED]:

@@ -17,6 +17,7 @@ from shapespace.geometry.doctor import examine
 from shapespace.geometry.surface import faces_of
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
+from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
@@ -65,11 +66,11 @@ def info(path: Path) -> dict[str, Any]:
     if path.name.endswith(CorrespondRecord.ENDING):
         record = read(CorrespondRecord, json_of(path), path.name, CORRESPOND_AGAIN)
         return {"kind": "scan in correspondence", **to_json(record)}
+    if looks_like_model(path):
+        return {"kind": "model", **model_facts(ShapeModel.load(path))}
     if path.name.endswith(".json"):
         record = read_record(path)
         return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
-    if path.suffix.lower() in (".h5", ".hdf5"):
-        return {"kind": "model", **model_facts(ShapeModel.load(path))}
     mesh = mesh_at(path)
     return {"kind": "mesh", "file": str(path), **asdict(examine(mesh))}
 

@@ -17,6 +17,7 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
+from shapespace.model.foreign import looks_like_model
 from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
@@ -24,7 +25,6 @@ from shapespace.schemas import BySize, Measured, Quality, json_text
 from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
-_MODELS = (".h5", ".hdf5")
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
 _MOST_TARGETS = 2
 
@@ -118,7 +118,7 @@ def _targets(paths: Sequence[Path], options: QualityOptions, notes: list[str], *
         raise InputError("At most two targets or representations are compared; give one or two.")
     gauge = options.settings.gauge if options.settings.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
-        (ShapeModel.load(p), {}) if p.suffix.lower() in _MODELS else _meshes(p, notes, gauge, quiet=quiet)
+        (ShapeModel.load(p), {}) if not p.is_dir() and looks_like_model(p) else _meshes(p, notes, gauge, quiet=quiet)
         for p in paths
     ]
     pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]

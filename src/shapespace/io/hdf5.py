@@ -77,6 +77,15 @@ def _user_block(data: bytes | memoryview) -> bytes:
     return (_MAGIC + hashlib.sha256(data).hexdigest().encode() + b"\n").ljust(_USER_BLOCK, b"\0")
 
 
+def is_ours(path: Path) -> bool:
+    """Whether `path` begins as `write_hdf5` has files begin; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
 def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
     """Return the arrays (read-only) and attributes in `path`, checked against both hashes.
 

@@ -17,10 +17,12 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import read_hdf5
 from shapespace.model import model_file
+from shapespace.model.foreign import is_foreign, load_foreign, parted
 from shapespace.model.held_out import held_out_shapes
 from shapespace.model.local_modes import local_modes
 from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
@@ -268,12 +270,19 @@ class AdditiveModel:
 
     @classmethod
     def load(cls, path: Path | str) -> AdditiveModel:
-        """Read a model written by `save`.
+        """Read a model written by `save`, or one of another tool that has modes of identity and of expression.
 
         Raises:
             FileError: it cannot be read.
             ModelFileError: it is damaged, of another version, or does not part identity and expression.
         """
+        if is_foreign(Path(path)):
+            foreign = load_foreign(Path(path))
+            if foreign.rotation is None:
+                raise ModelFileError(
+                    f"{path} ({foreign.format}) does not part identity and expression; give one that does."
+                )
+            return cls(ShapeModel.of_foreign(foreign, Path(path)), foreign.rotation, foreign.n_identity)
         shape = ShapeModel.load(path)
         arrays, attributes = read_hdf5(Path(path))
         if "split_rotation" not in arrays or "split_identity" not in attributes:
@@ -282,6 +291,10 @@ class AdditiveModel:
             return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
         except (InputError, ValueError, TypeError, OverflowError) as error:
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+
+    def as_linear(self) -> LinearModel:
+        """Return what formats of other tools can hold of the model, identity and expression parted."""
+        return parted(self.shape.as_linear(), self.rotation, self.n_identity)
 
     def _checked(self, z: npt.ArrayLike) -> FloatArray:
         array = np.asarray(z, dtype=np.float64)

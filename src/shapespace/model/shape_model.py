@@ -16,10 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
+from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
+from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.holes import fill_holes
 from shapespace.model.missing import MIN_SEEN, Kept, complete
 from shapespace.model.pca import PrincipalComponents, principal_components
@@ -535,12 +537,16 @@ class ShapeModel:
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
-        """Read a model written by `save`, checking its hashes.
+        """Read a model written by `save`, checking its hashes, or one in a format of another tool.
+
+        Where such a file parts identity and expression, both together are the model; `AdditiveModel.load` parts them.
 
         Raises:
             FileError: it cannot be read.
             ModelFileError: it is damaged, of another version, or not a model.
         """
+        if is_foreign(Path(path)):
+            return cls.of_foreign(load_foreign(Path(path)), Path(path))
         fields = model_file.load(Path(path))
         try:
             with np.errstate(all="ignore"):  # huge numbers overflow on the way to being refused
@@ -550,6 +556,22 @@ class ShapeModel:
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {said}") from error
         _IN_FILES.add(model)
         return model
+
+    @classmethod
+    def of_foreign(cls, foreign: Foreign, path: Path) -> ShapeModel:
+        """Return the model that `path` of another tool holds.
+
+        Raises:
+            ModelFileError: its parts do not make a model.
+        """
+        try:
+            return cls(**foreign.fields)
+        except InputError as error:
+            raise ModelFileError(f"{path} ({foreign.format}) is no usable model: {str(error)[:_TOLD]}") from error
+
+    def as_linear(self) -> LinearModel:
+        """Return what formats of other tools can hold of the model."""
+        return as_linear(self.fields(), self.mean_vertices, self.vertex_basis)
 
     def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
         array = np.atleast_1d(np.asarray(b, dtype=np.float64))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
+from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.population import neediest
 from shapespace.report.saved import Folder, SavedFit, find_fits, has_fits, model_of, saved_fit, staged_fit
@@ -64,7 +65,7 @@ class Shown:
         if not path.is_dir():
             if model is not None:
                 raise InputError(f"{path} is not a folder of fits; leave --model out, or give the folder.")
-            if path.exists() and path.suffix.lower() not in (".h5", ".hdf5"):
+            if path.exists() and not looks_like_model(path):
                 raise InputError(
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
                 )

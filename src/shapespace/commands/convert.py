@@ -1,0 +1,70 @@
+"""What `convert` does: shape models from the formats of other tools to shapespace's own, and on to others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.parts import Format
+from shapespace.formats.registry import FORMATS, format_to_write
+from shapespace.model.additive import AdditiveModel
+from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign
+from shapespace.model.shape_model import ShapeModel
+
+OWN = ("shapespace", OWN_ENDINGS)
+
+
+def convert(source: Path, output: Path, *, to: str | None, mm: float | None) -> tuple[str, str, list[str]]:
+    """Write the model in `source` to `output`; return the formats of both, and sentences on what became of it.
+
+    Args:
+        source: a model in any format that is read.
+        output: its name tells the format, where `to` does not.
+        to: a format by its name, or None.
+        mm: how many mm one unit of `source` is, where its format does not say; None for what the format says, or 1.
+
+    Raises:
+        FileError: `source` cannot be read, or `output` not written.
+        InputError: an unknown format, one that is only read, or one that cannot hold the model.
+    """
+    target = _target(output, to)
+    if source.resolve() == output.resolve():
+        raise InputError(f"{output} is the model itself; give another name to write to.")
+    model, of, notes = _load(source, mm)
+    if target is None:
+        model.save(output)
+        return of, OWN[0], notes
+    linear = model.as_linear()
+    notes += target.write(linear, output)
+    if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
+        notes.append(f"The licence goes along: {linear.licence}")
+    return of, target.title, notes
+
+
+def formats() -> list[dict[str, str]]:
+    """Return the name, title and endings of each format that `convert` knows."""
+    rows = [(OWN[0], "shapespace's own", OWN[1]), *((one.name, one.title, one.suffixes) for one in FORMATS)]
+    return [{"name": name, "title": title, "endings": " ".join(ends)} for name, title, ends in rows]
+
+
+def _target(output: Path, to: str | None) -> Format | None:
+    if to == OWN[0] or (to is None and output.suffix.lower() in OWN[1]):
+        return None
+    return format_to_write(output, to)
+
+
+def _load(source: Path, mm: float | None) -> tuple[ShapeModel | AdditiveModel, str, list[str]]:
+    if not is_foreign(source):
+        if mm is not None:
+            raise InputError(f"{source} is in mm, as all models of shapespace; leave --unit out.")
+        shape = ShapeModel.load(source)
+        try:
+            return AdditiveModel.load(source), OWN[0], []
+        except ModelFileError:
+            return shape, OWN[0], []
+    foreign = load_foreign(source, mm)
+    shape = ShapeModel.of_foreign(foreign, source)
+    notes = list[str](foreign.notes)
+    if foreign.rotation is None:
+        return shape, foreign.format, notes
+    return AdditiveModel(shape, foreign.rotation, foreign.n_identity), foreign.format, notes

@@ -1,0 +1,202 @@
+"""eos `.bin`: a cereal archive of one morphable model, little-endian, without names or a magic number."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import ModelFileError
+from shapespace.formats.parts import LinearModel, Modes, orthonormal, scaled
+from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.json_files import check_file
+from shapespace.types import FloatArray
+
+_AGAIN = "give a model that eos has saved"
+_LARGEST_BYTES = 2**32
+_NEWEST = 4
+_MOST_NAME_BYTES = 4096
+_PCA, _BLENDSHAPES = 0, 1
+_NOTHING: Final = np.zeros((0, 0))
+_SFM = (3448, 63, 6736)
+_SFM_LICENCE = "Surrey Face Model (3448): non-commercial use only, see its README"
+Item = TypeVar("Item")
+
+
+class Eos:
+    """`eos.morphablemodel`: shape, colour, expressions of PCA or blendshapes; versions 1 to 4."""
+
+    name = "eos"
+    title = "eos .bin"
+    suffixes: Sequence[str] = (".bin",)
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it begins with a version of eos and a mean of one column."""
+        if path.suffix.lower() != ".bin" or len(head) < 12:
+            return False
+        version, rows, columns = struct.unpack_from("<Iii", head)
+        blendshapes, length = struct.unpack_from("<QQ", head) if len(head) >= 16 else (0, 0)
+        if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
+            return True
+        return bool(0 < blendshapes < 2**16 and 0 < length < _MOST_NAME_BYTES)
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, _LARGEST_BYTES, _AGAIN)
+        data = read_bytes(path)
+        try:
+            return _model(_Archive(data))
+        except (_DamagedError, ValueError, OverflowError) as error:
+            raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`; single precision, version 4."""
+        out = bytearray(struct.pack("<I", _NEWEST))
+        out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
+        out += _pca_bytes(_NOTHING, _NOTHING, None)
+        if model.expression is None:
+            out += struct.pack("<B", 1)
+        else:
+            zero = np.zeros(model.mean.size)
+            out += struct.pack("<Bi", 0, _PCA) + _pca_bytes(zero, model.expression.moved, model)
+        if model.landmarks:
+            out += struct.pack("<BQ", 0, len(model.landmarks))
+            for name in sorted(model.landmarks):
+                text = name.encode()
+                out += struct.pack("<Q", len(text)) + text + struct.pack("<i", model.landmarks[name])
+        else:
+            out += struct.pack("<B", 1)
+        out += struct.pack("<QQ", 0, 0)
+        write_bytes(path, bytes(out))
+        said = ["Numbers are in single precision."]
+        if model.provenance or model.licence:
+            said.append("Provenance and licence are left out: eos has no place for them.")
+        return said
+
+
+class _DamagedError(ValueError):
+    """The bytes are not such an archive."""
+
+
+class _Archive:
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    @property
+    def at_end(self) -> bool:
+        return self._at == len(self._data)
+
+    def fields(self, layout: str) -> tuple[Any, ...]:
+        return struct.unpack(f"<{layout}", self._take(struct.calcsize(f"<{layout}")))
+
+    def one(self, layout: str) -> int:
+        return int(self.fields(layout)[0])
+
+    def array(self, kind: str, count: int, *row: int) -> npt.NDArray[Any]:
+        dtype = np.dtype(kind)
+        taken = self._take(count * int(np.prod(row, dtype=np.int64)) * dtype.itemsize)
+        return np.frombuffer(taken, dtype).reshape(count, *row)
+
+    def matrix(self) -> FloatArray:
+        rows, columns = self.fields("ii")
+        if rows < 0 or columns < 0:
+            raise _DamagedError("a matrix has a negative size")
+        return self.array("<f4", rows * columns).reshape(columns, rows).T.astype(np.float64)
+
+    def vector(self, kind: str, *row: int) -> npt.NDArray[Any]:
+        return self.array(kind, self.one("Q"), *row)
+
+    def text(self) -> str:
+        size = self.one("Q")
+        if size > _MOST_NAME_BYTES:
+            raise _DamagedError("a name is too long")
+        return self._take(size).decode(errors="replace")
+
+    def many(self, read: Callable[[], Item], least_bytes: int) -> list[Item]:
+        count = self.one("Q")
+        if count * least_bytes > len(self._data) - self._at:
+            raise _DamagedError("it is cut short")
+        return [read() for _ in range(count)]
+
+    def _take(self, size: int) -> bytes:
+        if size > len(self._data) - self._at:
+            raise _DamagedError("it is cut short")
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+
+def _model(archive: _Archive) -> LinearModel:
+    version = archive.one("I")
+    if not 1 <= version <= _NEWEST:
+        raise _DamagedError(f"it is of version {version}, and versions 1 to {_NEWEST} are known")
+    mean, moved, faces = _pca(archive)
+    colour = _pca(archive)[0]
+    expression, notes = None, list[str]()
+    if version >= 2 and not archive.one("B"):
+        expression, displaced = _expression(archive, len(mean))
+        mean = mean + displaced
+    landmarks: dict[str, int] = {}
+    if version >= 3 and not archive.one("B"):
+        landmarks = dict(archive.many(lambda: (archive.text(), archive.one("i")), 12))
+    textured = len(archive.vector("<f8", 2))
+    if version >= 4:
+        archive.vector("<i4", 3)
+    if not archive.at_end:
+        raise _DamagedError("there is more in it than a model")
+    if len(colour):
+        notes.append("Its model of colour is left out.")
+    if textured:
+        notes.append("Its texture coordinates are left out.")
+    is_sfm = (len(mean) // 3, moved.shape[1], len(faces)) == _SFM
+    return LinearModel(
+        mean=mean.reshape(-1, 3),
+        shape=Modes(moved),
+        expression=expression,
+        faces=faces.astype(np.int32) if len(faces) else None,
+        landmarks=landmarks,
+        provenance=f"eos model of version {version}",
+        licence=_SFM_LICENCE if is_sfm else "",
+        notes=tuple(notes),
+    )
+
+
+def _pca(archive: _Archive) -> tuple[FloatArray, FloatArray, npt.NDArray[Any]]:
+    """Return mean (D,), what one standard deviation of each mode does (D, K), and triangles."""
+    mean, basis, variance = archive.matrix(), archive.matrix(), archive.matrix()
+    faces = archive.vector("<i4", 3)
+    if mean.shape[1] > 1 or basis.shape != (mean.size, variance.size) or (variance < 0).any() or mean.size % 3:
+        raise _DamagedError(f"its parts have the shapes {mean.shape}, {basis.shape} and {variance.shape}")
+    return mean.ravel(), scaled(basis, np.sqrt(variance.ravel())), faces
+
+
+def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:
+    """Return the modes of expressions, and their mean displacement (D,)."""
+    kind = archive.one("i")
+    if kind == _PCA:
+        displaced, moved, _ = _pca(archive)
+        if len(displaced) != size:
+            raise _DamagedError("expressions have another number of vertices")
+        return Modes(moved), displaced
+    if kind != _BLENDSHAPES:
+        raise _DamagedError(f"there is no kind {kind} of expressions")
+    found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+    if not found or any(len(moved) != size for _, moved in found):
+        raise _DamagedError("blendshapes have another number of vertices")
+    return Modes(np.stack([moved for _, moved in found], axis=1), tuple(name for name, _ in found)), np.zeros(size)
+
+
+def _pca_bytes(mean: FloatArray, moved: FloatArray, model: LinearModel | None) -> bytes:
+    basis, stddev = (moved, np.zeros(0)) if not moved.size else orthonormal(moved)[:2]
+    faces = None if model is None else model.faces
+    triangles = np.zeros((0, 3), dtype="<i4") if faces is None else faces.astype("<i4")
+    column = mean.reshape(-1, 1)
+    parts = [column, basis, (stddev**2).reshape(-1, 1)]
+    return b"".join(map(_matrix_bytes, parts)) + struct.pack("<Q", len(triangles)) + triangles.tobytes()
+
+
+def _matrix_bytes(matrix: FloatArray) -> bytes:
+    return struct.pack("<ii", *matrix.shape) + matrix.T.astype("<f4").tobytes()

@@ -1,0 +1,60 @@
+"""The one list of formats, and which of them a file is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from shapespace.errors import FileError, InputError, ModelFileError
+from shapespace.formats.eos import Eos
+from shapespace.formats.parts import Format, LinearModel
+
+FORMATS: Sequence[Format] = (Eos(),)
+"""In the order in which they are asked whether a file is theirs."""
+_HEAD_BYTES = 4096
+
+
+def read_linear(path: Path) -> tuple[Format, LinearModel]:
+    """Return the format of `path`, and the model in it.
+
+    Raises:
+        FileError: it cannot be read.
+        ModelFileError: no format is recognised, or it is damaged.
+    """
+    found = _format_of(path)
+    if found is None:
+        known = ", ".join(one.title for one in FORMATS)
+        raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
+    model = found.read(path)
+    model.check(path)
+    return found, model
+
+
+def is_known(path: Path) -> bool:
+    """Whether `path` looks like a model in one of `FORMATS`."""
+    return path.exists() and _format_of(path) is not None
+
+
+def format_to_write(path: Path, name: str | None) -> Format:
+    """Return the format called `name`, or the one whose names end as `path` does.
+
+    Raises:
+        InputError: there is none.
+    """
+    for one in FORMATS:
+        if one.name == name or (name is None and path.name.lower().endswith(tuple(one.suffixes))):
+            return one
+    names = ", ".join(f"{one.name} ({one.suffixes[0]})" if one.suffixes else one.name for one in FORMATS)
+    what = f"There is no format {name!r}" if name else f"The name {path.name!r} tells no format"
+    raise InputError(f"{what}; choose one of {names}, or .h5 for shapespace's own.")
+
+
+def _format_of(path: Path) -> Format | None:
+    head = b""
+    if not path.is_dir():
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError as error:
+            raise FileError(f"{path} cannot be read: {error.strerror or error}.") from error
+    return next((one for one in FORMATS if one.recognises(path, head)), None)

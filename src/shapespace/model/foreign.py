@@ -1,0 +1,145 @@
+"""From a model of another tool to one of ours and back: orthonormal modes in mm, with variances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.errors import ModelFileError
+from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, orthonormal
+from shapespace.formats.registry import is_known, read_linear
+from shapespace.io.hdf5 import is_ours
+from shapespace.model.model_file import ModelFields
+from shapespace.types import FloatArray
+
+OWN_ENDINGS = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True, eq=False)
+class Foreign:
+    """What a model file of another tool holds, as ours would.
+
+    Args:
+        fields: of the shape model; of identity and expression together where the file parts them.
+        rotation: (K, K) from z to identity and expression, or None where the file does not part them.
+        n_identity: how many rows of `rotation` are identity.
+        format: the format in words.
+        notes: sentences on what was kept, changed or left out.
+    """
+
+    fields: ModelFields
+    rotation: FloatArray | None
+    n_identity: int
+    format: str
+    notes: tuple[str, ...]
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether `path` is there and is a model of another tool."""
+    return not is_ours(path) and is_known(path)
+
+
+def looks_like_model(path: Path) -> bool:
+    """Whether `path` is named as a model of shapespace, or is one of another tool."""
+    return path.suffix.lower() in OWN_ENDINGS or is_foreign(path)
+
+
+def load_foreign(path: Path, mm: float | None = None) -> Foreign:
+    """Return the model in `path`, in whatever format of another tool it is.
+
+    Args:
+        path: a file or a folder.
+        mm: how many mm one unit of it is; None for what its format says, or 1.
+
+    Raises:
+        FileError: it cannot be read.
+        ModelFileError: it is in no known format, damaged, or holds no variation.
+    """
+    found, linear = read_linear(path)
+    notes = list(linear.notes)
+    if mm is None and linear.mm is None:
+        notes.append("The file names no unit; mm are taken.")
+    mm = mm or linear.mm or 1.0
+    if mm != 1.0:
+        notes.append(f"Lengths are multiplied by {mm:g} to be mm.")
+    moved, n_identity = linear.shape.moved, linear.shape.moved.shape[1]
+    if linear.expression is not None:
+        moved = np.concatenate([moved, linear.expression.moved], axis=1)
+    basis, stddev, right = orthonormal(moved * mm)
+    if not len(stddev):
+        raise ModelFileError(f"{path} holds no variation, only a mean; read that as a mesh instead.")
+    notes += _changes(moved, len(stddev), parted=linear.expression is not None)
+    rotation = None
+    if linear.expression is not None and len(stddev) == moved.shape[1]:
+        rotation = right
+    elif linear.expression is not None:
+        notes.append("Identity and expression share modes, so that they cannot be told apart and are one.")
+    if linear.n_training is None and not linear.held_out:
+        notes.append(f"It does not say of how many shapes it was made; {len(stddev) + 1} are taken.")
+    kept = float((stddev**2).sum())
+    told = [block.total_variance for block in (linear.shape, linear.expression) if block is not None]
+    total = kept
+    if all(one is not None for one in told):
+        total = max(kept, sum(one for one in told if one is not None) * mm**2)
+    fields: ModelFields = {
+        "mean": linear.mean.ravel() * mm,
+        "basis": basis,
+        "stddev": stddev,
+        "total_variance": total,
+        "n_training": linear.n_training or len(stddev) + 1,
+        "faces": linear.faces,
+        # Others align rigidly and leave size in the modes.
+        "gauge": "form",
+        "landmarks": linear.landmarks,
+        "representation": "vertices",
+        "coding": {},
+        "provenance": linear.provenance,
+        "licence": linear.licence,
+        "held_out": linear.held_out,
+        "residuals": None,
+    }
+    return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
+
+
+def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> LinearModel:
+    """Return what other formats can hold of a model of ours.
+
+    Args:
+        fields: of the model.
+        mean: (V, 3) its vertices, mm.
+        directions: (3V, K) how vertices move with each coefficient, mm.
+    """
+    left = fields["total_variance"]
+    return LinearModel(
+        mean=mean,
+        shape=Modes(directions * fields["stddev"], total_variance=left),
+        faces=fields["faces"],
+        mm=1.0,
+        landmarks=fields["landmarks"],
+        n_training=fields["n_training"],
+        held_out=fields["held_out"],
+        provenance=fields["provenance"],
+        licence=fields["licence"],
+    )
+
+
+def parted(linear: LinearModel, rotation: FloatArray, n_identity: int) -> LinearModel:
+    """Return `linear` with its modes turned into those of identity and of expression: z = rotation.T @ [a; e]."""
+    moved = linear.shape.moved @ rotation.T
+    return replace(linear, shape=Modes(moved[:, :n_identity]), expression=Modes(moved[:, n_identity:]))
+
+
+def _changes(moved: FloatArray, kept: int, *, parted: bool) -> list[str]:
+    length = np.linalg.norm(moved, axis=0)
+    there = length > 0
+    unit = moved[:, there] / length[there]
+    skew = float(np.abs(unit.T @ unit - np.eye(unit.shape[1])).max(initial=0.0))
+    said: list[str] = []
+    if skew > ORTHOGONAL:
+        why = "Identity and expression overlap" if parted else "The basis was not orthonormal"
+        said.append(f"{why} (by {skew:.2g}) and was made so, which keeps the covariance.")
+    if kept < moved.shape[1]:
+        said.append(f"{moved.shape[1] - kept} of {moved.shape[1]} modes do not vary and are left out.")
+    return said
