@@ -215,6 +215,7 @@ def _add_quality(commands: Any) -> None:
                      default=["vertices"], help="as of build; two are compared")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of folds and samples")
+    _add_where(sub, "folds")
     sub.set_defaults(run=run.quality)
 
 
