@@ -8,9 +8,11 @@ from pathlib import Path
 from shapespace.errors import FileError, InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.parts import Format, LinearModel
+from shapespace.io.json_files import check_file
 
 FORMATS: Sequence[Format] = (Eos(),)
 """In the order in which they are asked whether a file is theirs."""
+LARGEST_BYTES = 2**34
 _HEAD_BYTES = 4096
 
 
@@ -21,6 +23,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
         FileError: it cannot be read.
         ModelFileError: no format is recognised, or it is damaged.
     """
+    check_file(path, LARGEST_BYTES, "give a model file")
     found = _format_of(path)
     if found is None:
         known = ", ".join(one.title for one in FORMATS)
@@ -32,7 +35,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
 
 def is_known(path: Path) -> bool:
     """Whether `path` looks like a model in one of `FORMATS`."""
-    return path.exists() and _format_of(path) is not None
+    return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
 def format_to_write(path: Path, name: str | None) -> Format:
