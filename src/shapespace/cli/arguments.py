@@ -130,7 +130,7 @@ def _add_correspond(commands: Any) -> None:
                "shapespace correspond scans -o same\n"
                "         shapespace build same -o model.h5")  # fmt: skip
     sub.add_argument("scans", nargs="+", metavar="SCAN",
-                     help="scans of one kind of object, folders, patterns, addresses, or lists (.csv, .txt)")  # fmt: skip
+                     help="scans of one kind of object, folders, patterns, addresses or lists (.csv)")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
