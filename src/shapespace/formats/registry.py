@@ -8,9 +8,10 @@ from pathlib import Path
 from shapespace.errors import FileError, InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.gltf import Gltf
+from shapespace.formats.obj_folder import ObjFolder
 from shapespace.formats.parts import Format, LinearModel
 
-FORMATS: Sequence[Format] = (Eos(), Gltf())
+FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder())
 """In the order in which they are asked whether a file is theirs."""
 _HEAD_BYTES = 4096
 

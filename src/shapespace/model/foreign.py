@@ -43,7 +43,7 @@ def is_foreign(path: Path) -> bool:
 
 def looks_like_model(path: Path) -> bool:
     """Whether `path` is named as a model of shapespace, or is one of another tool."""
-    return path.suffix.lower() in OWN_ENDINGS or is_foreign(path)
+    return (path.suffix.lower() in OWN_ENDINGS and not path.is_dir()) or is_foreign(path)
 
 
 def load_foreign(path: Path, mm: float | None = None) -> Foreign:
