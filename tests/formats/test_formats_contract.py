@@ -14,7 +14,7 @@ from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
 
 READ_ONLY: set[str] = set()
-ONLY_SHAPE: set[str] = set()
+ONLY_SHAPE: set[str] = {"shapeworks"}
 """Formats that hold no expressions apart."""
 WRITTEN = [one for one in FORMATS if one.name not in READ_ONLY]
 PARTED = [one for one in WRITTEN if one.name not in ONLY_SHAPE]

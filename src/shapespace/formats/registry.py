@@ -10,8 +10,9 @@ from shapespace.formats.eos import Eos
 from shapespace.formats.gltf import Gltf
 from shapespace.formats.obj_folder import ObjFolder
 from shapespace.formats.parts import Format, LinearModel
+from shapespace.formats.shapeworks import ShapeWorks
 
-FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder())
+FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder(), ShapeWorks())
 """In the order in which they are asked whether a file is theirs."""
 _HEAD_BYTES = 4096
 
