@@ -7,12 +7,14 @@ from pathlib import Path
 
 from shapespace.errors import FileError, InputError, ModelFileError
 from shapespace.formats.eos import Eos
+from shapespace.formats.gias import Gias
 from shapespace.formats.gltf import Gltf
+from shapespace.formats.monai import Monai
 from shapespace.formats.obj_folder import ObjFolder
 from shapespace.formats.parts import Format, LinearModel
 from shapespace.formats.shapeworks import ShapeWorks
 
-FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder(), ShapeWorks())
+FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder(), ShapeWorks(), Monai(), Gias())
 """In the order in which they are asked whether a file is theirs."""
 _HEAD_BYTES = 4096
 
