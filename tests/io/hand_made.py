@@ -128,6 +128,14 @@ def bnt(depth: np.ndarray, step: float = 1.0, name: bytes = b"bs000_N_N_0.png", 
 
 
 BND = "1123\t\t-34.11 20.5 80.25\n1200 -3.0e1 21 81\n0 1 2 3\n"
+# As Slicer 4.10 and 4.13 write fiducials, and as geomorph's writeland.tps writes a specimen.
+FCSV = """# Markups fiducial file version = 4.10
+# CoordinateSystem = 0
+# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
+vtkMRMLMarkupsFiducialNode_0,-10.5,20,3.25,0.000,0.000,0.000,1.000,1,1,0,nose tip,,
+vtkMRMLMarkupsFiducialNode_1,0,-1e2,7,0.000,0.000,0.000,1.000,1,1,0,"left, eye",,vtkMRMLModelNode1
+"""
+TPS = "LM3=3\r\n1.5 2 -3\r\nNA NA NA\r\n4 5 6\r\nIMAGE=a.jpg\r\nID=skull 1\r\nSCALE=1.0\r\n"
 LM3 = "# Landmark file\n\n3 landmarks\nOuter left eyebrow\n-50.5 30.25 1\nNose tip\n0 0 0\nChin middle\n1 -60.0 -2e1\n"
 
 

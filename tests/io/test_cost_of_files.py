@@ -209,6 +209,12 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "many.csv": lambda size: b"".join(b"a%d,0,0,0\n" % k for k in range(size // 14)),
     "many.bnd": lambda size: repeated(b"1 0 0 0\n", size),
     "many.lm3": lambda size: b"%d\n" % (size // 8) + b"a\n0 0 0\n" * (size // 8),
+    "many.fcsv": lambda size: b"".join(b"%d,0,0,0\n" % k for k in range(size // 11)),
+    "heads.fcsv": lambda size: repeated(b"#columns=x,y,z\n", size),
+    "many.tps": lambda size: b"LM3=%d\n" % (size // 6) + b"0 0 0\n" * (size // 6),
+    "many.tlms": lambda size: repeated(b"a 1 0 0 0\n", size),
+    "many.txt": lambda size: repeated(b"0 0 0\n", size),
+    "heads.pts": lambda size: repeated(b"{\n", size),
     "many.pp": lambda size: repeated(b'<point x="0" y="0" z="0"/>', size, b"<PickedPoints>", b"</PickedPoints>"),
     "many.json": lambda size: b"[" + b'{"id":"a","coordinates":[0,0,0]},' * (size // 33) + b"0]",
     "many.mrk.json": lambda size: (

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hand_made import BND, FACE, LM3, NONE, bnt, gltf_tree, vtk_5_1, vtp
+from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, vtk_5_1, vtp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,6 +29,9 @@ from shapespace.types import Mesh
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is bounded by what Linux tells of a process")
 MINUTES = float(os.environ.get("SHAPESPACE_FUZZ_MINUTES", "0"))
 EXAMPLES = 300
+EXAMPLES_OF_ROWS = 100
+ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".pcd")
+"""Formats of rows of numbers under a short head, where less can go wrong."""
 MOST_MEMORY = 2**29
 MOST_CPU_S = 5.0
 
@@ -114,6 +117,11 @@ LANDMARKS: dict[str, list[bytes]] = {
     ".csv": [*marked(".csv"), b'# c\na,1,2,3\n"b, c",4,5,6\n'],
     ".bnd": [BND.encode()],
     ".lm3": [LM3.encode()],
+    ".fcsv": [*marked(".fcsv"), FCSV.encode()],
+    ".tps": [TPS.encode()],
+    ".tlms": [b"nose 1 1.5 -2 3\nchin 0 0 0 0\near_left 1 1e3 0 2\n"],
+    ".txt": [b"# c\nname x y z\nnose 1 2 3\nchin 4,5,6\n", b"1 2 3\n4 5 6\n"],
+    ".pts": [b"Version 1.0\n2\nS000 1 2 3\nS001 4 5 6\n", b"version: 1\nn_points: 1\n{\n0.5 1 2\n}\n"],
 }
 NO_DATA = gltf_tree(accessors=[{"componentType": 5126, "count": 5 * 10**7, "type": "VEC3"}])
 LONG_LABEL = {"landmarks": {"points": [[0, 1, 2]] * 9}, "labels": [{"label": "a" * 10**6, "mask": [*range(9)]}]}
@@ -214,7 +222,7 @@ def fuzz(read: Callable[[Path], object], path: Path, samples: list[bytes]) -> No
     readers = len(MESHES) + len(LANDMARKS) + 1
 
     @settings(
-        max_examples=EXAMPLES,
+        max_examples=EXAMPLES_OF_ROWS if path.suffix in ROWS else EXAMPLES,
         deadline=None,
         suppress_health_check=list(HealthCheck),
         derandomize=not MINUTES,
