@@ -128,6 +128,47 @@ def bnt(depth: np.ndarray, step: float = 1.0, name: bytes = b"bs000_N_N_0.png", 
 
 
 BND = "1123\t\t-34.11 20.5 80.25\n1200 -3.0e1 21 81\n0 1 2 3\n"
+
+
+def lzf(data: bytes) -> bytes:
+    """Literal runs, and copies of four bytes before where the data repeat, as liblzf writes them."""
+    out, at = bytearray(), 0
+    while at < len(data):
+        run = 0
+        while at >= 4 and at + run < len(data) and run < 264 and data[at + run] == data[at + run - 4]:
+            run += 1
+        if run >= 3:
+            length = run - 2
+            out += bytes([(min(length, 7) << 5), *([length - 7] if length >= 7 else []), 3])
+            at += run
+        else:
+            part = data[at : at + 4]
+            out += bytes([len(part) - 1]) + part
+            at += len(part)
+    return bytes(out)
+
+
+def pcd(form: str, points: np.ndarray = POINTS, *, width: int | None = None) -> bytes:
+    """As PCL writes points with a colour, a padding of two bytes and a descriptor of three numbers."""
+    n = len(points)
+    row = np.dtype([("x", "<f4"), ("y", "<f4"), ("p", "u1", (2,)), ("z", "<f4"), ("rgb", "<u4"), ("d", "<f8", (3,))])
+    table = np.zeros(n, row)
+    for k, axis in enumerate("xyz"):
+        table[axis] = points[:, k]
+    head = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y _ z rgb d\nSIZE 4 4 1 4 4 8\n"
+        f"TYPE F F U F U F\nCOUNT 1 1 2 1 1 3\nWIDTH {width or n}\nHEIGHT {n // (width or n)}\nVIEWPOINT 0 0 0 1 0 0 "
+        f"0\nPOINTS {n}\nDATA {form}\n"
+    ).encode()
+    if form == "ascii":
+        return head + b"".join(f"{x!r} {y!r} 0 0 {z!r} 4278190080 0 0 0\n".encode() for x, y, z in points.tolist())
+    if form == "binary":
+        return head + table.tobytes()
+    runs = b"".join(np.ascontiguousarray(table[name]).tobytes() for name in row.names or ())
+    packed = lzf(runs)
+    return head + struct.pack("<II", len(packed), len(runs)) + packed
+
+
 # As Slicer 4.10 and 4.13 write fiducials, and as geomorph's writeland.tps writes a specimen.
 FCSV = """# Markups fiducial file version = 4.10
 # CoordinateSystem = 0

@@ -4,6 +4,7 @@
 A new reader needs an entry in `MESHES` or `LANDMARKS`; what was found by a long run belongs into `FOUND`.
 """
 
+import gzip
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, vtk_5_1, vtp
+from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, pcd, vtk_5_1, vtp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -30,7 +31,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is bound
 MINUTES = float(os.environ.get("SHAPESPACE_FUZZ_MINUTES", "0"))
 EXAMPLES = 300
 EXAMPLES_OF_ROWS = 100
-ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".pcd")
+ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".gz")
 """Formats of rows of numbers under a short head, where less can go wrong."""
 MOST_MEMORY = 2**29
 MOST_CPU_S = 5.0
@@ -107,6 +108,9 @@ MESHES: dict[str, list[bytes]] = {
     ".gltf": [*written(SURFACE, ".gltf"), json.dumps(gltf_tree()).encode(), json.dumps(MORPHED).encode()],
     ".wrl": [FACE.encode(), MOVED.encode(), VRML_1.encode()],
     ".raw": [b"0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1 -0.0\n", b"a\n1 2 3 # c\n4,5,6\n7 8 9\n"],
+    ".xyz": [b"//X Y Z R\n0 0 0 255\n1 0.5 -1e3 0\n", b"2\n1,2,3\n4;5;6\n"],
+    ".pts": [b"3\n1 2 3 -700 1 2 3\n4 5 6 0 0 0 0\n7 8 9 0 0 0 0\n"],
+    ".pcd": [pcd(form) for form in ("ascii", "binary", "binary_compressed")],
     ".bnt": [bnt(np.where(np.arange(12.0) == 5, NONE, np.arange(12.0)).reshape(3, 4), name=b"a")],
 }
 LANDMARKS: dict[str, list[bytes]] = {
@@ -248,6 +252,10 @@ def test_a_damaged_mesh_file_is_a_mesh_or_one_sentence(ending: str, tmp_path: Pa
     fuzz(read_mesh, tmp_path / f"bad{ending}", MESHES[ending])
 
 
+def test_a_damaged_packed_file_is_a_mesh_or_one_sentence(tmp_path: Path) -> None:
+    fuzz(read_mesh, tmp_path / "bad.xyz.gz", [gzip.compress(data, mtime=0) for data in MESHES[".xyz"]])
+
+
 @pytest.mark.parametrize("ending", LANDMARKS)
 def test_a_damaged_landmark_file_is_landmarks_or_one_sentence(ending: str, tmp_path: Path) -> None:
     fuzz(read_landmarks, tmp_path / f"bad{ending}", LANDMARKS[ending])
@@ -262,12 +270,15 @@ def test_every_reader_has_a_fuzzer() -> None:
     assert set(LANDMARKS) == {*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS}
 
 
-@pytest.mark.parametrize("ending", [*MESHES, *LANDMARKS])
-def test_what_is_damaged_was_whole(ending: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("read", "ending"),
+    [*((read_mesh, ending) for ending in MESHES), *((read_landmarks, ending) for ending in LANDMARKS)],
+)
+def test_what_is_damaged_was_whole(read: Callable[[Path], object], ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"good{ending}"
-    for data in MESHES.get(ending, LANDMARKS.get(ending, [])):
+    for data in (MESHES if read is read_mesh else LANDMARKS)[ending]:
         path.write_bytes(data)
-        assert read_mesh(path) if ending in MESHES else read_landmarks(path)
+        assert read(path)
 
 
 @pytest.mark.parametrize("which", range(len(FOUND)))
