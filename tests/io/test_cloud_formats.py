@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made import pcd
+from hand_made import las, pcd
 
 from shapespace.commands.look import check
 from shapespace.errors import FileFormatError
@@ -104,6 +104,23 @@ def test_packed_data_that_are_wrong_are_refused(packed: bytes, write) -> None:
     start = whole.index(b"binary_compressed\n") + 18
     size = whole[start + 4 : start + 8]
     assert "packed data" in refusal(write("a.pcd", whole[:start] + struct.pack("<I", len(packed)) + size + packed))
+
+
+@pytest.mark.parametrize(("minor", "kind", "row"), [(0, 0, 20), (2, 3, 34), (4, 7, 36)])
+def test_las_is_read_with_its_scale_and_offset(minor: int, kind: int, row: int, write) -> None:
+    found = read_mesh(write("a.las", las(POINTS, minor=minor, kind=kind, row=row)))
+    assert found.faces is None and np.abs(found.vertices - POINTS).max() <= 0.0005 + 1e-9
+
+
+def test_other_las_is_refused(write) -> None:
+    whole = las(POINTS)
+    assert "packed (LAZ)" in refusal(write("a.las", las(POINTS, kind=3 | 0x80)))
+    assert "50 points" in refusal(write("a.las", whole[:-1]))
+    assert "does not begin" in refusal(write("a.las", b"LASX" + whole[4:]))
+    assert "no points" in refusal(write("a.las", las(POINTS[:0])))
+    assert "contradicts itself" in refusal(
+        write("a.las", las(POINTS, row=12).replace(b"\x03\x0c\x00", b"\x03\x04\x00"))
+    )
 
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl", ".off", ".vtk", ".vtp", ".glb", ".gltf"])

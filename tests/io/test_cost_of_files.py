@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_made import gltf_tree, ply_header
+from hand_made import gltf_tree, las, ply_header
 
 from shapespace.commands.look import check
 from shapespace.errors import FileError, FileFormatError, ShapespaceError
@@ -231,6 +231,7 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "counts.pts": lambda size: repeated(b"1\n0 0 0\n", size),
     "runs.pcd": pcd_runs,
     "ones.pcd": pcd_ones,
+    "many.las": lambda size: las(np.zeros((size // 12, 3)), row=12),
     "many.csv": lambda size: b"".join(b"a%d,0,0,0\n" % k for k in range(size // 14)),
     "many.bnd": lambda size: repeated(b"1 0 0 0\n", size),
     "many.lm3": lambda size: b"%d\n" % (size // 8) + b"a\n0 0 0\n" * (size // 8),

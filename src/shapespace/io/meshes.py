@@ -13,6 +13,7 @@ from shapespace.errors import FileFormatError
 from shapespace.io.bnt import read_bnt
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
+from shapespace.io.las import read_las
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.obj import read_obj, write_obj
 from shapespace.io.off import read_off, write_off
@@ -146,7 +147,15 @@ MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
 """File name ending -> format that is read and written."""
 
 READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType(
-    {".wrl": read_vrml, ".raw": read_raw, ".bnt": read_bnt, ".xyz": read_xyz, ".pts": read_xyz, ".pcd": read_pcd}
+    {
+        ".wrl": read_vrml,
+        ".raw": read_raw,
+        ".bnt": read_bnt,
+        ".xyz": read_xyz,
+        ".pts": read_xyz,
+        ".pcd": read_pcd,
+        ".las": read_las,
+    }
 )
 """File name ending -> reader (content, path) -> mesh, for formats that are not written."""
 
