@@ -202,9 +202,12 @@ def test_what_is_wrong_is_said_in_one_sentence(change: str, said: str, tmp_path:
     assert str(refused.value).endswith(".") and "\n" not in str(refused.value)
 
 
-def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "big.particles", np.zeros((100_000, 3)), "%d")
-    rows = [{"world_particles_1": "big.particles"}] * 40_000
+def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shapespace.io.limits.SPARE_BYTES", 2**20)
+    np.savetxt(tmp_path / "big.particles", np.zeros((10_000, 3)), "%d")
+    rows = [{"world_particles_1": "big.particles"}] * 4_000
     with pytest.raises(ShapespaceError, match="unfold to more than"):
         ShapeWorks().read(swproj(tmp_path, rows))
 

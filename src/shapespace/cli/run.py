@@ -536,7 +536,9 @@ def convert(arguments: argparse.Namespace) -> int:
     from shapespace.types import MM_PER_UNIT
 
     mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
-    source, target, notes = convert(arguments.source, arguments.output, to=arguments.to, mm=mm)
+    source, target, notes = convert(
+        arguments.source, arguments.output, to=arguments.to, mm=mm, expressions=arguments.expressions
+    )
     if arguments.json:
         show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})
     else:
