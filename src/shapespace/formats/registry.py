@@ -8,8 +8,10 @@ from pathlib import Path
 from shapespace.errors import FileError, InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.parts import Format, LinearModel
+from shapespace.formats.scalismo_json import ScalismoJson
+from shapespace.formats.statismo import Statismo
 
-FORMATS: Sequence[Format] = (Eos(),)
+FORMATS: Sequence[Format] = (Eos(), Statismo(), ScalismoJson())
 """In the order in which they are asked whether a file is theirs."""
 _HEAD_BYTES = 4096
 
