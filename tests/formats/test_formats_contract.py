@@ -13,7 +13,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
 
-READ_ONLY: set[str] = set()
+READ_ONLY = {"flame", "mat"}
 ONLY_SHAPE: set[str] = set()
 """Formats that hold no expressions apart."""
 WRITTEN = [one for one in FORMATS if one.name not in READ_ONLY]

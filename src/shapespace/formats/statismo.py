@@ -11,7 +11,6 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
@@ -88,11 +87,10 @@ def model_of(tree: Tree, path: Path) -> LinearModel:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One model of a tree: mean (D,), moved (D, K), whether its basis is orthonormal, variance that no mode holds."""
+    """One model of a tree: mean (D,), moved (D, K), and variance that no mode holds."""
 
     mean: FloatArray
     moved: FloatArray
-    is_orthonormal: bool
     left: float
 
     def modes(self) -> Modes:
@@ -127,9 +125,8 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         mm=_mm(tree, root, told),
         landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), notes, path),
         n_training=_n_training(tree, root, part, told),
-        # Where modes are functions and not directions, it is a Gaussian process, whose variances were chosen and not
-        # found in the shapes that gave the modes.
-        held_out=told["held_out"] == "yes" if "held_out" in told else not part.is_orthonormal,
+        # Of Gaussian process models neither: fits that took their variances as they stand were too sure of themselves.
+        held_out=told.get("held_out") == "yes",
         provenance=told.get("provenance") or " ".join(f"statismo model {representer}".split()),
         licence=told.get("licence") or (_BFM_LICENCE if is_bfm else ""),
         notes=tuple(notes),
@@ -187,11 +184,10 @@ def _part(tree: Tree, root: str) -> _Part:
     unit = basis / np.where(is_scaled & (length > 0), length, 1.0)
     there = length > 0
     skew = np.abs(unit[:, there].T @ unit[:, there] - np.eye(int(there.sum()))).max(initial=0.0)
-    is_orthonormal = bool(skew <= ORTHOGONAL)
     # The file has variances less the noise, which every direction has.
-    within = len(variance) if is_orthonormal else 0
+    within = len(variance) if skew <= ORTHOGONAL else 0
     moved = scaled(unit, np.sqrt(variance + (noise if within else 0.0)))
-    return _Part(mean, moved, is_orthonormal, noise * (len(mean) - within))
+    return _Part(mean, moved, noise * (len(mean) - within))
 
 
 def _array(tree: Tree, path: str) -> FloatArray:
@@ -395,16 +391,18 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
 def _hdf5_of(tree: Tree) -> bytes:
     import h5py  # a twentieth of a second that only those who write should wait
 
+    low: Any = h5py
+
     def fixed(text: str) -> tuple[Any, Any]:
         data = text.encode("utf-8", "replace")
-        kind: Any = h5py.h5t.C_S1.copy()
+        kind = low.h5t.C_S1.copy()
         kind.set_size(len(data) + 1)
-        kind.set_strpad(h5py.h5t.STR_NULLTERM)
+        kind.set_strpad(low.h5t.STR_NULLTERM)
         return kind, np.array(data + b"\0", dtype=f"S{len(data) + 1}")
 
     memory = io.BytesIO()
     with h5py.File(memory, "w", libver="earliest", track_order=False) as file:
-        scalar: Any = h5py.h5s.create(h5py.h5s.SCALAR)
+        scalar = low.h5s.create(low.h5s.SCALAR)
         for path in sorted(tree.groups):
             file.require_group(path)
         for path, array in tree.arrays.items():
@@ -413,10 +411,10 @@ def _hdf5_of(tree: Tree) -> bytes:
             above, _, name = path.rpartition("/")
             kind, value = fixed(text)
             parent: Any = file[above or "/"]
-            h5py.h5d.create(parent.id, name.encode(), kind, scalar).write(h5py.h5s.ALL, h5py.h5s.ALL, value)
+            low.h5d.create(parent.id, name.encode(), kind, scalar).write(low.h5s.ALL, low.h5s.ALL, value)
         for path, told in tree.attributes.items():
             owner: Any = file[path]
             for name, text in told.items():
                 kind, value = fixed(str(text))
-                h5py.h5a.create(owner.id, name.encode(), kind, scalar).write(value)
+                low.h5a.create(owner.id, name.encode(), kind, scalar).write(value)
     return memory.getvalue()

@@ -114,7 +114,7 @@ def _dataset(one: Any, path: str, found: _Found) -> None:
     if not used <= _FILTERS:
         raise _RefusedError(f"{path} is packed in a way that no model needs")
     count, each = math.prod(one.shape), one.dtype.itemsize
-    of_text = h5py.check_string_dtype(one.dtype)
+    of_text: Any = h5py.check_string_dtype(one.dtype)
     if of_text is None and one.dtype.kind not in _NUMBERS:
         return
     if of_text is not None and count > 1 and of_text.length != 1:
@@ -135,14 +135,15 @@ def _text(value: Any) -> str:
 
 
 def _matlab(stream: BinaryIO, asked: dict[str, Any], found: _Found) -> None:
-    from scipy.io import loadmat, whosmat
+    from scipy import io as scipy_io
 
+    library: Any = scipy_io
     _close_the_door()
-    wanted = [(name, shape) for name, shape, _ in whosmat(stream) if name in asked["wanted"]]
+    wanted = [(name, shape) for name, shape, _ in library.whosmat(stream) if name in asked["wanted"]]
     for name, shape in wanted:
         found.charge(8 * math.prod(shape), f"/{name}")
     stream.seek(0)
-    loaded = loadmat(stream, variable_names=[name for name, _ in wanted])
+    loaded = library.loadmat(stream, variable_names=[name for name, _ in wanted])
     for name, _ in wanted:
         if name in loaded:
             _unfold(loaded[name], f"/{name}", found)
@@ -150,7 +151,7 @@ def _matlab(stream: BinaryIO, asked: dict[str, Any], found: _Found) -> None:
 
 def _unfold(value: Any, path: str, found: _Found) -> None:
     """Add a variable, or the fields of a structure, as groups of HDF5 would hold them."""
-    if path.count("/") > _DEEPEST or not isinstance(value, np.ndarray):
+    if path.count("/") > _DEEPEST or type(value) is not np.ndarray:
         return
     if value.dtype.kind in _NUMBERS:
         found.add(path, value)
