@@ -103,8 +103,9 @@ def _attributes(one: Any, path: str, found: _Found) -> None:
 
 
 def _dataset(one: Any, path: str, found: _Found) -> None:
-    import h5py
+    import h5py as library
 
+    h5py: Any = library
     stored = one.id.get_create_plist()
     if stored.get_external_count() or stored.get_layout() == h5py.h5d.VIRTUAL:
         raise _RefusedError(f"{path} lies in another file")
@@ -114,7 +115,7 @@ def _dataset(one: Any, path: str, found: _Found) -> None:
     if not used <= _FILTERS:
         raise _RefusedError(f"{path} is packed in a way that no model needs")
     count, each = math.prod(one.shape), one.dtype.itemsize
-    of_text: Any = h5py.check_string_dtype(one.dtype)
+    of_text = h5py.check_string_dtype(one.dtype)
     if of_text is None and one.dtype.kind not in _NUMBERS:
         return
     if of_text is not None and count > 1 and of_text.length != 1:

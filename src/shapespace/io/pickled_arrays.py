@@ -117,19 +117,19 @@ def pickled_array(value: object, depth: int = 0) -> npt.NDArray[Any]:
             raise PickleRefusedError("a list in it is no array") from error
     if not isinstance(value, _Made) or depth > _DEEPEST:
         raise PickleRefusedError("what should be an array is none")
-    state: Any = value.state
-    if value.what == "array" and type(state) is tuple and len(state) == 5:
-        _, shape, dtype, fortran, data = state
+    listed, named = _tuple(value.state), _dict(value.state)
+    if value.what == "array" and len(listed) == 5:
+        _, shape, dtype, fortran, data = listed
         return _numbers(data, _dtype(dtype), shape, bool(fortran))
     if value.what == "buffer" and len(value.parts) >= 4:
         data, dtype, shape, order = value.parts[:4]
         return _numbers(data, _dtype(dtype), shape, order == "F")
     if value.what == "scalar" and len(value.parts) == 2:
         return _numbers(value.parts[1], _dtype(value.parts[0]), (), False)
-    if value.what == "chumpy" and type(state) is dict and "x" in state:
-        return pickled_array(state["x"], depth + 1)
-    if value.what == "chumpy" and type(state) is dict and {"a", "idxs"} <= state.keys():
-        return _selected(state, depth)
+    if value.what == "chumpy" and "x" in named:
+        return pickled_array(named["x"], depth + 1)
+    if value.what == "chumpy" and {"a", "idxs"} <= named.keys():
+        return _selected(named, depth)
     raise PickleRefusedError("what should be an array is none")
 
 
@@ -148,8 +148,8 @@ def _dtype(made: object) -> np.dtype[Any]:
     found = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
     if found is None:
         raise PickleRefusedError("an array in it is not of numbers")
-    state: Any = cast(_Made, made).state
-    is_big = type(state) is tuple and len(state) > 1 and state[1] == ">"
+    state = _tuple(cast(_Made, made).state)
+    is_big = len(state) > 1 and state[1] == ">"
     try:
         return np.dtype(found[1]).newbyteorder(">" if is_big or cast(str, kind)[0] == ">" else "<")
     except TypeError as error:
@@ -171,6 +171,14 @@ def _numbers(data: Any, dtype: np.dtype[Any], shape: tuple[Any, ...], fortran: b
         raise PickleRefusedError("an array in it is not as long as it says")
     sizes = _shape(shape, len(content) // dtype.itemsize)
     return np.frombuffer(content, dtype).reshape(sizes, order="F" if fortran else "C")
+
+
+def _tuple(value: Any) -> tuple[Any, ...]:
+    return cast(tuple[Any, ...], value) if isinstance(value, tuple) else ()
+
+
+def _dict(value: Any) -> dict[Any, Any]:
+    return cast(dict[Any, Any], value) if isinstance(value, dict) else {}
 
 
 def _as_bytes(data: Any) -> bytes:
