@@ -16,7 +16,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-_MOST_STEPS = 2_000_000
+_MOST_STEPS = 400_000
 _MOST_AXES = 8
 _DEEPEST = 8
 _MULTIARRAY, _NUMERIC = (
