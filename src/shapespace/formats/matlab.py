@@ -35,7 +35,7 @@ class _Layout:
         first_vertex: the number of the first vertex.
         mm: how many mm one unit is, or None.
         n_training: how many shapes it was made of, or None; a path in the file, or a number.
-        textured: path of what tells that there is colour.
+        textured: where its colour is.
     """
 
     title: str
@@ -59,7 +59,7 @@ _LAYOUTS: Final = (
     ),
     _Layout(
         "LYHM", "Liverpool-York Head Model: for research only, see its licence",
-        "/shp/mu", "/shp/eigVec", "/shp/eigVal", "/tri/faces", textured="/tex/mu",
+        "/shp/mu", "/shp/eigVec", "/shp/eigVal", "/tri/faces", textured="/tex",
     ),
     _Layout(
         "LSFM", "Large Scale Facial Model: non-commercial research only, see its licence",
@@ -67,7 +67,7 @@ _LAYOUTS: Final = (
         n_training="/n_training_samples",
     ),
 )  # fmt: skip
-_WANTED = ("shapeMU", "shapePC", "shapeEV", "tl", "texMU", "shp", "tri", "mean", "components", "eigenvalues",
+_WANTED = ("shapeMU", "shapePC", "shapeEV", "tl", "shp", "tri", "mean", "components", "eigenvalues",
            "trilist", "n_training_samples")  # fmt: skip
 
 
@@ -105,7 +105,7 @@ def _tree(path: Path) -> Tree:
         head = stream.read(_HDF5_AT + len(HDF5_SIGNATURE))
     if not (head.startswith(HDF5_SIGNATURE) or head[_HDF5_AT:] == HDF5_SIGNATURE):
         return read_matlab_apart(path, _WANTED)
-    tree = read_hdf5_apart(path, leave=("/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#"))
+    tree = read_hdf5_apart(path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#"))
     # MATLAB has the last axis first.
     return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
 
@@ -123,7 +123,6 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
         n_training = (
             int(told.reshape(-1)[0]) if told is not None and told.size == 1 and told.reshape(-1)[0] > 1 else None
         )
-    is_textured = layout.textured and (layout.textured in tree.arrays or "/tex" in tree.groups)
     return LinearModel(
         mean=mean.reshape(-1, 3),
         shape=Modes(scaled(basis, spread if layout.is_stddev else np.sqrt(spread))),
@@ -132,7 +131,7 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
         n_training=n_training,
         provenance=layout.title,
         licence=layout.licence,
-        notes=("Its model of colour is left out.",) if is_textured else (),
+        notes=("Its model of colour is left out.",) if layout.textured in tree.groups else (),
     )
 
 

@@ -49,7 +49,7 @@ class Tree:
         arrays: of numbers.
         texts: single ones.
         attributes: numbers and texts by name, of groups and arrays that have any.
-        groups: paths of all groups, with "/".
+        groups: paths of all groups, with "/", and of what was left.
     """
 
     arrays: Mapping[str, npt.NDArray[Any]]

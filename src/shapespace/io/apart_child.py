@@ -140,7 +140,9 @@ def _matlab(stream: BinaryIO, asked: dict[str, Any], found: _Found) -> None:
 
     library: Any = scipy_io
     _close_the_door()
-    wanted = [(name, shape) for name, shape, _ in library.whosmat(stream) if name in asked["wanted"]]
+    there = [(name, shape) for name, shape, _ in library.whosmat(stream)]
+    wanted = [(name, shape) for name, shape in there if name in asked["wanted"]]
+    found.groups.extend(f"/{name}" for name, _ in there if name not in asked["wanted"])
     for name, shape in wanted:
         found.charge(8 * math.prod(shape), f"/{name}")
     stream.seek(0)
