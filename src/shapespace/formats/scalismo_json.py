@@ -24,7 +24,8 @@ _AGAIN = "export it again from where it was made"
 _LARGEST_BYTES = 2**31
 _MOST_NODES = 4096
 _DEEPEST = 16
-_MARKS = (b'"apiVersion"', b'"root"', b'"datasets"', b'"groups"')
+_LONGEST_NAME = 1024
+_MARKS = (b'"apiVersion"', b"H5T_", b"H5S_", b"H5L_")
 _FLOAT: Final = {"class": "H5T_FLOAT", "base": "H5T_IEEE_F32LE"}
 _INTEGER: Final = {"class": "H5T_INTEGER", "base": "H5T_STD_I32LE"}
 _TEXT: Final = {
@@ -44,7 +45,7 @@ class ScalismoJson:
     suffixes: Sequence[str] = (".h5.json",)
 
     def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins as JSON, and is named as scalismo names it or has such a beginning."""
+        """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
         start = head.lstrip()
         if not start.startswith(b"{"):
             return False
@@ -55,7 +56,7 @@ class ScalismoJson:
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             tree = _tree(read_bytes(path))
-        except (ApartError, ValueError, RecursionError, MemoryError) as error:
+        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
             told = " ".join(str(error).split())[:120].rstrip(".")
             raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {told}; {_AGAIN}.") from error
         return model_of(tree, path)
@@ -121,8 +122,8 @@ def _tree(text: bytes) -> Tree:
         attributes[path or "/"] = _attributes(group.attributes)
         for link in group.links:
             inner = f"{path}/{link.title}"
-            if link.kind != "H5L_TYPE_HARD":
-                raise ApartError(f"{inner} is a link to elsewhere")
+            if link.kind != "H5L_TYPE_HARD" or len(link.title) > _LONGEST_NAME:
+                raise ApartError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
             if link.collection == "groups":
                 waiting.append((inner, link.id))
             elif link.id in file.datasets:

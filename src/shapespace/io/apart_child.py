@@ -19,6 +19,7 @@ _MOST_ATTRIBUTES = 64
 _DEEPEST = 16
 _MOST_AXES = 8
 _LONGEST_TEXT = 2**20
+_LONGEST_NAME = 1024
 _FILTERS = {1, 2, 3}
 """Deflate, shuffle and checksums: those that HDF5 itself brings, and that models use."""
 _NUMBERS: Final = "biuf"
@@ -71,6 +72,8 @@ def _walk(group: Any, path: str, found: _Found, leave: tuple[str, ...]) -> None:
     if path.count("/") > _DEEPEST or len(found.groups) + len(found.arrays) + len(group) > _MOST_NODES:
         raise _RefusedError("it has more groups than a model")
     for name in group:
+        if len(name) > _LONGEST_NAME:
+            raise _RefusedError("it has longer names than a model")
         inner = f"{path}/{name}"
         if inner in leave:
             found.groups.append(inner)
@@ -98,6 +101,7 @@ def _attributes(one: Any, path: str, found: _Found) -> None:
         if is_text or about.dtype.kind in _NUMBERS:
             value = np.asarray(one.attrs[name]).reshape(-1)[0]
             told[name] = _text(value) if is_text else value.item()
+            found.charge(len(str(told[name])), path)
     if told:
         found.attributes[path] = told
 
@@ -126,6 +130,7 @@ def _dataset(one: Any, path: str, found: _Found) -> None:
         found.add(path, one[()])
     elif count == 1:
         found.texts[path] = _text(np.asarray(one[()]).reshape(-1)[0])
+        found.charge(len(found.texts[path]), path)
     elif count:
         found.add(path, np.frombuffer(one[()].tobytes(), np.uint8))
 
