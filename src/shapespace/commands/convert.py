@@ -34,14 +34,14 @@ def convert(
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the model itself; give another name to write to.")
     model, of, notes = _load(source, mm, expressions)
+    linear = model.as_linear()
     if target is None:
         model.save(output)
-        return of, OWN[0], notes
-    linear = model.as_linear()
-    notes += target.write(linear, output)
+    else:
+        notes += target.write(linear, output)
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
-        notes.append(f"The licence goes along: {linear.licence}")
-    return of, target.title, notes
+        notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
+    return of, OWN[0] if target is None else target.title, notes
 
 
 def formats() -> list[dict[str, str]]:
@@ -51,7 +51,8 @@ def formats() -> list[dict[str, str]]:
 
 
 def _target(output: Path, to: str | None) -> Format | None:
-    if to == OWN[0] or (to is None and output.suffix.lower() in OWN[1]):
+    named = any(output.name.lower().endswith(tuple(one.suffixes)) for one in FORMATS)
+    if to == OWN[0] or (to is None and not named and output.suffix.lower() in OWN[1]):
         return None
     return format_to_write(output, to)
 

@@ -5,16 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shapespace.errors import FileError, InputError, ModelFileError
+from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.eos import Eos
+from shapespace.formats.flame import Flame
 from shapespace.formats.gias import Gias
 from shapespace.formats.gltf import Gltf
+from shapespace.formats.matlab import Matlab
 from shapespace.formats.monai import Monai
 from shapespace.formats.obj_folder import ObjFolder
 from shapespace.formats.parts import Format, LinearModel
+from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks
+from shapespace.formats.statismo import Statismo
+from shapespace.io.files import open_file
 
-FORMATS: Sequence[Format] = (Eos(), Gltf(), ObjFolder(), ShapeWorks(), Monai(), Gias())
+FORMATS: Sequence[Format] = (
+    Eos(),
+    Statismo(),
+    ScalismoJson(),
+    Gias(),
+    Flame(),
+    Matlab(),
+    Gltf(),
+    ObjFolder(),
+    ShapeWorks(),
+    Monai(),
+)
 """In the order in which they are asked whether a file is theirs."""
 _HEAD_BYTES = 4096
 
@@ -57,9 +73,6 @@ def format_to_write(path: Path, name: str | None) -> Format:
 def _format_of(path: Path) -> Format | None:
     head = b""
     if not path.is_dir():
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError as error:
-            raise FileError(f"{path} cannot be read: {error.strerror or error}.") from error
+        with open_file(path) as file:
+            head = file.read(_HEAD_BYTES)
     return next((one for one in FORMATS if one.recognises(path, head)), None)
