@@ -369,6 +369,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
         landmark_rms: distance of its landmarks from their places on the surface.
+        metadata: by the columns of the list that named it.
     """
 
     CALLED: ClassVar = "a record of correspondence"
@@ -397,6 +398,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     moved_share: list[float] = []
     cpu_s: list[float] = []
     landmark_rms: float | None = None
+    metadata: Mapping[str, str | int | float | None] = {}
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -82,15 +82,17 @@ def names_for(
     for scan, key in keys.items():
         if key not in names:
             groups.setdefault(_stem(scan).casefold(), {})[key] = scan
+    used = {name.casefold() for name in (*taken, *names.values())}
     # Names that stand alone come first, so that none is taken from its owner.
     for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
-        used = {name.casefold() for name in (*taken, *names.values())}
         (key, scan), *others = group.items()
         stem = _stem(scan)
         if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
-            names[key] = stem
+            found = {key: stem}
         else:
-            names |= _told_apart(group, used)
+            found = _told_apart(group, used)
+        names |= found
+        used |= {name.casefold() for name in found.values()}
     return [names[keys[scan]] for scan in scans]
 
 

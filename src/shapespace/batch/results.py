@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,6 +29,16 @@ from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
 _LARGEST_RECORD = 2**24
+
+
+@lru_cache(maxsize=1024)
+def _resolved_folder(folder: Path) -> Path:
+    return folder.resolve()
+
+
+def _resolved(file: Path) -> Path:
+    """Return the real path of `file`; its folder's is found once, since that takes longest of what is known of it."""
+    return file.resolve() if file.is_symlink() else _resolved_folder(file.parent.absolute()) / file.name
 
 
 @dataclass(frozen=True)
@@ -54,7 +65,7 @@ class Source:
     def at(file: Path, content_hash: str, folder: Path) -> Source:
         """Return the source `file` as results in `folder` refer to it."""
         try:
-            path = os.path.relpath(file.resolve(), folder.resolve())
+            path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
         except (ValueError, OSError):  # another drive, or a folder that is gone
             path = str(file)
         return Source(file.name, content_hash, Path(path).as_posix())

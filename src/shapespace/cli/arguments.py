@@ -130,7 +130,7 @@ def _add_correspond(commands: Any) -> None:
                "shapespace correspond scans -o same\n"
                "         shapespace build same -o model.h5")  # fmt: skip
     sub.add_argument("scans", nargs="+", metavar="SCAN",
-                     help="scans of one kind of object, folders, patterns, or lists (.csv, .txt) of these")  # fmt: skip
+                     help="scans of one kind of object, folders, patterns, addresses or lists (.csv)")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
@@ -215,6 +215,7 @@ def _add_quality(commands: Any) -> None:
                      default=["vertices"], help="as of build; two are compared")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of folds and samples")
+    _add_where(sub, "folds")
     sub.set_defaults(run=run.quality)
 
 

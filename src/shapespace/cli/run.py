@@ -289,7 +289,7 @@ def quality(arguments: argparse.Namespace) -> int:
         control_points=arguments.control_points,
     )
     options = QualityOptions(settings, arguments.representation, arguments.scans, arguments.unseen)
-    found, notes = quality(arguments.targets, arguments.output, options, quiet=arguments.quiet)
+    found, notes = quality(arguments.targets, arguments.output, options, _where(arguments), quiet=arguments.quiet)
     for note in notes:
         say(note)
     if arguments.json:

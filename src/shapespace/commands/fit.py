@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.batch.where import Where
-from shapespace.commands.inputs import Given, given_scans
+from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
@@ -25,7 +25,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.store.manifest import read_manifest
 
 _SURFACES = (".fitted.ply", ".dense.ply")
-_ROOT = "/"
 
 
 @dataclass(frozen=True)
@@ -137,27 +136,8 @@ class _Watch:
 
 def _jobs(given: Sequence[Given], landmarks: Path | None, folder: Path) -> list[Job]:
     """Return a job for each scan; one that lies elsewhere is named by its address as by a path."""
-    addresses: dict[Path, str] = {}
-    paths: list[Path] = []
-    for one in given:
-        path = Path(_ROOT, *_parts(one.place)) if isinstance(one.place, str) else one.place
-        paths.append(path)
-        if isinstance(one.place, str):
-            addresses[path] = one.place
-    jobs = [
-        replace(job, name=one.called or job.name, metadata=one.metadata)
-        for job, one in zip(make_jobs(paths, landmarks, folder, addresses), given, strict=True)
-    ]
-    seen: dict[str, Job] = {}
-    for job in jobs:
-        if seen.setdefault(job.name.casefold(), job).called != job.called:
-            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
-    return jobs
-
-
-def _parts(address: str) -> Sequence[str]:
-    head = address.split("::", 1)[0].partition("?")[0]
-    return [part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")]
+    addresses = {one.path: one.address for one in given if one.address}
+    return with_ids(make_jobs([one.path for one in given], landmarks, folder, addresses), given)
 
 
 def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:

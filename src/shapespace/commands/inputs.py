@@ -6,9 +6,10 @@ import csv
 import glob
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from shapespace.batch.fit_work import Job
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
@@ -33,6 +34,19 @@ class Given:
     place: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def address(self) -> str:
+        """Of a scan that lies elsewhere; else empty."""
+        return self.place if isinstance(self.place, str) else ""
+
+    @property
+    def path(self) -> Path:
+        """Of the scan; of one that lies elsewhere, what it would be, for its name."""
+        if isinstance(self.place, Path):
+            return self.place
+        head = self.place.split("::", 1)[0].partition("?")[0]
+        return Path("/", *(part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")))
 
 
 def given_scans(
@@ -66,17 +80,20 @@ def given_scans(
     return found
 
 
-def files_of(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:
-    """Return the same where only files can be read.
+def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
+    """Return `jobs` by the ids of the scans that they are of, where these have some, with what is known of the scans.
 
     Raises:
-        InputError: there is nothing, or an address among them.
-        FileError: a folder or a list cannot be read.
+        InputError: two scans would have one name.
     """
-    found = given_scans(scans, folder, recursive=recursive, say=say)
-    if there := [one.place for one in found if not isinstance(one.place, Path)]:
-        raise InputError(f"{there[0]} is an address, and this command reads files; copy the scans to a folder first.")
-    return [Path(one.place) for one in found]
+    named = [
+        replace(job, name=one.called or job.name, metadata=one.metadata) for job, one in zip(jobs, given, strict=True)
+    ]
+    seen: dict[str, Job] = {}
+    for job in named:
+        if seen.setdefault(job.name.casefold(), job).called != job.called:
+            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
+    return named
 
 
 def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]) -> Sequence[Path | str]:

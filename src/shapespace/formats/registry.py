@@ -17,6 +17,7 @@ from shapespace.formats.parts import Format, LinearModel
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks
 from shapespace.formats.statismo import Statismo
+from shapespace.io.json_files import check_file
 from shapespace.io.files import open_file
 
 FORMATS: Sequence[Format] = (
@@ -32,6 +33,7 @@ FORMATS: Sequence[Format] = (
     Monai(),
 )
 """In the order in which they are asked whether a file is theirs."""
+LARGEST_BYTES = 2**34
 _HEAD_BYTES = 4096
 
 
@@ -42,6 +44,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
         FileError: it cannot be read.
         ModelFileError: no format is recognised, or it is damaged.
     """
+    check_file(path, LARGEST_BYTES, "give a model file")
     found = _format_of(path)
     if found is None:
         known = ", ".join(one.title for one in FORMATS)
@@ -53,7 +56,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
 
 def is_known(path: Path) -> bool:
     """Whether `path` looks like a model in one of `FORMATS`."""
-    return path.exists() and _format_of(path) is not None
+    return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
 def format_to_write(path: Path, name: str | None) -> Format:

@@ -78,7 +78,9 @@ def _user_block(data: bytes | memoryview) -> bytes:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether `path` begins as `write_hdf5` has files begin; False where it cannot be read."""
+    """Whether `path` is a file that begins as `write_hdf5` has files begin; False where it cannot be read."""
+    if not path.is_file():  # a pipe would have its reader wait
+        return False
     try:
         with open_file(path) as file:
             return file.read(len(_MAGIC)) == _MAGIC
