@@ -17,8 +17,8 @@ from shapespace.formats.parts import Format, LinearModel
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks
 from shapespace.formats.statismo import Statismo
-from shapespace.io.json_files import check_file
 from shapespace.io.files import open_file
+from shapespace.io.json_files import check_file
 
 FORMATS: Sequence[Format] = (
     Eos(),

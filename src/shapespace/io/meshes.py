@@ -15,6 +15,7 @@ from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
 from shapespace.io.las import read_las
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
+from shapespace.io.mat_mesh import read_mat_mesh
 from shapespace.io.obj import read_obj, write_obj
 from shapespace.io.off import read_off, write_off
 from shapespace.io.packed import GZIP, unpacked
@@ -59,7 +60,8 @@ def read_mesh(path: Path | str) -> Mesh:
     equal ones are merged in the order of first appearance). Polygons become fans of triangles.
 
     Args:
-        path: a file with one of the endings in `MESH_ENDINGS`, in any case, packed by gzip (`.ply.gz`) or not.
+        path: a file with one of the endings in `MESH_ENDINGS` or `NAMED_FORMATS`, in any case, packed by gzip
+            (`.ply.gz`) or not.
 
     Returns:
         The mesh as the file has it, with whatever is wrong with it.
@@ -71,7 +73,8 @@ def read_mesh(path: Path | str) -> Mesh:
         MeshError: faces that point past the end of the vertices.
     """
     path = Path(path)
-    read = READ_ONLY_FORMATS.get(ending_of(path)) or _format(path, "read").read
+    ending = ending_of(path)
+    read = READ_ONLY_FORMATS.get(ending) or NAMED_FORMATS.get(ending) or _format(path, "read").read
     data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
     if data.startswith(GZIP):
         data = unpacked(data, path, LARGEST_MESH_FILE_BYTES)
@@ -158,6 +161,9 @@ READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyTyp
     }
 )
 """File name ending -> reader (content, path) -> mesh, for formats that are not written."""
+
+NAMED_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType({".mat": read_mat_mesh})
+"""The same for endings under which most files are none, so that those are read where they are named, not in folders."""
 
 MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
 """The endings that `read_mesh` takes."""
