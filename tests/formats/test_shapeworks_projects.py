@@ -175,7 +175,8 @@ def test_written_shapes_have_the_mean_and_covariance_and_are_near(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("missing", "not there"), ("outside", "outside its own folder"), ("text", "no number|text where"),
+        ("missing", "not there"), ("long", "cannot be|not there"), ("zero", "cannot be|not there"),
+        ("outside", "outside its own folder"), ("text", "no number|text where"),
         ("cut", "different numbers of particles"), ("none", "names no particles"), ("one", "of 1 subjects"),
         ("ragged", "rows of three"),
     ],
@@ -185,6 +186,8 @@ def test_what_is_wrong_is_said_in_one_sentence(change: str, said: str, tmp_path:
     first = tmp_path / rows[0]["world_particles_1"]
     if change == "missing":
         first.unlink()
+    elif change in ("long", "zero"):
+        rows[0]["world_particles_1"] = "a" * 5000 if change == "long" else "a\0b"
     elif change == "outside":
         rows[0]["world_particles_1"] = "../../etc/passwd"
     elif change == "text":

@@ -133,6 +133,7 @@ LONG_LABEL = {"landmarks": {"points": [[0, 1, 2]] * 9}, "labels": [{"label": "a"
 FOUND: list[tuple[str, bytes]] = [
     (".gltf", json.dumps(NO_DATA).encode()),
     (".ljson", json.dumps({"version": 2, **LONG_LABEL}).encode()),
+    (".gltf", json.dumps(gltf_tree(buffers=[{"byteLength": 42, "uri": "dat`:" + "a" * 5000}])).encode()),
 ]
 
 NUMBERS = [

@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from shapespace.errors import FileFormatError
 from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes import MESH_ENDINGS, NAMED_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 VERTICES = np.random.default_rng(0).normal(size=(9, 3))
@@ -49,3 +49,4 @@ def test_of_a_folder_it_is_no_scan(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.ply", Mesh(VERTICES))
     savemat(tmp_path / "results.mat", {"x": VERTICES})
     assert [path.name for path in mesh_files([tmp_path]).files] == ["a.ply"]
+    assert set(NAMED_FORMATS) == {".mat"} and not set(NAMED_FORMATS) & set(MESH_ENDINGS)

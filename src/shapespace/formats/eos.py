@@ -93,7 +93,8 @@ def read_blendshapes(path: Path) -> Modes:
     check_file(path, _LARGEST_BYTES, _BLENDSHAPES_AGAIN)
     archive = _Archive(read_bytes(path))
     try:
-        found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+        with np.errstate(invalid="ignore"):
+            found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
         if not archive.at_end:
             raise _DamagedError("there is more in it than blendshapes")
         if not found or any(len(moved) != len(found[0][1]) or len(moved) % 3 for _, moved in found):

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from threadpoolctl import threadpool_limits
+
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.eos import Eos
 from shapespace.formats.flame import Flame
@@ -49,7 +52,9 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
     if found is None:
         known = ", ".join(one.title for one in FORMATS)
         raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
-    model = found.read(path)
+    # The last bits hang on the number of threads, and workers, which have one, must find the same model.
+    with threadpool_limits(1, user_api="blas"), np.errstate(invalid="ignore", over="ignore"):
+        model = found.read(path)
     model.check(path)
     return found, model
 

@@ -123,13 +123,17 @@ class _Project:
     def file(self, name: str) -> Path:
         """Return the file of that name beside the project or in a folder there, counted the first time."""
         folder = self.path.parent.resolve()
-        target = (folder / PurePosixPath(name.strip().replace("\\", "/"))).resolve()
+        try:
+            target = (folder / PurePosixPath(name.strip().replace("\\", "/"))).resolve()
+            is_there = target.is_file()
+        except (OSError, ValueError) as error:  # a name too long for the system, or one with zeros
+            raise ModelFileError(f"{self.path} names a file that cannot be ({name[:80]!r}); {_AGAIN}.") from error
         if not target.is_relative_to(folder):
             raise ModelFileError(
-                f"{self.path} names a file outside its own folder ({name[:80]}), which is not read; move it there."
+                f"{self.path} names a file outside its own folder ({name[:80]!r}), which is not read; move it there."
             )
-        if not target.is_file():
-            raise ModelFileError(f"{self.path} names a file that is not there ({name[:80]}); {_AGAIN}.")
+        if not is_there:
+            raise ModelFileError(f"{self.path} names a file that is not there ({name[:80]!r}); {_AGAIN}.")
         if target not in self.known:
             self.known.add(target)
             self.allowance.more_file(target.stat().st_size)

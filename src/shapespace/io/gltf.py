@@ -103,10 +103,14 @@ class _Gltf:
                 raise damaged(self.path, "it has a buffer that is not base64; export it again")
             return base64.b64decode(body, validate=True)
         folder = self.path.parent.resolve()
-        target = (folder / unquote(uri)).resolve()
+        try:
+            target = (folder / unquote(uri)).resolve()
+            is_there = target.exists()
+        except OSError as error:  # a name too long for the system
+            raise damaged(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
         if "://" in uri or not target.is_relative_to(folder):
             raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
-        if not target.exists():
+        if not is_there:
             raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
         try:
             data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
