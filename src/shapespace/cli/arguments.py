@@ -314,6 +314,8 @@ def _add_convert(commands: Any) -> None:
     sub.add_argument("output", type=Path, metavar="OUT", help="its ending tells the format; .h5 is shapespace's own")
     sub.add_argument("--to", metavar="FORMAT", help="the format by its name, where the ending does not tell it")
     sub.add_argument("--unit", choices=("um", "mm", "cm", "inch", "m"), help="of IN, where its format does not say")
+    sub.add_argument("--expressions", type=Path, metavar="FILE.bin",
+                     help="blendshapes that eos keeps in a file of their own")  # fmt: skip
     sub.set_defaults(run=run.convert)
 
 

@@ -536,7 +536,9 @@ def convert(arguments: argparse.Namespace) -> int:
     from shapespace.types import MM_PER_UNIT
 
     mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
-    source, target, notes = convert(arguments.source, arguments.output, to=arguments.to, mm=mm)
+    source, target, notes = convert(
+        arguments.source, arguments.output, to=arguments.to, mm=mm, expressions=arguments.expressions
+    )
     if arguments.json:
         show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})
     else:
@@ -578,9 +580,11 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
 
 
 def _print_fit(name: str, record: Mapping[str, Any]) -> None:
+    from shapespace.io.meshes import stem_of
+
     file = str(record["scan"]["name"])
     # A scan that shares its file's name with others goes by the name of its results.
-    called = file if Path(file).stem == name else f"{name} ({file})"
+    called = file if stem_of(file) == name else f"{name} ({file})"
     told = _distances(record, "shown")
     show(f"{called}: {record['status']}" + (f"; {told}" if told else ""))
     if told := _distances(record, "shown_dense", measure="median"):

@@ -13,7 +13,7 @@ from shapespace.batch.fit_work import Job
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import MESH_ENDINGS
+from shapespace.io.meshes import MESH_FILE_ENDINGS
 from shapespace.io.remote import addresses, is_address
 
 _LISTS = (".csv", ".tsv", ".txt")
@@ -98,14 +98,14 @@ def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
 
 def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]) -> Sequence[Path | str]:
     if isinstance(text, str) and is_address(text):
-        return addresses(text, MESH_ENDINGS, recursive=recursive)
+        return addresses(text, MESH_FILE_ENDINGS, recursive=recursive)
     path = Path(text)
     if glob.has_magic(str(path)) and not path.exists():
         matched = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
         if not matched:
             raise InputError(f"No file matches {path}; check the pattern.")
         # A pattern that ends in an ending names scans; another one may take what is none.
-        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(tuple(MESH_ENDINGS))]
+        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(MESH_FILE_ENDINGS)]
         paths = files or matched
     else:
         paths = [path]

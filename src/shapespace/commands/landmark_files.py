@@ -8,6 +8,7 @@ from pathlib import Path
 
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.meshes import stem_of
 from shapespace.types import Mesh
 
 _LISTED = 5
@@ -58,18 +59,19 @@ class LandmarkFiles:
         """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""
         owner: dict[str, Path] = {}
         for path in scans:
-            if path.stem in self.files and owner.setdefault(path.stem, path) != path:
+            name = stem_of(path)
+            if name in self.files and owner.setdefault(name, path) != path:
                 raise InputError(
-                    f"{owner[path.stem]} and {path} would both take the landmarks in {self.files[path.stem]}; rename "
-                    "one of the scans."
+                    f"{owner[name]} and {path} would both take the landmarks in {self.files[name]}; rename one of the "
+                    "scans."
                 )
 
     def onto(self, mesh: Mesh, path: Path) -> Mesh:
         """Return `mesh`, read from `path`, with the landmarks that the folder has for it."""
-        file = self.files.get(path.stem)
+        file = self.files.get(stem_of(path))
         if file is None:
             return mesh
-        self.used.add(path.stem)
+        self.used.add(stem_of(path))
         try:
             return replace(mesh, landmarks=read_landmarks(file))
         except ShapespaceError as error:

@@ -61,6 +61,8 @@ def info(path: Path) -> dict[str, Any]:
     """
     if path.is_dir() and (results := results_at(path)) is not None:
         return {"kind": "store", **store_facts(results)}
+    if path.is_dir() and looks_like_model(path):
+        return {"kind": "model", **model_facts(ShapeModel.load(path))}
     if path.is_dir() or path.name == CorrespondenceRecord.FILE:
         return {"kind": "correspondence", **correspondence_facts(path if path.is_dir() else path.parent)}
     if path.name.endswith(CorrespondRecord.ENDING):
