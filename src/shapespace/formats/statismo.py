@@ -99,7 +99,7 @@ class _Part:
 
 
 def _model(tree: Tree, path: Path) -> LinearModel:
-    root = _root(tree)
+    root = _root(tree, path)
     part = _part(tree, root)
     mean, expression, notes = part.mean, None, list[str]()
     if root == "/shape" and "/expression/model/mean" in tree.arrays:
@@ -139,13 +139,13 @@ def _roots(tree: Tree) -> list[str]:
     return ["/" + "/".join(part for part in text.split("/") if part) for text in found]
 
 
-def _root(tree: Tree) -> str:
+def _root(tree: Tree, path: Path) -> str:
     for root in ("/shape", "", *_roots(tree)):
         if f"{root}/model/mean" in tree.arrays:
             return root
     if tree.attributes.get("/", {}).get("format") == "shapespace model":
         raise ValueError("it is one of shapespace, but has no checksum")
-    raise ValueError("there is no /model/mean in it")
+    raise ModelFileError(f"{path} is not a shapespace model, nor one of statismo: there is no /model/mean in it.")
 
 
 def _version(tree: Tree, root: str) -> tuple[int, int] | None:
