@@ -37,7 +37,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
 
 def is_known(path: Path) -> bool:
     """Whether `path` looks like a model in one of `FORMATS`."""
-    return path.exists() and _format_of(path) is not None
+    return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
 def format_to_write(path: Path, name: str | None) -> Format:
