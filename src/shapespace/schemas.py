@@ -154,6 +154,18 @@ class Iteration(Struct, frozen=True, kw_only=True):
     scale: float | None = None
 
 
+class FoundLandmark(Struct, frozen=True, kw_only=True):
+    """A landmark of the model on the fitted surface.
+
+    Args:
+        at: in the scan's own frame and unit.
+        stddev_mm: along the axes of that frame, mm of the scan; None where the method finds none.
+    """
+
+    at: tuple[float, float, float]
+    stddev_mm: tuple[float, float, float] | None = None
+
+
 class FitRecord(Struct, frozen=True, kw_only=True):
     """A NAME.fit.json.
 
@@ -172,6 +184,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         z: and in standard deviations.
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
+        found_landmarks: the model's landmarks, on the dense surface where there is one, by name.
         distances_mm: by stage, over the whole model and every scan point within its rim.
         size_mm: root mean square distance of the fitted surface's vertices from their middle.
         shown: distances of the final stage over what the scan shows, in mm of the model's frame; None, as the next
@@ -208,6 +221,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     b_stddev_calibrated: bool = False
     shrinkage: tuple[float, ...] = ()
     evidence: Mapping[str, Any] = {}
+    found_landmarks: Mapping[str, FoundLandmark] = {}
     distances_mm: Mapping[str, BothWays] = {}
     shown: ShownDistances | None = None
     shown_scan_mm: ShownDistances | None = None

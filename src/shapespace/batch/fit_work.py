@@ -25,12 +25,14 @@ from shapespace.batch.results import (
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.state import IcpState
-from shapespace.io.files import sha256_of_file, write_together
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
+from shapespace.io.files import sha256_of_file, write_text, write_together
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.meshes import read_mesh
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.results import wrote_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -128,15 +130,17 @@ def fit_file(
         writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
     if stages:
         writes[files.stages] = partial(write_stages, result=result, model=model)
+    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
+    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
     writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not config.dense, stages=not stages))
+    write_together(writes, files.stale(dense=not config.dense, stages=not stages, landmarks=not texts))
     return record
 
 
 def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
     files = _Files.of(job, folder)
     # An earlier run's surface would contradict the record.
-    stale = [files.fitted, *files.stale(dense=True, stages=True)]
+    stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
     write_together({files.record: partial(write_record, record=record)}, stale)
     return record
 
@@ -149,16 +153,19 @@ class _Files:
     fitted: Path
     dense: Path
     stages: Path
+    landmarks: Mapping[str, Path]
 
     @staticmethod
     def of(job: Job, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        return _Files(*(folder / f"{job.name}{ending}" for ending in endings))
+        landmarks = {ending: folder / f"{job.name}{ending}" for ending in FIDUCIAL_ENDINGS}
+        return _Files(*(folder / f"{job.name}{ending}" for ending in endings), landmarks)
 
-    def stale(self, *, dense: bool, stages: bool) -> list[Path]:
+    def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
         """Return what an earlier fit may have left that this one does not write."""
-        # Without a record it is no result of ours, but perhaps a scan.
+        # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
         left = [self.dense] if dense and self.record.is_file() else []
+        left += self.landmarks.values() if landmarks and wrote_landmarks(self.record) else ()
         return [*left, self.stages] if stages else left
 
 

@@ -135,6 +135,7 @@ def fit_record(
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
+        **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [
             {
@@ -149,6 +150,15 @@ def fit_record(
         "iterations": result.iterations,
         "seconds": dict(result.seconds),
         "version": __version__,
+    }
+
+
+def found_landmarks(result: FitResult) -> dict[str, dict[str, list[float] | None]]:
+    """Return what a record says of the model's landmarks on the fitted surface; nothing where the model has none."""
+    stddev_mm = result.landmark_stddev_mm
+    return {
+        name: {"at": point.tolist(), "stddev_mm": None if stddev_mm is None else stddev_mm[name].tolist()}
+        for name, point in result.landmarks.items()
     }
 
 

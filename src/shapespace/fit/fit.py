@@ -180,6 +180,7 @@ def fit_scan(
         model=model,
         scan=placed.scan,
         find_regions=fitted.regions,
+        landmark_stddev_mm=_landmark_stddev_mm(model, fitted, dense=config.dense),
     )
 
 
@@ -274,6 +275,19 @@ def _measure(model: ShapeModel, placed: _Placed, driven: _Driven, config: FitCon
     if config.dense:
         stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
     return stages
+
+
+def _landmark_stddev_mm(model: ShapeModel, fitted: Fitted, *, dense: bool) -> dict[str, FloatArray] | None:
+    """Return name -> (3,) of where each of the model's landmarks lies, mm of the scan."""
+    if fitted.landmark_covariance is None:
+        return None
+    variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
+    if not dense:
+        # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
+        vertex = list(model.landmarks.values())
+        told = fitted.T_scan_model.apply(model.reconstruct(fitted.b)[vertex])
+        variance += (told - fitted.vertices_scan_mm[vertex]) ** 2
+    return dict(zip(model.landmarks, np.sqrt(variance), strict=True))
 
 
 def _in_standard_deviations(b_covariance: FloatArray | None, model: ShapeModel) -> FloatArray | None:

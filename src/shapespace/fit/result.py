@@ -100,6 +100,8 @@ class FitResult:
         model: the model that was fitted.
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
+        landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
+            scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method.
     """
 
     scan_name: str
@@ -124,6 +126,7 @@ class FitResult:
     model: ShapeModel = field(repr=False)
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
+    landmark_stddev_mm: Mapping[str, FloatArray] | None = field(default=None, repr=False)
 
     @cached_property
     def regions(self) -> IntArray:
@@ -132,6 +135,14 @@ class FitResult:
         The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
         """
         return self.find_regions()
+
+    @cached_property
+    def landmarks(self) -> dict[str, FloatArray]:
+        """Name -> (3,) of the model's landmarks in the scan's frame and unit, on the dense surface if there is one.
+
+        Empty where the model has no landmarks.
+        """
+        return dict(self.surface(stage="dense" if "dense" in self.stages else "final").landmarks)
 
     @property
     def iterations(self) -> dict[str, int]:

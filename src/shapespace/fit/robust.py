@@ -28,7 +28,7 @@ from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_eq
 from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
-from shapespace.fit.posterior import lack_of_new_shapes, new_shapes, posterior
+from shapespace.fit.posterior import Posterior, covariance_of_vertices, lack_of_new_shapes, new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -39,7 +39,7 @@ from shapespace.fit.weights import spread, tails
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray, IntArray, Similarity
 
 _MOTION_STRIDE = 7
 _FEWEST_MATCHES = 30
@@ -48,6 +48,8 @@ _CLEARLY_BETTER = 0.95
 _FARTHEST = 5.0
 _HALF, _LEADING, _NEAR = 0.5, 10, 0.05
 """A match counts at half weight; so many modes lead; near is this share of the model's size."""
+_LACK_LEFT = 0.5
+"""Of the variance outside the model, so that landmarks lie within their standard deviations (docs/landmarks.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +324,16 @@ def robust_icp(
             "model_lack_mm": lack_of_new_shapes(model),
             "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         },
+        landmark_covariance=_of_landmarks(model, known, surface, at.T_scan_model),
     )  # fmt: skip
+
+
+def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T: Similarity) -> FloatArray:
+    """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
+    covariance = covariance_of_vertices(known, surface, np.array(list(model.landmarks.values()), dtype=np.int32))
+    # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
+    covariance += np.eye(3) * _LACK_LEFT * lack_of_new_shapes(model) ** 2 / 3.0
+    return T.scale**2 * T.rotation @ covariance @ T.rotation.T
 
 
 def _matched(look: Look, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray) -> dict[str, float]:
