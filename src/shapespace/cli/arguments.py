@@ -250,7 +250,11 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
                      help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
     sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
-    sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE|DIR",
+                     help="to start from and be held to, named as in the model: of one scan, or a folder with a file "
+                          "for each, named as it; or the column landmarks of a list of scans")  # fmt: skip
+    sub.add_argument("--landmark-sd", type=_stddev, metavar="MM",
+                     help="their standard deviation (default: 3 %% of the model's size); inf: only to start from")  # fmt: skip
     _add_where(sub, "scans")
     results = sub.add_mutually_exclusive_group()
     results.add_argument("--again", action="store_true", help="fit also scans whose results of earlier runs still hold")
@@ -453,6 +457,16 @@ def _control_points(text: str) -> tuple[int, int]:
     if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
         raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
     return int(counts[0]), int(counts[1])
+
+
+def _stddev(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
+    return value
 
 
 def _smoothing(text: str) -> float:

@@ -360,6 +360,7 @@ def fit(arguments: argparse.Namespace) -> int:
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,
         dense=arguments.dense,
+        landmark_stddev_mm=arguments.landmark_sd,
     )
     settings = BatchSettings(
         config,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.marks import SHARE, Marks
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.methods import method_named
 from shapespace.fit.result import FitResult, Stage
@@ -49,6 +50,9 @@ class FitConfig:
         scale: `free` fits a similarity, `fixed` a rigid motion; `auto` goes by the model's gauge.
         max_iterations: cap of each phase.
         seed: of the subsample that the start is searched on.
+        landmark_stddev_mm: of landmarks that are given, mm of the scan: how well they are placed. The robust method is
+            held to them by it; infinity takes them for the start alone. None for 3 % of the model's size (RMS distance
+            from its centre).
         dense: whether the surface is then taken the rest of the way to the scan, as the stage `dense`.
         dense_settings: settings of that.
 
@@ -64,6 +68,7 @@ class FitConfig:
     seed: int = 0
     dense: bool = False
     dense_settings: DenseSettings = field(default_factory=DenseSettings)
+    landmark_stddev_mm: float | None = None
 
     def __post_init__(self) -> None:
         for value, choices, what in (
@@ -77,6 +82,8 @@ class FitConfig:
             raise InputError(
                 f"The dense stage needs the robust method; leave out dense, or the method {fitting.name!r}."
             )
+        if self.landmark_stddev_mm is not None and not self.landmark_stddev_mm > 0:
+            raise InputError(f"Landmarks need a positive standard deviation in mm, not {self.landmark_stddev_mm}.")
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
         if self.max_iterations < 1:
@@ -97,6 +104,10 @@ class FitConfig:
         # Not `asdict` of the whole: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
+        # Options that are left out are not told, so that such fits are those of versions that did not know them.
+        if self.landmark_stddev_mm is not None:
+            # JSON has no infinity.
+            common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
         return {
             "method": method.name, **common, "dense_settings": asdict(self.dense_settings),
             method.name: asdict(method),  # type: ignore[call-overload]
@@ -118,7 +129,8 @@ def fit_scan(
         model: the shape space.
         scan: a mesh or point cloud, in its own frame and unit.
         config: settings; None for the defaults.
-        landmarks: name -> (3,) in the scan's frame and unit, to start from; None to use none.
+        landmarks: name -> (3,) in the scan's frame and unit, to start from and, by the robust method, to be held to
+            (`FitConfig.landmark_stddev_mm`); None to use none.
         T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
         on_state: called with each state of the loop, for progress bars and viewers.
 
@@ -219,13 +231,16 @@ def _place(
     T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
     with_scale = config.limits(model).with_scale
+    marks_mm = {name: T_mm_scan.apply(point) for name, point in (landmarks or {}).items()}
     if T_scan_model is not None:
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
-        marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         start = start_from_landmarks(model, marks_mm, scan.name, with_scale=with_scale)
     else:
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
+    if landmarks:
+        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(model.mean_vertices) * start.T_scan_model.scale
+        start = replace(start, marks=Marks.of(model, marks_mm, stddev_mm))
     said = [f"{finding.what} {finding.action}".strip() for finding in findings]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
 

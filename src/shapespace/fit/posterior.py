@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from shapespace.fit.equations import SCALE, NormalEquations, Prior
+from shapespace.fit.marks import worth
 from shapespace.fit.matching import Weights
 from shapespace.fit.moving_model import MovingSurface
 from shapespace.geometry.similarity import POSE, small_poses
@@ -101,6 +102,9 @@ def posterior(
         # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
         temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # eq 20
         scaled = data / temperature * np.outer(unit, unit)
+        if equations.marks is not None:
+            # Weighed up in a step by what matches are worth, they are what they are beside tempered ones.
+            scaled += equations.marks / (sigma_mm**2 * worth(matches)) * np.outer(unit, unit)
         scaled[np.diag_indices(n)] += known_before
         inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # eq 21
         if equations.holds_scale:

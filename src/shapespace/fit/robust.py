@@ -26,6 +26,7 @@ from scipy.linalg import LinAlgError
 from shapespace.errors import FitError
 from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
 from shapespace.fit.final_matches import FinalMatches
+from shapespace.fit.marks import Marks, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
 from shapespace.fit.posterior import Posterior, covariance_of_vertices, lack_of_new_shapes, new_shapes, posterior
@@ -97,6 +98,7 @@ class Problem:
         settings: of the method.
         prior: of pose and shape.
         surface: the model's surface, which moves.
+        marks: landmarks that it is held to, if any.
     """
 
     prepared: PreparedModel
@@ -104,15 +106,17 @@ class Problem:
     settings: RobustSettings
     prior: Prior
     surface: MovingSurface
+    marks: Marks | None = None
 
     @staticmethod
     def of(
-        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool
+        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start: Start, *, with_scale: bool
     ) -> Problem:
         """Return the problem with the model's own modes."""
+        start_scale = start.T_scan_model.scale
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
         surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        return Problem(prepared, target, settings, prior, surface)
+        return Problem(prepared, target, settings, prior, surface, start.marks)
 
     def with_modes_beside(self) -> Problem:
         """Return the problem with the modes that the model lacks, weighed as `beyond_prior` says."""
@@ -157,7 +161,12 @@ class Problem:
     def equations(self, look: Look, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
         """Return what each vertex carries of the matches, and the equations of a step from there."""
         gathered = look.matches.gathered(look.weights, self.prepared.topology.faces, len(self.surface.vertices))
-        return gathered, normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
+        equations = normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
+        if self.marks is None:
+            return gathered, equations
+        hessian, gradient = self.marks.equations(self.surface, at.T_scan_model, modes)
+        gain = look.sigma_mm**2 * worth(float(look.weights.points.sum() + look.weights.vertices.sum()))
+        return gathered, replace(equations, gradient=equations.gradient + gain * gradient, marks=gain * hessian)
 
     def step(self, matcher: Matcher, at: Estimate, modes: int) -> Step:
         """Return one Gauss-Newton step on the pose and the first `modes` coefficients; the surface moves with it.
@@ -258,7 +267,7 @@ def robust_icp(
         FitError: hardly anything matches, or the fit diverged.
     """
     prepared = prepare(model)
-    problem = Problem.of(prepared, target, settings, start.T_scan_model.scale, with_scale=with_scale)
+    problem = Problem.of(prepared, target, settings, start, with_scale=with_scale)
     at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
     tree, tree_fits = prepared.tree, False
     matcher = problem.matcher(settings.levels[0], at, tree, None)
@@ -322,10 +331,20 @@ def robust_icp(
             "left_out_mm": float(np.sqrt(left_out_mm2)),
             "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
             "model_lack_mm": lack_of_new_shapes(model),
+            **_of_marks(problem, at),
             "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         },
+        notes=() if problem.marks is None else problem.marks.notes(surface, at.T_scan_model),
         landmark_covariance=_of_landmarks(model, known, surface, at.T_scan_model),
     )  # fmt: skip
+
+
+def _of_marks(problem: Problem, at: Estimate) -> dict[str, float]:
+    """Return the standard deviation of the landmarks that were given, and how far off they are (RMS), mm of the scan."""
+    if problem.marks is None:
+        return {}
+    off_mm = problem.marks.off_mm(problem.surface, at.T_scan_model)
+    return {"marks_stddev_mm": problem.marks.stddev_mm, "marks_rms_mm": float(np.sqrt((off_mm**2).mean()))}
 
 
 def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T: Similarity) -> FloatArray:

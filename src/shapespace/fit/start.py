@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.marks import Marks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
@@ -36,6 +37,7 @@ class Start:
         b: (K',) coefficients of the leading modes found there, mm; (0,) where none were.
         runner_up_score_mm: `score_mm` of the best pose that is another one; infinite where none was tried.
         alternatives: up to three such other poses, best first, without alternatives of their own.
+        marks: landmarks of the scan that the fit is held to; None without any.
     """
 
     T_scan_model: Similarity
@@ -44,6 +46,7 @@ class Start:
     b: FloatArray = field(default_factory=lambda: np.zeros(0))
     runner_up_score_mm: float = float("inf")
     alternatives: tuple[Start, ...] = ()
+    marks: Marks | None = None
 
 
 def start_evidence(start: Start) -> dict[str, float]:
