@@ -23,7 +23,7 @@ from shapespace.batch.results import (
     write_stages,
 )
 from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit import OPTIONS, FitConfig, fit_scan
 from shapespace.fit.state import IcpState
 from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
 from shapespace.io.files import sha256_of_file, write_text, write_together
@@ -300,7 +300,7 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
     return bool(
         record["model"]["hash"] == model_hash
         and record.get("landmarks") == marks
-        and all(record["config"].get(key) == value for key, value in settings.items())
+        and all(record["config"].get(key) == settings.get(key) for key in {*settings, *OPTIONS})
         and is_same_scan(record["scan"], job, folder)
     )
 

@@ -155,9 +155,9 @@ def fit_record(
 
 def found_landmarks(result: FitResult) -> dict[str, dict[str, list[float] | None]]:
     """Return what a record says of the model's landmarks on the fitted surface; nothing where the model has none."""
-    stddev_mm = result.landmark_stddev_mm
+    stddev_mm = result.landmark_stddev_mm or {}
     return {
-        name: {"at": point.tolist(), "stddev_mm": None if stddev_mm is None else stddev_mm[name].tolist()}
+        name: {"at": point.tolist(), "stddev_mm": stddev_mm[name].tolist() if name in stddev_mm else None}
         for name, point in result.landmarks.items()
     }
 

@@ -187,6 +187,8 @@ def _add_build(commands: Any) -> None:
     sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
                      help="CSV of name,vertex, or points on the first mesh")  # fmt: skip
+    sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
+                     help="a part of the surface to hold fits to: a CSV file of vertices; can be repeated")  # fmt: skip
     sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
     sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
@@ -254,7 +256,13 @@ def _add_fit(commands: Any) -> None:
                      help="to start from and be held to, named as in the model: of one scan, or a folder with a file "
                           "for each, named as it; or the column landmarks of a list of scans")  # fmt: skip
     sub.add_argument("--landmark-sd", type=_stddev, metavar="MM",
-                     help="their standard deviation (default: 3 %% of the model's size); inf: only to start from")  # fmt: skip
+                     help="their standard deviation (default: 3 %% of the model's size); inf: for the start")  # fmt: skip
+    sub.add_argument("--crop", default="", metavar="KIND:NUMBERS",
+                     help="fit what lies in sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z (the scan's frame and unit), or within "
+                          "so many mm of the landmarks, landmarks:MM")  # fmt: skip
+    sub.add_argument("--region", metavar="NAME|FILE.csv",
+                     help="hold fit, distances and verdict to a part of the model: a region that it has by name, or a "
+                          "CSV file of its vertices")  # fmt: skip
     _add_where(sub, "scans")
     results = sub.add_mutually_exclusive_group()
     results.add_argument("--again", action="store_true", help="fit also scans whose results of earlier runs still hold")
@@ -457,6 +465,13 @@ def _control_points(text: str) -> tuple[int, int]:
     if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
         raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
     return int(counts[0]), int(counts[1])
+
+
+def _named_file(text: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not (name.strip() and equals and file):
+        raise argparse.ArgumentTypeError(f"must be NAME=FILE, not {text!r}")
+    return name.strip(), Path(file)
 
 
 def _stddev(text: str) -> float:

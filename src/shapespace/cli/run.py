@@ -254,6 +254,7 @@ def build(arguments: argparse.Namespace) -> int:
         add=arguments.add,
         recursive=arguments.recursive,
         with_doubtful=arguments.with_doubtful,
+        regions=dict(arguments.region),
     )
     if settings.streams:
         arguments.goes_on = "; the same command goes on from there"
@@ -361,6 +362,8 @@ def fit(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         dense=arguments.dense,
         landmark_stddev_mm=arguments.landmark_sd,
+        crop=arguments.crop,
+        region=_region(arguments.region),
     )
     settings = BatchSettings(
         config,
@@ -383,6 +386,14 @@ def fit(arguments: argparse.Namespace) -> int:
     if counts["failed"] == every:
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _region(region: str | None) -> str | tuple[int, ...] | None:
+    if region is None or not Path(region).is_file():
+        return region
+    from shapespace.io.regions import read_region
+
+    return read_region(region)
 
 
 def _where(arguments: argparse.Namespace) -> Where:

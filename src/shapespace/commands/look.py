@@ -168,6 +168,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({} if model.residuals is None else _residual_facts(model)),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
+        **({"regions": {name: len(at) for name, at in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,

@@ -101,7 +101,8 @@ class FitResult:
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
         landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
-            scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method.
+            scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
+            the region that the fit was held to.
     """
 
     scan_name: str
@@ -133,6 +134,7 @@ class FitResult:
         """(V,) code of each model vertex in `fit.regions.REGIONS`, found when first asked for.
 
         The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
+        Outside the region that a fit is held to (`FitConfig.region`) nothing is seen.
         """
         return self.find_regions()
 
@@ -175,7 +177,11 @@ class FitResult:
     def shown_at(self, stage: str) -> ShownDistances:
         """Return the distances at `stage` over what the scan shows, as it is known at the end of the fit."""
         distances, seen = self.stages[stage].distances, np.isin(self.regions, SHOWN)
-        forward, backward = DistanceSummary.of(distances.model_to_scan_mm, seen), distances.scan_to_model
+        counted = slice(None) if distances.model_counted is None else distances.model_counted
+        forward, backward = (
+            DistanceSummary.of(distances.model_to_scan_mm[counted], seen[counted]),
+            distances.scan_to_model,
+        )
         return ShownDistances(forward, backward, forward.fraction, backward.fraction)
 
     def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:

@@ -110,13 +110,13 @@ class Problem:
 
     @staticmethod
     def of(
-        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start: Start, *, with_scale: bool
-    ) -> Problem:
+        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool,
+        marks: Marks | None = None,
+    ) -> Problem:  # fmt: skip
         """Return the problem with the model's own modes."""
-        start_scale = start.T_scan_model.scale
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
         surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        return Problem(prepared, target, settings, prior, surface, start.marks)
+        return Problem(prepared, target, settings, prior, surface, marks)
 
     def with_modes_beside(self) -> Problem:
         """Return the problem with the modes that the model lacks, weighed as `beyond_prior` says."""
@@ -267,7 +267,8 @@ def robust_icp(
         FitError: hardly anything matches, or the fit diverged.
     """
     prepared = prepare(model)
-    problem = Problem.of(prepared, target, settings, start, with_scale=with_scale)
+    scale = start.T_scan_model.scale
+    problem = Problem.of(prepared, target, settings, scale, with_scale=with_scale, marks=start.marks)
     at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
     tree, tree_fits = prepared.tree, False
     matcher = problem.matcher(settings.levels[0], at, tree, None)
@@ -340,7 +341,7 @@ def robust_icp(
 
 
 def _of_marks(problem: Problem, at: Estimate) -> dict[str, float]:
-    """Return the standard deviation of the landmarks that were given, and how far off they are (RMS), mm of the scan."""
+    """Return the standard deviation of landmarks that were given, and how far off they are (RMS), mm of the scan."""
     if problem.marks is None:
         return {}
     off_mm = problem.marks.off_mm(problem.surface, at.T_scan_model)

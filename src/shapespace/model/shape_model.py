@@ -73,6 +73,7 @@ class ShapeModel:
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
         residuals: (K,) mm^2, |C v - lambda v| of each mode where it was found by passes over the shapes (PCA beyond
             memory); None where the modes are exact to rounding.
+        regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be held to.
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
@@ -94,6 +95,7 @@ class ShapeModel:
     held_out: bool = False
     residuals: FloatArray | None = None
     left_out: int = 0
+    regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
 
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
@@ -131,6 +133,8 @@ class ShapeModel:
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
         _refuse_far_landmarks(self.landmarks, len(checked.vertices))
+        regions = {str(name): region_vertices(at, len(checked.vertices), name) for name, at in self.regions.items()}
+        object.__setattr__(self, "regions", MappingProxyType(regions))
 
     @classmethod
     def fit(
@@ -604,6 +608,22 @@ def _components_of_codes(
     shares = (data @ pc.basis - pc.mean @ pc.basis) / (pc.variance * (len(data) - 1))
     mean = codes.mean(axis=0)
     return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
+
+
+def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntArray:
+    """Return the vertices of a region, (n,) int32, each once, in order; `name` is what errors call it.
+
+    Raises:
+        InputError: there are none, or one that a model of `n_vertices` does not have.
+    """
+    found = np.unique(np.asarray(vertices, dtype=np.int64))
+    if found.ndim != 1 or not len(found) or found[0] < 0 or found[-1] >= n_vertices:
+        raise InputError(
+            f"The region {name!r} needs vertices from 0 to {n_vertices - 1}, which the model has; give some of those."
+        )
+    region = found.astype(np.int32)
+    region.setflags(write=False)
+    return region
 
 
 def _refuse_far_landmarks(landmarks: Mapping[str, int], n_vertices: int) -> None:
