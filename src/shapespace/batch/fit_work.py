@@ -159,7 +159,8 @@ class _Files:
     def of(job: Job, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
         landmarks = {ending: folder / f"{job.name}{ending}" for ending in FIDUCIAL_ENDINGS}
-        return _Files(*(folder / f"{job.name}{ending}" for ending in endings), landmarks)
+        record, fitted, dense, stages = (folder / f"{job.name}{ending}" for ending in endings)
+        return _Files(record, fitted, dense, stages, landmarks)
 
     def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
         """Return what an earlier fit may have left that this one does not write."""

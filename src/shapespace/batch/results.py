@@ -15,7 +15,7 @@ import numpy as np
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.surface import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.ply import ply_comment, write_ply
 from shapespace.io.tables import checked_table_text
@@ -128,7 +128,7 @@ def fit_record(
             "translation": T.translation.tolist(),
         },
         "mm_per_scan_unit": result.mm_per_scan_unit,
-        "size_mm": rms_size(result.surface().vertices) * result.mm_per_scan_unit,
+        **_size(result),
         "b": result.b.tolist(),
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
@@ -150,6 +150,22 @@ def fit_record(
         "iterations": result.iterations,
         "seconds": dict(result.seconds),
         "version": __version__,
+    }
+
+
+def _size(result: FitResult) -> dict[str, Any]:
+    """Return how large the fitted surface is, in mm of the scan: RMS, centroid size, extents, area."""
+    surface = result.surface()
+    x = (surface.vertices - surface.vertices.mean(axis=0)) * result.mm_per_scan_unit
+    axes = np.linalg.svd(x, full_matrices=False)[2]
+    size_mm = rms_size(surface.vertices) * result.mm_per_scan_unit
+    area = {} if surface.faces is None else {"area_mm2": float(face_areas(surface).sum()) * result.mm_per_scan_unit**2}
+    return {
+        "size_mm": size_mm,
+        "n_vertices": len(x),
+        "centroid_size_mm": size_mm * float(np.sqrt(len(x))),
+        "extents_mm": np.sort(np.ptp(x @ axes.T, axis=0))[::-1].tolist(),
+        **area,
     }
 
 

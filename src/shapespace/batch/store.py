@@ -385,7 +385,7 @@ def _ordered(columns: set[str]) -> list[str]:
 
 def _natural(column: str) -> tuple[str, int, str]:
     """Return a key that sorts b2 before b10."""
-    letter, number = column[:1], column[1:].removesuffix("_stddev")
+    letter, number = column[:1], column[1:].removesuffix("_stddev").removesuffix("_rms_mm")
     return (f"{letter}{column.removeprefix(letter + number)}", int(number), "") if number.isdigit() else (column, 0, "")
 
 

@@ -256,7 +256,7 @@ def _add_fit(commands: Any) -> None:
                      help="to start from and be held to, named as in the model: of one scan, or a folder with a file "
                           "for each, named as it; or the column landmarks of a list of scans")  # fmt: skip
     sub.add_argument("--landmark-sd", type=_stddev, metavar="MM",
-                     help="their standard deviation (default: 3 %% of the model's size); inf: for the start")  # fmt: skip
+                     help="their standard deviation (default: 3 %% of the model's size); inf: none")  # fmt: skip
     sub.add_argument("--crop", default="", metavar="KIND:NUMBERS",
                      help="fit what lies in sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z (the scan's frame and unit), or within "
                           "so many mm of the landmarks, landmarks:MM")  # fmt: skip

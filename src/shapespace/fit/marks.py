@@ -70,8 +70,9 @@ class Marks:
         weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
         pose = small_poses(x).reshape(len(x), 3, POSE)
         rows = np.concatenate([pose, surface.modes[self.vertex][:, :, :modes]], axis=2)
-        heavy = weight[:, None, None] * rows
-        return np.tensordot(heavy, rows, axes=([0, 1], [0, 1])), np.tensordot(heavy, off, axes=([0, 1], [0, 1]))
+        every = rows.reshape(3 * len(x), -1)
+        heavy = np.repeat(weight, 3)[:, None] * every
+        return heavy.T @ every, heavy.T @ off.ravel()
 
     def notes(self, surface: MovingSurface, T_scan_model: Similarity) -> list[str]:
         """Return a sentence on each landmark that lies where the fit does not have it."""

@@ -99,6 +99,7 @@ def load_foreign(path: Path, mm: float | None = None) -> Foreign:
         "licence": linear.licence,
         "held_out": linear.held_out,
         "residuals": None,
+        "regions": {},
     }
     return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
 
