@@ -119,7 +119,7 @@ def fit_file(
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except (MemoryError, ShapespaceError) as error:
-        short = f"{job.called}: not enough memory to fit it; thin the scan first."
+        short = f"{job.called}: not enough memory to fit it; crop it (--crop), or thin it first, as by MeshLab."
         reason = short if isinstance(error, MemoryError) else naming(job.called, str(error))
         failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
         return _write_failed(failed, job, folder)

@@ -307,12 +307,14 @@ def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, limits: Limits
             if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
                 raise FitError(
                     f"{name}: the model shrank to a point, as the plain method does when a large part of the "
-                    "scan is missing; hold the scale (--scale fixed), or crop the model to what the scan shows."
+                    "scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
                 )
     except StopIteration as end:
         return _Driven(history, ended, phase_2_from, end.value)
     except InputError as error:
-        raise FitError(f"{name}: the fit diverged ({error}); give landmarks, or crop the scan.") from error
+        raise FitError(
+            f"{name}: the fit diverged ({error}); give landmarks (--landmarks), or crop the scan (--crop)."
+        ) from error
 
 
 def _measure(
@@ -387,7 +389,7 @@ def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
         return []
     return [
         f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
-        "details of the scan that the model does not know, so build it with fewer modes for plausible ones."
+        "details of the scan that the model does not know, so build it with fewer modes (--modes) for plausible ones."
     ]
 
 

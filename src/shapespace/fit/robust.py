@@ -147,8 +147,8 @@ class Problem:
         residual = matches.residuals()
         if len(residual) < _FEWEST_MATCHES:
             raise FitError(
-                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks, or "
-                "check that it shows what the model does."
+                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks "
+                "(--landmarks), or check that it shows what the model does."
             )
         sigma_mm = max(spread(residual), s.least_spread_mm)
         width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
@@ -180,7 +180,8 @@ class Problem:
             delta = equations.step()  # eq 15
         except LinAlgError as error:
             raise FitError(
-                f"{self.target.mesh.name}: the fit diverged; give landmarks, or crop the scan to what the model shows."
+                f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to what the model shows "
+                "(--crop)."
             ) from error
         some = slice(None, None, _MOTION_STRIDE)
         before, at = at.T_scan_model.apply(self.surface.vertices[some]), at.moved_by(delta)  # eq 16

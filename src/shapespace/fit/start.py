@@ -72,7 +72,7 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     best, second = sorted(penalty, key=lambda name: penalty[name])[:2]
     if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
         raise FitError(
-            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit, or crop it to "
+            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop it (--crop) to "
             "what the model shows."
         )
     low, high = _PLAUSIBLE_COVER
@@ -98,7 +98,9 @@ def start_from_landmarks(
         FitError: the model has no landmarks, or fewer than three names are shared.
     """
     if not model.landmarks:
-        raise FitError(f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out.")
+        raise FitError(
+            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it with --landmarks."
+        )
     names = [name for name in model.landmarks if name in scan_landmarks_mm]
     if len(names) < 3:
         raise FitError(

@@ -471,7 +471,7 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected, so fit this one instead."
+                "model's vertex order can be projected, so fit this one instead (shapespace fit, or fit_scan)."
             )
         if not np.isfinite(vertices).all():
             raise InputError("A shape to be projected must be finite.")
@@ -670,7 +670,8 @@ def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
     finite = np.isfinite(values).all(axis=(1, 2))
     if not finite.all():
         raise InputError(
-            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; repair it or leave it out."
+            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; see shapespace check, and repair it "
+            "or leave it out."
         )
 
 
