@@ -48,15 +48,10 @@ def test_every_option_and_command_that_a_sentence_names_is_there() -> None:
     assert len(options) > 50
     wrong: list[str] = []
     for file, text in sentences():
-        wrong += [
-            f"{file.name}: {o}"
-            for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", text)
-            if o not in options | OF_OTHERS
-        ]
-        commands = re.findall(r"(?<!import )\bshapespace ([a-z]+)\b(?=.*[.;,:)`]| --| [A-Z])", text)
-        wrong += [
-            f"{file.name}: shapespace {c}" for c in commands if c not in known and " run shapespace " in f" {text}"
-        ]
+        named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]", text))
+        wrong += [f"{file.name}: {option}" for option in named - options - OF_OTHERS]
+        told = re.findall(r"(?<=run shapespace )([a-z]+)", text)
+        wrong += [f"{file.name}: shapespace {command}" for command in told if command not in known]
     assert wrong == []
 
 

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from shapespace.errors import FitError
@@ -49,7 +50,7 @@ def start_loading(*, tell: bool) -> None:
     Args:
         tell: whether a line on standard error may say that the code is being compiled.
     """
-    _Said.mark = (_Said.mark or os.path.join(_scratch(), "said")) if tell else None
+    _Said.mark = (_Said.mark or str(_scratch() / "said")) if tell else None
     if sys.platform != "linux":
         from shapespace.batch.warm import warm_up
 
@@ -79,8 +80,8 @@ class _Said:
     mark: str | None = os.environ.get(SAID) or None
 
 
-def _scratch() -> str:
-    folder = tempfile.mkdtemp(prefix="shapespace-")
+def _scratch() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
@@ -90,7 +91,7 @@ def is_first_to_say() -> bool:
     if _Said.mark is None:
         return True
     try:
-        os.mkdir(_Said.mark)
+        Path(_Said.mark).mkdir()
     except FileExistsError:
         return False
     except OSError:  # the folder is gone, or cannot be written: better twice than never

@@ -180,8 +180,8 @@ class Problem:
             delta = equations.step()  # eq 15
         except LinAlgError as error:
             raise FitError(
-                f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to what the model shows "
-                "(--crop)."
+                f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
+                "what the model shows (--crop)."
             ) from error
         some = slice(None, None, _MOTION_STRIDE)
         before, at = at.T_scan_model.apply(self.surface.vertices[some]), at.moved_by(delta)  # eq 16

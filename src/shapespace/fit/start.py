@@ -99,7 +99,8 @@ def start_from_landmarks(
     """
     if not model.landmarks:
         raise FitError(
-            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it with --landmarks."
+            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it "
+            "with --landmarks."
         )
     names = [name for name in model.landmarks if name in scan_landmarks_mm]
     if len(names) < 3:

@@ -336,7 +336,8 @@ def _check_declared(head: _Head, available: int, growth: int, path: Path) -> Non
     if head.bytes > _MOST_BYTES:
         raise damaged(
             path,
-            f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer",
+            f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
+            "by 3D Slicer",
         )
     if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > growth * available:
         raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
