@@ -72,8 +72,8 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     best, second = sorted(penalty, key=lambda name: penalty[name])[:2]
     if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
         raise FitError(
-            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop it (--crop) to "
-            "what the model shows."
+            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop "
+            "it to what the model shows (--crop)."
         )
     low, high = _PLAUSIBLE_COVER
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
