@@ -103,6 +103,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "licence": linear.licence,
         "held_out": linear.held_out,
         "residuals": None,
+        "regions": {},
     }
     return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
 

@@ -520,7 +520,7 @@ def _refuse_other(mesh: Mesh, vertices: int) -> None:
     if len(mesh.vertices) != vertices:
         raise CorrespondenceError(
             f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {vertices}; unseen shapes must be in "
-            "correspondence with it."
+            "correspondence with it, so bring them there by shapespace fit with --dense."
         )
 
 
