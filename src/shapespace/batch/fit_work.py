@@ -24,6 +24,7 @@ from shapespace.batch.results import (
 )
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.result import FitResult
 from shapespace.fit.state import IcpState
 from shapespace.io.files import sha256_of_file, write_together
 from shapespace.io.landmarks import read_landmarks
@@ -122,19 +123,30 @@ def fit_file(
         failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
         return _write_failed(failed, job, folder)
     record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
-    files = _Files.of(job, folder)
-    writes: dict[Path, Callable[[Path], None]] = {}
-    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if config.dense else [])):
-        writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
-    if stages:
-        writes[files.stages] = partial(write_stages, result=result, model=model)
-    writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not config.dense, stages=not stages))
+    publish(result, record, job.name, folder, stages=stages)
     return record
 
 
+def publish(result: FitResult, record: Mapping[str, Any], name: str, folder: Path, *, stages: bool) -> None:
+    """Write the record and the surfaces of a fit together, and remove what an earlier one of that name left.
+
+    Raises:
+        FileError: they cannot be written.
+    """
+    files, dense = _Files.of(name, folder), "dense" in result.stages
+    writes: dict[Path, Callable[[Path], None]] = {}
+    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if dense else [])):
+        writes[surface] = partial(
+            write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record["id"]
+        )
+    if stages:
+        writes[files.stages] = partial(write_stages, result=result, model=result.model)
+    writes[files.record] = partial(write_record, record=record)
+    write_together(writes, files.stale(dense=not dense, stages=not stages))
+
+
 def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     # An earlier run's surface would contradict the record.
     stale = [files.fitted, *files.stale(dense=True, stages=True)]
     write_together({files.record: partial(write_record, record=record)}, stale)
@@ -151,9 +163,9 @@ class _Files:
     stages: Path
 
     @staticmethod
-    def of(job: Job, folder: Path) -> _Files:
+    def of(name: str, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        return _Files(*(folder / f"{job.name}{ending}" for ending in endings))
+        return _Files(*(folder / f"{name}{ending}" for ending in endings))
 
     def stale(self, *, dense: bool, stages: bool) -> list[Path]:
         """Return what an earlier fit may have left that this one does not write."""
@@ -255,7 +267,7 @@ _models: dict[str, ShapeModel] = {}
 
 def has_surface(job: Job, folder: Path) -> bool:
     """Return whether `folder` holds the surface of an earlier fit of the scan."""
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     return files.fitted.is_file() and files.record.is_file()
 
 
@@ -265,7 +277,7 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
     is tried again by another run, not by `run` itself.
     """
-    files = _Files.of(task.job, folder)
+    files = _Files.of(task.job.name, folder)
     if not files.record.is_file():
         return task, None
     try:

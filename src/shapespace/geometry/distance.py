@@ -12,6 +12,7 @@ import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
 from shapespace.geometry.surface import boundary_vertices, vertex_normals
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 
@@ -71,6 +72,8 @@ class SurfaceDistances:
     scan_counted: BoolArray
     outside_of_model: BoolArray
     scan_outside: BoolArray
+
+    __repr__ = short_repr
 
     @property
     def model_to_scan_signed_mm(self) -> FloatArray:
