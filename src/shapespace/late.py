@@ -66,7 +66,9 @@ def other_package(module: str, what: str, install: str = "") -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise ShapespaceError(
-            f"{what} needs {module.partition('.')[0]}, which is not installed; "
-            f"run pip install {install or module.partition('.')[0]}."
-        ) from error
+        package = module.partition(".")[0]
+        if isinstance(error, ModuleNotFoundError) and error.name == package:
+            why = f"which is not installed; run pip install {install or package}."
+        else:
+            why = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
+        raise ShapespaceError(f"{what} needs {package}, {why}") from error

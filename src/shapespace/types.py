@@ -84,6 +84,13 @@ class Mesh:
                 raise MeshError(f"{self.name}: landmark {key!r} must be 3 numbers, not {point.shape}.")
         object.__setattr__(self, "landmarks", MappingProxyType(landmarks))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # For copies, other processes and skops, none of which takes read-only mappings.
+        return {"vertices": self.vertices, "faces": self.faces, "landmarks": dict(self.landmarks), "name": self.name}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
         """Return the same triangles on other `vertices` (V, 3); landmarks are dropped unless given."""
         return Mesh(np.asarray(vertices, dtype=np.float64), self.faces, landmarks or {}, self.name)

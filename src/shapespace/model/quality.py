@@ -122,7 +122,11 @@ class ModelQuality:
     missing_share: float = 0.0
     left_out_vertices: int = 0
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        told = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
+        for name, curve in (("generalisation", self.generalisation), ("specificity", self.specificity)):
+            told += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
+        return f"<ModelQuality of {self.shapes} shapes: {', '.join(told)}>"
 
     def plot(self, **options: Any) -> Figure:
         """Return a matplotlib figure of all measures that there are, over the number of modes.

@@ -139,6 +139,13 @@ class ShapeModel:
         object.__setattr__(self, "faces", checked.faces)
         _refuse_far_landmarks(self.landmarks, len(checked.vertices))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # For copies, other processes and skops, none of which takes read-only mappings.
+        return {**self.fields(), "landmarks": dict(self.landmarks), "coding": dict(self.coding)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
     @classmethod
     def fit(
         cls,

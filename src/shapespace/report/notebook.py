@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.result import FitResult
@@ -20,8 +18,13 @@ from shapespace.report.wording import counted, listed, mm, percent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from shapespace.report.stills import Still
+
+_Drawn: TypeAlias = "tuple[Still, str]"
+"""A picture, and what stands below it."""
 _SHARES = (0.9, 0.95, 0.98)
-_MODES_SHOWN = 3
+_MODES_SHOWN = 2
+_PANEL = (220, 290)
 _MOST_COEFFICIENTS = 5
 _CURVES = (
     "compactness",
@@ -32,8 +35,6 @@ _CURVES = (
     "reconstruction",
     "reconstruction_vertices",
 )
-MODEL_PLOTS = ("modes", "mean", "spectrum")
-FIT_PLOTS = ("distances", "stages", "overlay", "histograms", "coefficients", "history", "regions")
 
 
 def plot_model(model: ShapeModel, what: str, **options: Any) -> Figure:
@@ -98,17 +99,21 @@ def html_of_model(model: ShapeModel) -> str:
         ("Provenance", model.provenance or "not stated"),
         ("Licence", model.licence or "not stated"),
     ]
-    draw = partial(plot_model, model, "modes", modes=_MODES_SHOWN)
-    return _html(model, "Shape model", [], rows, draw, "The first modes at minus and plus 3 standard deviations")
+
+    def draw() -> _Drawn:
+        return _still(plot_model(model, "modes", modes=_MODES_SHOWN)), "The first modes; model.plot() draws more."
+
+    return _html(model, "Shape model", [], rows, draw)
 
 
 def html_of_fit(result: FitResult) -> str:
     """Return a fit for a notebook: where it is how far from the scan, the verdict, and the largest coefficients."""
     shown = result.shown
     largest = sorted(range(len(result.z)), key=lambda k: -abs(result.z[k]))[:_MOST_COEFFICIENTS]
+    seen, covered = percent(shown.model_seen_share), percent(shown.scan_covered_share)
     rows = [
-        ("Model to scan", f"{mm(shown.model_to_scan.mean)} mean over the {percent(shown.model_seen_share)} it shows"),
-        ("Scan to model", f"{mm(shown.scan_to_model.mean)} mean over the {percent(shown.scan_covered_share)} covered"),
+        ("Model to scan", f"{mm(shown.model_to_scan.mean)} mean, over the {seen} that the scan shows"),
+        ("Scan to model", f"{mm(shown.scan_to_model.mean)} mean, over the {covered} that the model covers"),
         ("Coefficients", f"{len(result.z)}; " + ", ".join(f"z{k + 1} {result.z[k]:+.1f}" for k in largest)),
         ("Scale", f"{result.T_scan_model.scale:.4g} ({result.mm_per_scan_unit:g} mm in the scan's unit)"),
         ("Method", f"{result.method}, started from {result.start}, {sum(result.seconds.values()):.2f} s"),
@@ -116,9 +121,16 @@ def html_of_fit(result: FitResult) -> str:
     if (expected := result.evidence.get("expected_error_mm")) is not None:
         rows.insert(2, ("Expected error", f"{mm(expected)} of its vertices"))
     rows += [("Note", note) for note in result.notes]
-    draw = partial(plot_fit, result, "distances")
-    verdict = f"{result.status}: {result.reason}"
-    return _html(result, result.scan_name, [verdict], rows, draw, "Distances from the fitted surface to the scan")
+
+    def draw() -> _Drawn:
+        from shapespace.report.stills import fit_strip
+
+        fit = StagedFit.of(result.model, result)
+        colours = "blue inside, red outside" if fit.scan.faces is not None else "dark is far"
+        caption = f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
+        return fit_strip(fit, fit.scale_mm, _PANEL), caption
+
+    return _html(result, result.scan_name, [f"{result.status}: {result.reason}"], rows, draw)
 
 
 def html_of_quality(quality: ModelQuality) -> str:
@@ -130,17 +142,15 @@ def html_of_quality(quality: ModelQuality) -> str:
             value, low, high = curve.mean[-1], curve.low[-1], curve.high[-1]
             told = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
             rows.append((name.replace("_vertices", " (vertices)").capitalize(), f"{told} with {curve.at[-1]} modes"))
-    draw = partial(plot_quality, quality)
-    return _html(quality, "Quality of a shape space", quality.sentences(), rows, draw, "Quality by the number of modes")
+
+    def draw() -> _Drawn:
+        return _still(plot_quality(quality)), "Bands are 95 % intervals."
+
+    return _html(quality, "Quality of a shape space", quality.sentences(), rows, draw)
 
 
 def _html(
-    of: object,
-    title: str,
-    sentences: Sequence[str],
-    rows: Sequence[tuple[str, str]],
-    draw: Callable[[], Figure],
-    alt: str,
+    of: object, title: str, sentences: Sequence[str], rows: Sequence[tuple[str, str]], draw: Callable[[], _Drawn]
 ) -> str:
     try:
         require_report_extra()
@@ -148,14 +158,18 @@ def _html(
         return f"<pre>{escape(repr(of))}\n{escape(str(error))}</pre>"
     from shapespace.report.page import template
 
+    picture, size, caption = "", (0, 0), ""
     try:
-        picture = _png(draw())
+        (content, size), caption = draw()
+        picture = base64.b64encode(content).decode()
     except ShapespaceError as error:
-        picture, sentences = "", [*sentences, f"No picture: {error}"]
-    return template("notebook.html").render(title=title, sentences=sentences, rows=rows, picture=picture, alt=alt)
+        sentences = [*sentences, f"No picture: {error}"]
+    return template("notebook.html").render(
+        title=title, sentences=sentences, rows=rows, picture=picture, size=size, caption=caption
+    )
 
 
-def _png(figure: Figure) -> str:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return base64.b64encode(stream.getvalue()).decode()
+def _still(figure: Figure) -> Still:
+    from shapespace.report.figures import encode_webp
+
+    return encode_webp(figure)
