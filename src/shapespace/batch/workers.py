@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 WARM_UP = "SHAPESPACE_WARM_UP"
 """Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
+COPIED = sys.platform == "linux"
+"""Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -32,10 +34,7 @@ def cores() -> int:
 
 def context() -> ForkServerContext | SpawnContext:
     """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
-    # Apple's BLAS does not survive a fork, and Windows has none.
-    if sys.platform == "linux":
-        return multiprocessing.get_context("forkserver")
-    return multiprocessing.get_context("spawn")
+    return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
 def start_loading(*, tell: bool) -> None:
@@ -44,7 +43,7 @@ def start_loading(*, tell: bool) -> None:
     Args:
         tell: whether a line on standard error may say that the code is being compiled.
     """
-    if sys.platform != "linux":
+    if not COPIED:
         from shapespace.batch.warm import warm_up
 
         warm_up(tell=tell)
@@ -73,7 +72,7 @@ def wait_until_loaded() -> None:
     Raises:
         FitError: no process can be started.
     """
-    if sys.platform != "linux":
+    if not COPIED:
         return
     try:
         first = context().Process(target=_nothing)
