@@ -19,13 +19,15 @@ test: $(READY)
 test-all: $(READY)
 	$(BIN)/python -m pytest -n auto --max-worker-restart 0 $(PYTEST)
 
-# Each has an environment of its own, beside the usual one.
-test-oldest test-newest: test-%:
-	$(PYTHON) -m venv $(VENV)-$*
-	$(VENV)-$*/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-$*/bin/python -m pip install --quiet --editable '.[all]' --group test --constraint constraints/$*.txt
-	$(VENV)-$*/bin/python -m pip check
-	$(VENV)-$*/bin/python -m pytest -n auto -m "not long" $(or $(PYTEST),$(QUICK))
+# Each has an environment of its own, beside the usual one; old packages warn of one another.
+test-oldest: WHICH = oldest
+test-newest: WHICH = newest
+test-oldest test-newest:
+	$(PYTHON) -m venv $(VENV)-$(WHICH)
+	$(VENV)-$(WHICH)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-$(WHICH)/bin/python -m pip install --quiet --editable '.[all]' --group test --constraint constraints/$(WHICH).txt
+	$(VENV)-$(WHICH)/bin/python -m pip check
+	$(VENV)-$(WHICH)/bin/python -m pytest -n auto -m "not long" -W default $(or $(PYTEST),$(QUICK))
 
 lint: $(READY_TO_LINT)
 	$(BIN)/ruff check .
