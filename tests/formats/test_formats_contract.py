@@ -19,7 +19,7 @@ ONLY_SHAPE: set[str] = set()
 WRITTEN = [one for one in FORMATS if one.name not in READ_ONLY]
 PARTED = [one for one in WRITTEN if one.name not in ONLY_SHAPE]
 SINGLE = 2e-6
-FLIPS = {"statismo": 8}
+FLIPS = {"statismo": 5}
 """Damaged files that are tried where it is fewer than `MOST_FLIPS`: of a format that is read in a process apart."""
 MOST_FLIPS = 60
 
