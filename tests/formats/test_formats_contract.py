@@ -19,7 +19,7 @@ ONLY_SHAPE = {"shapeworks"}
 WRITTEN = [one for one in FORMATS if one.name not in READ_ONLY]
 PARTED = [one for one in WRITTEN if one.name not in ONLY_SHAPE]
 SINGLE = 2e-6
-FLIPS = {"statismo": 8}
+FLIPS = {"statismo": 5}
 """Damaged files that are tried where it is fewer than `MOST_FLIPS`: of a format that is read in a process apart."""
 MOST_FLIPS = 60
 
@@ -122,11 +122,12 @@ def test_a_basis_that_is_not_orthonormal_keeps_its_covariance(model: ShapeModel,
     assert np.linalg.norm(wanted @ wanted.T - found @ found.T) < 1e-5 * np.linalg.norm(wanted @ wanted.T)
 
 
-@pytest.mark.parametrize("change", ["nan", "faces", "modes", "landmark"])
+@pytest.mark.parametrize("change", ["nan", "huge", "faces", "modes", "landmark"])
 def test_parts_that_do_not_belong_together_are_refused(change: str, model: ShapeModel) -> None:
     linear = model.as_linear()
     wrong: dict[str, LinearModel] = {
         "nan": dataclasses.replace(linear, mean=np.full_like(linear.mean, np.nan)),
+        "huge": dataclasses.replace(linear, shape=Modes(linear.shape.moved * 1e200)),
         "faces": dataclasses.replace(linear, faces=np.array([[0, 1, 300]], dtype=np.int32)),
         "modes": dataclasses.replace(linear, shape=Modes(np.zeros((5, 2)))),
         "landmark": dataclasses.replace(linear, landmarks={"tip": 300}),

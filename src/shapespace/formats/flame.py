@@ -26,8 +26,9 @@ _FAMILY: Final = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL+H", 55: "SMPL-X"
 """By their number of joints."""
 _BY_VERTICES: Final = {5023: "FLAME", 778: "MANO", 6890: "SMPL", 10475: "SMPL-X"}
 _WITH_EXPRESSION = ("FLAME", "SMPL-X")
-_IDENTITY: Final = {400: 300, 150: 100, 20: 10}
-"""Modes of identity among so many; the others are of expression."""
+_IDENTITY: Final = {150: 100, 20: 10}
+"""Modes of identity among so many, the others being of expression; of more than `_MOST_IDENTITY` the first."""
+_MOST_IDENTITY = 300
 
 
 class Flame:
@@ -67,7 +68,10 @@ class Flame:
             raise ModelFileError(f"{path} is damaged: its arrays are not of numbers; {_AGAIN}.")
         family = _family(arrays, n)
         moved = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
-        n_identity = _IDENTITY.get(moved.shape[1]) if family in (*_WITH_EXPRESSION, "") else None
+        n_identity = None
+        if family in (*_WITH_EXPRESSION, ""):
+            n_modes = moved.shape[1]
+            n_identity = _MOST_IDENTITY if n_modes > _MOST_IDENTITY else _IDENTITY.get(n_modes)
         return LinearModel(
             mean=np.asarray(template, dtype=np.float64),
             shape=Modes(moved[:, :n_identity]),

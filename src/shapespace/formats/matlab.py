@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.parts import LinearModel, Modes, scaled
+from shapespace.formats.parts import LinearModel, Modes, are_measurable, scaled
 from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
 from shapespace.io.files import open_file
 from shapespace.io.json_files import check_file
@@ -115,7 +115,9 @@ def _model(tree: Tree, layout: _Layout) -> LinearModel:
     mean, spread = mean.ravel(), spread.ravel()
     if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
         basis = basis.T
-    if len(mean) % 3 or basis.shape != (len(mean), len(spread)) or not (spread >= 0).all():
+    if not all(map(are_measurable, (mean, basis, spread))) or not (spread >= 0).all():
+        raise ApartError("its numbers are not finite, too large, or spread below 0")
+    if len(mean) % 3 or basis.shape != (len(mean), len(spread)):
         raise ApartError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
     n_training = layout.n_training
     if isinstance(n_training, str):

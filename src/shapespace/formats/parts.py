@@ -20,6 +20,7 @@ from shapespace.errors import ModelFileError
 from shapespace.types import FloatArray, IntArray, read_only
 
 ORTHOGONAL: Final = 1e-3
+_LARGEST = 1e30
 _NO_STDDEV = 1e-6
 """Of the largest one; what single precision makes of a mode that is not there."""
 
@@ -95,8 +96,8 @@ class LinearModel:
         elif any(block.moved.ndim != 2 or len(block.moved) != 3 * n or not block.moved.shape[1] for block in blocks):
             shapes = " and ".join(str(block.moved.shape) for block in blocks)
             wrong = f"its modes have the shape {shapes}, which {n} vertices do not"
-        elif not (np.isfinite(self.mean).all() and all(np.isfinite(block.moved).all() for block in blocks)):
-            wrong = "it holds numbers that are not finite"
+        elif not all(are_measurable(one) for one in (self.mean, *(block.moved for block in blocks))):
+            wrong = "it holds numbers that are not finite, or too large for lengths"
         elif any(block.names and len(block.names) != block.moved.shape[1] for block in blocks):
             wrong = "it has another number of names than of modes"
         elif self.faces is not None and not _are_triangles(self.faces, n):
@@ -109,6 +110,11 @@ class LinearModel:
 
 def _are_triangles(faces: IntArray, n: int) -> bool:
     return faces.ndim == 2 and faces.shape[1] == 3 and (not len(faces) or (faces.min() >= 0 and faces.max() < n))
+
+
+def are_measurable(array: FloatArray) -> bool:
+    """Whether all numbers are finite, and no larger than their squares and sums can be reckoned with."""
+    return bool((np.abs(array) <= _LARGEST).all())
 
 
 def scaled(basis: npt.ArrayLike, stddev: npt.ArrayLike) -> FloatArray:

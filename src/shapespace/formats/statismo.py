@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, scaled
+from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, are_measurable, scaled
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
 from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
 from shapespace.io.files import write_bytes
@@ -161,12 +161,12 @@ def _part(tree: Tree, root: str) -> _Part:
         basis = basis.T
     if len(mean) % 3 or basis.shape != (len(mean), len(variance)) or not len(variance):
         raise ValueError(f"its mean, basis and variances have the shapes {mean.shape}, {basis.shape}, {variance.shape}")
-    if not (np.isfinite(variance).all() and (variance >= 0).all() and np.isfinite(basis).all()):
-        raise ValueError("its variances or modes are not finite, or below 0")
+    if not (all(map(are_measurable, (mean, basis, variance))) and (variance >= 0).all()):
+        raise ValueError("its numbers are not finite, too large, or below 0")
     noise_at = f"{root}/model/noiseVariance"
     noise = float(_array(tree, noise_at).reshape(-1)[:1].sum()) if noise_at in tree.arrays else 0.0
-    if not 0 <= noise < np.inf:
-        raise ValueError("its noise is not finite, or below 0")
+    if not (noise >= 0 and are_measurable(np.array(noise))):
+        raise ValueError("its noise is not finite, too large, or below 0")
     version = _version(tree, root)
     length = np.linalg.norm(basis, axis=0)
     if version is None:
@@ -306,7 +306,7 @@ def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:
             pairs = LANDMARK_FORMATS[".json"].read(text.encode(), path) if kind == "json" else _tlms(text)
         except (ShapespaceError, ValueError, IndexError) as error:
             raise ValueError("its landmarks cannot be read") from error
-        return {name: point for name, point in pairs if np.isfinite(point).all()}
+        return {name: point for name, point in pairs if are_measurable(point)}
     return {}
 
 
