@@ -192,6 +192,7 @@ def test_a_pickle_that_does_more_than_hold_arrays_is_refused(name: str, tmp_path
     with pytest.raises(ModelFileError) as refused:
         ShapeModel.load(path)
     assert "\n" not in str(refused.value)
+    assert name[-1] not in "024" or "asks for" in str(refused.value)
     assert not marker.exists()
 
 

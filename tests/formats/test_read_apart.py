@@ -132,6 +132,7 @@ def test_a_folder_that_one_stands_in_is_not_imported_from(
 ) -> None:
     (tmp_path / "numpy.py").write_text("raise SystemExit(3)")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])  # as in a session of Python
     assert ShapeModel.load(harmless).n_modes == 4
 
 

@@ -23,14 +23,17 @@ from shapespace.batch.results import (
     write_stages,
 )
 from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit import OPTIONS, FitConfig, fit_scan
+from shapespace.fit.result import FitResult
 from shapespace.fit.state import IcpState
-from shapespace.io.files import sha256_of_file, write_together
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
+from shapespace.io.files import sha256_of_file, write_text, write_together
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.meshes import read_mesh
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.results import wrote_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -117,26 +120,39 @@ def fit_file(
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except (MemoryError, ShapespaceError) as error:
-        short = f"{job.called}: not enough memory to fit it; thin the scan first."
+        short = f"{job.called}: not enough memory to fit it; crop it (--crop), or thin it first, as by MeshLab."
         reason = short if isinstance(error, MemoryError) else naming(job.called, str(error))
         failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
         return _write_failed(failed, job, folder)
     record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
-    files = _Files.of(job, folder)
-    writes: dict[Path, Callable[[Path], None]] = {}
-    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if config.dense else [])):
-        writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
-    if stages:
-        writes[files.stages] = partial(write_stages, result=result, model=model)
-    writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not config.dense, stages=not stages))
+    publish(result, record, job.name, folder, stages=stages)
     return record
 
 
+def publish(result: FitResult, record: Mapping[str, Any], name: str, folder: Path, *, stages: bool) -> None:
+    """Write the record and the surfaces of a fit together, and remove what an earlier one of that name left.
+
+    Raises:
+        FileError: they cannot be written.
+    """
+    files, dense = _Files.of(name, folder), "dense" in result.stages
+    writes: dict[Path, Callable[[Path], None]] = {}
+    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if dense else [])):
+        writes[surface] = partial(
+            write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record["id"]
+        )
+    if stages:
+        writes[files.stages] = partial(write_stages, result=result, model=result.model)
+    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
+    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
+    writes[files.record] = partial(write_record, record=record)
+    write_together(writes, files.stale(dense=not dense, stages=not stages, landmarks=not texts))
+
+
 def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     # An earlier run's surface would contradict the record.
-    stale = [files.fitted, *files.stale(dense=True, stages=True)]
+    stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
     write_together({files.record: partial(write_record, record=record)}, stale)
     return record
 
@@ -149,16 +165,20 @@ class _Files:
     fitted: Path
     dense: Path
     stages: Path
+    landmarks: Mapping[str, Path]
 
     @staticmethod
-    def of(job: Job, folder: Path) -> _Files:
+    def of(name: str, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        return _Files(*(folder / f"{job.name}{ending}" for ending in endings))
+        landmarks = {ending: folder / f"{name}{ending}" for ending in FIDUCIAL_ENDINGS}
+        record, fitted, dense, stages = (folder / f"{name}{ending}" for ending in endings)
+        return _Files(record, fitted, dense, stages, landmarks)
 
-    def stale(self, *, dense: bool, stages: bool) -> list[Path]:
+    def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
         """Return what an earlier fit may have left that this one does not write."""
-        # Without a record it is no result of ours, but perhaps a scan.
+        # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
         left = [self.dense] if dense and self.record.is_file() else []
+        left += self.landmarks.values() if landmarks and wrote_landmarks(self.record) else ()
         return [*left, self.stages] if stages else left
 
 
@@ -255,7 +275,7 @@ _models: dict[str, ShapeModel] = {}
 
 def has_surface(job: Job, folder: Path) -> bool:
     """Return whether `folder` holds the surface of an earlier fit of the scan."""
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     return files.fitted.is_file() and files.record.is_file()
 
 
@@ -265,7 +285,7 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
     is tried again by another run, not by `run` itself.
     """
-    files = _Files.of(task.job, folder)
+    files = _Files.of(task.job.name, folder)
     if not files.record.is_file():
         return task, None
     try:
@@ -293,7 +313,7 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
     return bool(
         record["model"]["hash"] == model_hash
         and record.get("landmarks") == marks
-        and all(record["config"].get(key) == value for key, value in settings.items())
+        and all(record["config"].get(key) == settings.get(key) for key in {*settings, *OPTIONS})
         and is_same_scan(record["scan"], job, folder)
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.surface import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.ply import ply_comment, write_ply
 from shapespace.io.tables import checked_table_text
@@ -139,13 +139,14 @@ def fit_record(
             "translation": T.translation.tolist(),
         },
         "mm_per_scan_unit": result.mm_per_scan_unit,
-        "size_mm": rms_size(result.surface().vertices) * result.mm_per_scan_unit,
+        **_size(result),
         "b": result.b.tolist(),
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
+        **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [
             {
@@ -160,6 +161,31 @@ def fit_record(
         "iterations": result.iterations,
         "seconds": dict(result.seconds),
         "version": __version__,
+    }
+
+
+def _size(result: FitResult) -> dict[str, Any]:
+    """Return how large the fitted surface is, in mm of the scan: RMS, centroid size, extents, area."""
+    surface = result.surface()
+    x = (surface.vertices - surface.vertices.mean(axis=0)) * result.mm_per_scan_unit
+    axes = np.linalg.svd(x, full_matrices=False)[2]
+    size_mm = rms_size(surface.vertices) * result.mm_per_scan_unit
+    area = {} if surface.faces is None else {"area_mm2": float(face_areas(surface).sum()) * result.mm_per_scan_unit**2}
+    return {
+        "size_mm": size_mm,
+        "n_vertices": len(x),
+        "centroid_size_mm": size_mm * float(np.sqrt(len(x))),
+        "extents_mm": np.sort(np.ptp(x @ axes.T, axis=0))[::-1].tolist(),
+        **area,
+    }
+
+
+def found_landmarks(result: FitResult) -> dict[str, dict[str, list[float] | None]]:
+    """Return what a record says of the model's landmarks on the fitted surface; nothing where the model has none."""
+    stddev_mm = result.landmark_stddev_mm or {}
+    return {
+        name: {"at": point.tolist(), "stddev_mm": stddev_mm[name].tolist() if name in stddev_mm else None}
+        for name, point in result.landmarks.items()
     }
 
 

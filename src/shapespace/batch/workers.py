@@ -5,13 +5,17 @@ This module imports nothing heavy, so that the server can start before the rest 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from shapespace.errors import FitError
@@ -22,6 +26,10 @@ if TYPE_CHECKING:
 
 WARM_UP = "SHAPESPACE_WARM_UP"
 """Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
+SAID = "SHAPESPACE_SAID"
+"""Set for the server alone: a folder that whoever says first that code is compiled makes, so that it is said once."""
+COPIED = sys.platform == "linux"
+"""Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -32,10 +40,7 @@ def cores() -> int:
 
 def context() -> ForkServerContext | SpawnContext:
     """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
-    # Apple's BLAS does not survive a fork, and Windows has none.
-    if sys.platform == "linux":
-        return multiprocessing.get_context("forkserver")
-    return multiprocessing.get_context("spawn")
+    return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
 def start_loading(*, tell: bool) -> None:
@@ -44,7 +49,8 @@ def start_loading(*, tell: bool) -> None:
     Args:
         tell: whether a line on standard error may say that the code is being compiled.
     """
-    if sys.platform != "linux":
+    _Said.mark = (_Said.mark or str(_scratch() / "said")) if tell else None
+    if not COPIED:
         from shapespace.batch.warm import warm_up
 
         warm_up(tell=tell)
@@ -52,7 +58,7 @@ def start_loading(*, tell: bool) -> None:
     from multiprocessing import forkserver  # not on Windows
 
     # One worker is one core: threads of BLAS would spread it over all.
-    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet"}
+    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", SAID: _Said.mark or ""}
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
@@ -67,13 +73,38 @@ def start_loading(*, tell: bool) -> None:
                 os.environ[name] = value
 
 
+class _Said:
+    """Where this process, or the one that started it, marks that compiling was said; None where nobody else says it."""
+
+    mark: str | None = os.environ.get(SAID) or None
+
+
+def _scratch() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def is_first_to_say() -> bool:
+    """Return whether neither this process nor the server of the workers has said that code is compiled."""
+    if _Said.mark is None:
+        return True
+    try:
+        Path(_Said.mark).mkdir()
+    except FileExistsError:
+        return False
+    except OSError:  # the folder is gone, or cannot be written: better twice than never
+        return True
+    return True
+
+
 def wait_until_loaded() -> None:
     """Return when workers start at once; Ctrl-C is heard until then.
 
     Raises:
         FitError: no process can be started.
     """
-    if sys.platform != "linux":
+    if not COPIED:
         return
     try:
         first = context().Process(target=_nothing)

@@ -97,6 +97,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         quiet=arguments.quiet,
         raw=arguments.raw,
         wide=arguments.wide,
+        intensity=arguments.intensity,
     )
     if arguments.json:
         show_json({"folder": str(arguments.output), "faces": count})
@@ -254,6 +255,7 @@ def build(arguments: argparse.Namespace) -> int:
         add=arguments.add,
         recursive=arguments.recursive,
         with_doubtful=arguments.with_doubtful,
+        regions=dict(arguments.region),
     )
     if settings.streams:
         arguments.goes_on = "; the same command goes on from there"
@@ -360,6 +362,9 @@ def fit(arguments: argparse.Namespace) -> int:
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,
         dense=arguments.dense,
+        landmark_stddev_mm=arguments.landmark_sd,
+        crop=arguments.crop,
+        region=_region(arguments.region),
     )
     settings = BatchSettings(
         config,
@@ -382,6 +387,14 @@ def fit(arguments: argparse.Namespace) -> int:
     if counts["failed"] == every:
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _region(region: str | None) -> str | tuple[int, ...] | None:
+    if region is None or not Path(region).is_file():
+        return region
+    from shapespace.io.regions import read_region
+
+    return read_region(region)
 
 
 def _where(arguments: argparse.Namespace) -> Where:

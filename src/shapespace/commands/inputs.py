@@ -18,6 +18,7 @@ from shapespace.io.remote import addresses, is_address
 
 _LISTS = (".csv", ".tsv", ".txt")
 _PLACES = ("scan", "file", "path")
+_LANDMARKS = "landmarks"
 _LONGEST = 200
 
 
@@ -29,11 +30,13 @@ class Given:
         place: path of the scan, or its address.
         called: by the column `id` of a list, or empty.
         metadata: the other columns of the list.
+        landmarks: of the scan, by the column `landmarks` of the list; None where it names none.
     """
 
     place: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
+    landmarks: Path | None = None
 
     @property
     def address(self) -> str:
@@ -56,7 +59,8 @@ def given_scans(
 
     Args:
         scans: paths of scans and of folders, patterns, addresses, and lists: a text file with one of these in a line,
-            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id`, and others that are kept.
+            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id` and `landmarks`, and others that
+            are kept.
         folder: of the results, not looked into.
         recursive: whether to take what lies in folders below too.
         say: told what was not taken.
@@ -73,7 +77,9 @@ def given_scans(
                 there = _expanded(row.place, folder, recursive=recursive, say=say)
                 if row.called and len(there) > 1:
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
-                found += [Given(place, row.called, row.metadata) for place in there]
+                if row.landmarks is not None and len(there) > 1:
+                    raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
+                found += [replace(row, place=place) for place in there]
         else:
             found += [Given(place) for place in _expanded(text, folder, recursive=recursive, say=say)]
     _refuse_doubles(found)
@@ -156,7 +162,8 @@ def _table(file: Path, text: str) -> list[Given]:
             raise InputError(f"{file}: row {number} names no scan in the column {column}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
-        rows.append(Given(_beside(file, place), called, cells))
+        marks = cells.pop(_LANDMARKS, "")
+        rows.append(Given(_beside(file, place), called, cells, file.parent / marks if marks else None))
     return rows
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Similarity
 
 
@@ -34,6 +35,8 @@ class IcpState:
     motion_mm: float
     stopped: str | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -51,6 +54,8 @@ class Fitted:
         evidence: what the verdict goes by, by name.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
         notes: what was noticed in the scan, a sentence each.
+        landmark_covariance: (L, 3, 3) of where the model's landmarks lie in that frame, mm^2, in the model's order,
+            where the method finds it.
     """
 
     T_scan_model: Similarity
@@ -64,6 +69,7 @@ class Fitted:
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
     b_covariance: FloatArray | None = None
     notes: Sequence[str] = ()
+    landmark_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel
-from shapespace.formats.statismo import model_of, tree_of
+from shapespace.formats.statismo import model_of
+from shapespace.formats.statismo_tree import tree_of
 from shapespace.io.apart import ApartError, Tree
 from shapespace.io.files import atomic_path, read_bytes
 from shapespace.io.json_files import check_file

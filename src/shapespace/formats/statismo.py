@@ -7,18 +7,17 @@ three such models in one: shape, colour, expression.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, orthonormal, scaled
+from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, scaled
+from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
 from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
 from shapespace.io.files import write_bytes
 from shapespace.io.json_files import check_file
@@ -33,10 +32,8 @@ _POINTS_AT = 1e-3
 _UNIT_LENGTH = 1e-2
 _BFM_MODES = 199
 _BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
-_PARAMETERS = "modelinfo/modelBuilder-0/parameters"
 _LEGACY_POINTS = "representer/reference-mesh/vertex-coordinates"
 _LEGACY_CELLS = "representer/reference-mesh/triangle-list"
-_GREY = 0.5
 _OUTER: Final = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 """Sides of a tetrahedron, counter-clockwise from outside where its volume is positive."""
 
@@ -63,7 +60,7 @@ class Statismo:
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """As `Format.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
         tree, said = tree_of(model)
-        write_bytes(path, _hdf5_of(tree))
+        write_bytes(path, hdf5_of(tree))
         return said
 
 
@@ -99,7 +96,7 @@ class _Part:
 
 
 def _model(tree: Tree, path: Path) -> LinearModel:
-    root = _root(tree)
+    root = _root(tree, path)
     part = _part(tree, root)
     mean, expression, notes = part.mean, None, list[str]()
     if root == "/shape" and "/expression/model/mean" in tree.arrays:
@@ -125,7 +122,7 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         mm=_mm(tree, root, told),
         landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), notes, path),
         n_training=_n_training(tree, root, part, told),
-        # Of Gaussian process models neither: fits that took their variances as they stand were too sure of themselves.
+        # Not so of Gaussian processes: fits that took their variances as they stand were too sure of themselves.
         held_out=told.get("held_out") == "yes",
         provenance=told.get("provenance") or " ".join(f"statismo model {representer}".split()),
         licence=told.get("licence") or (_BFM_LICENCE if is_bfm else ""),
@@ -139,13 +136,13 @@ def _roots(tree: Tree) -> list[str]:
     return ["/" + "/".join(part for part in text.split("/") if part) for text in found]
 
 
-def _root(tree: Tree) -> str:
+def _root(tree: Tree, path: Path) -> str:
     for root in ("/shape", "", *_roots(tree)):
         if f"{root}/model/mean" in tree.arrays:
             return root
     if tree.attributes.get("/", {}).get("format") == "shapespace model":
         raise ValueError("it is one of shapespace, but has no checksum")
-    raise ValueError("there is no /model/mean in it")
+    raise ModelFileError(f"{path} is not a shapespace model, nor one of statismo: there is no /model/mean in it.")
 
 
 def _version(tree: Tree, root: str) -> tuple[int, int] | None:
@@ -266,7 +263,7 @@ def _mm(tree: Tree, root: str, told: Mapping[str, str]) -> float | None:
 
 def _parameters(tree: Tree, root: str) -> dict[str, str]:
     """Return what our writer left for us."""
-    start = f"{root}/{_PARAMETERS}/"
+    start = f"{root}/{PARAMETERS}/"
     return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
 
 
@@ -317,104 +314,3 @@ def _tlms(text: str) -> list[tuple[str, FloatArray]]:
     """Return the landmarks of lines `name visible x y z`, those that are visible."""
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     return [(row[0], np.array(row[2:5], dtype=np.float64).reshape(3)) for row in rows if row[1] != "0"]
-
-
-def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
-    """Return `model` as version 0.9 has it, and sentences on what was changed or left out.
-
-    With expressions it is a Morphable Model of scalismo-faces, with a grey stand-in for the colour that it asks for.
-    """
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    texts: dict[str, str] = {}
-    attributes: dict[str, dict[str, str]] = {}
-    groups: list[str] = ["/"]
-    said = ["Numbers are in single precision."]
-    mean, now = model.mean.ravel(), datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y")
-    told = {"provenance": model.provenance, "licence": model.licence, "held_out": "yes" if model.held_out else "no"}
-    told |= {"unit": "mm"} if model.mm == 1.0 else {}
-    told |= {"n_training": str(model.n_training)} if model.n_training else {}
-    told = {name: text.replace("\0", " ") for name, text in told.items() if text}
-
-    def version(root: str) -> None:
-        arrays[f"{root}/version/majorVersion"] = np.array(0, dtype=np.int32)
-        arrays[f"{root}/version/minorVersion"] = np.array(9, dtype=np.int32)
-
-    def part(root: str, mean: FloatArray, moved: FloatArray, representer: str) -> None:
-        basis, stddev, _ = orthonormal(moved)
-        if not len(stddev):
-            basis, stddev = np.full((len(mean), 1), len(mean) ** -0.5), np.zeros(1)
-        numbers = {"mean": mean, "pcaBasis": basis, "pcaVariance": stddev**2, "noiseVariance": np.zeros(1)}
-        arrays.update({f"{root}/model/{name}": value.astype(np.float32) for name, value in numbers.items()})
-        builder = f"{root}/modelinfo/modelBuilder-0"
-        arrays[f"{root}/modelinfo/scores"] = np.zeros((1, 1), dtype=np.float32)
-        texts.update(
-            {f"{root}/modelinfo/build-time": now, f"{builder}/buildTime": now, f"{builder}/builderName": "shapespace"}
-        )
-        texts.update({f"{builder}/parameters/{name}": text for name, text in told.items()})
-        groups.extend([f"{builder}/dataInfo", f"{builder}/parameters", f"{root}/representer/pointData"])
-        kind = "POINT_SET" if model.faces is None else "POLYGON_MESH"
-        attributes[f"{root}/representer"] = {"name": representer, "datasetType": kind, "version": "1.0"}
-        attributes[f"{root}/representer"] |= {"version/majorVersion": "0", "version/minorVersion": "9"}
-        arrays[f"{root}/representer/points"] = np.ascontiguousarray(model.mean.T, dtype=np.float32)
-        if model.faces is not None:
-            arrays[f"{root}/representer/cells"] = np.ascontiguousarray(model.faces.T, dtype=np.int32)
-        version(root)
-
-    if model.expression is None:
-        part("", mean, model.shape.moved, "itkStandardMeshRepresenter")
-    else:
-        nothing = np.zeros((len(mean), 0))
-        part("/shape", mean, model.shape.moved, "gravis::MeshShapeRepresenter")
-        part("/color", np.full(len(mean), _GREY), nothing, "gravis::MeshColorRepresenter")
-        part("/expression", np.zeros(len(mean)), model.expression.moved, "gravis::MeshExpressionRepresenter")
-        texts["/color/representer/colorspace"] = "RGB"
-        version("")
-        for name in ("shape", "color", "expression"):
-            texts[f"/catalog/MorphableModel.{name}/modelType"] = "POLYGON_MESH_MODEL"
-            texts[f"/catalog/MorphableModel.{name}/modelPath"] = f"/{name}"
-        said.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
-    if model.landmarks:
-        points = {name: model.mean[vertex].astype(np.float32) for name, vertex in model.landmarks.items()}
-        marks = {name: point.astype(np.float64) for name, point in points.items()}
-        texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(marks)
-    blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-    kept = sum(float((block.moved**2).sum()) for block in blocks)
-    total = model.shape.total_variance
-    if total is not None and total > kept * (1 + 1e-6):
-        said.append(f"The {1 - kept / total:.2g} of the variance that no mode holds is left out.")
-    for path in [*arrays, *texts, *groups]:
-        parents = path.split("/")[1:-1]
-        groups.extend("/" + "/".join(parents[:count]) for count in range(1, len(parents) + 1))
-    return Tree(arrays, texts, attributes, tuple(dict.fromkeys(groups))), said
-
-
-def _hdf5_of(tree: Tree) -> bytes:
-    import h5py  # a twentieth of a second that only those who write should wait
-
-    low: Any = h5py
-
-    def fixed(text: str) -> tuple[Any, Any]:
-        data = text.encode("utf-8", "replace")
-        kind = low.h5t.C_S1.copy()
-        kind.set_size(len(data) + 1)
-        kind.set_strpad(low.h5t.STR_NULLTERM)
-        return kind, np.array(data + b"\0", dtype=f"S{len(data) + 1}")
-
-    memory = io.BytesIO()
-    with h5py.File(memory, "w", libver="earliest", track_order=False) as file:
-        scalar = low.h5s.create(low.h5s.SCALAR)
-        for path in sorted(tree.groups):
-            file.require_group(path)
-        for path, array in tree.arrays.items():
-            file.create_dataset(path, data=array, track_order=False)
-        for path, text in tree.texts.items():
-            above, _, name = path.rpartition("/")
-            kind, value = fixed(text)
-            parent: Any = file[above or "/"]
-            low.h5d.create(parent.id, name.encode(), kind, scalar).write(low.h5s.ALL, low.h5s.ALL, value)
-        for path, told in tree.attributes.items():
-            owner: Any = file[path]
-            for name, text in told.items():
-                kind, value = fixed(str(text))
-                low.h5a.create(owner.id, name.encode(), kind, scalar).write(value)
-    return memory.getvalue()

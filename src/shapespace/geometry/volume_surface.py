@@ -19,6 +19,7 @@ from scipy import ndimage
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume, Mesh
 
 SMOOTH = 1.3
@@ -71,6 +72,8 @@ class VolumeSurface:
     at_border: int
     volume_mm3: float
     notes: tuple[str, ...]
+
+    __repr__ = short_repr
 
 
 def surface_of_volume(
@@ -169,7 +172,9 @@ def _cut_out(inside: BoolArray, margin: npt.NDArray[np.int_], name: str) -> tupl
         low[axis], high[axis] = along[0], along[-1] + 1
     if np.prod(high - low + 2 * margin) > _MOST_VOXELS:
         size = " x ".join(map(str, high - low))
-        raise InputError(f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it.")
+        raise InputError(
+            f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it, as by 3D Slicer."
+        )
     box = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     return np.pad(box, [(int(m), int(m)) for m in margin]), (low - margin).astype(np.float64)
 

@@ -89,10 +89,10 @@ def _read(path: Path, asked: dict[str, Any]) -> Tree:
             "most_seconds": seconds,
         }
         # A program of its own and not a copy: a copy of a process with threads may hang, and a script without a guard
-        # would be run again. -P, since a folder that one stands in may hold a numpy.py.
+        # would be run again. -P, since modules beside the program are none of its own.
         command = [sys.executable, "-P", str(Path(apart_child.__file__)), json.dumps(asked)]
         environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),
+            "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),  # not the folder that one stands in
             "OPENBLAS_NUM_THREADS": "1",
             "HDF5_PLUGIN_PRELOAD": "::",  # no code of filters from elsewhere
         }

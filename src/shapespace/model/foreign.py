@@ -103,6 +103,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "licence": linear.licence,
         "held_out": linear.held_out,
         "residuals": None,
+        "regions": {},
     }
     return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
 
@@ -156,8 +157,8 @@ def _changes(moved: FloatArray, kept: int, *, parted: bool) -> list[str]:
     skew = float(np.abs(unit.T @ unit - np.eye(unit.shape[1])).max(initial=0.0))
     said: list[str] = []
     if skew > ORTHOGONAL:
-        why = "Identity and expression overlap" if parted else "The basis was not orthonormal"
-        said.append(f"{why} (by {skew:.2g}) and was made so, which keeps the covariance.")
+        what = "Modes of identity and expression were" if parted else "The basis was"
+        said.append(f"{what} not orthonormal (by {skew:.2g}) and made so, which keeps the covariance.")
     if kept < moved.shape[1]:
         said.append(f"{moved.shape[1] - kept} of {moved.shape[1]} modes do not vary and are left out.")
     return said
