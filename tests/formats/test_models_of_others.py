@@ -21,7 +21,7 @@ from shapespace.viewer.shown import Shown
 MODELS = Path(os.environ.get("SHAPESPACE_DATA", "/nowhere")) / "models"
 FEMUR = MODELS / "femur_gp_model_50-components.h5"
 FILES = ["femur_gp_model_50-components.h5", "scalismo_asm_model.h5"]
-READ_ONLY = {"flame", "mat"}
+READ_ONLY = {"flame", "mat", "monai-physio", "gias"}
 pytestmark = pytest.mark.skipif(not MODELS.is_dir(), reason="needs SHAPESPACE_DATA with the folder models")
 
 

@@ -14,7 +14,7 @@ from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, read_mesh, write_me
 from shapespace.types import Mesh
 
 MARK = b"\xef\xbb\xbf"
-BINARY = (".stl", ".glb", ".bnt")
+BINARY = (".stl", ".glb", ".bnt", ".las")
 
 
 def refusal(path: Path) -> str:
