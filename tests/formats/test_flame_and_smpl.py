@@ -15,8 +15,7 @@ import pytest
 import scipy.sparse
 
 from own_file_fuzz import damaged_bytes, fuzzed
-from shapespace.errors import InputError, ModelFileError, ShapespaceError
-from shapespace.formats.flame import Flame
+from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.registry import read_linear
 from shapespace.io.pickled_arrays import PickleRefusedError, pickled_array, pickled_dict
 from shapespace.model.additive import AdditiveModel
@@ -237,9 +236,3 @@ def test_a_damaged_file_gives_a_model_or_one_sentence(tmp_path_factory: pytest.T
         ShapeModel.load(path)
     except ShapespaceError as error:
         assert "\n" not in str(error)
-
-
-def test_it_is_only_read(tmp_path: Path) -> None:
-    _, linear = read_linear(saved(parts(), tmp_path, ".npz"))
-    with pytest.raises(InputError, match="only read"):
-        Flame().write(linear, tmp_path / "out.npz")

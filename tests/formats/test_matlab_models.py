@@ -10,8 +10,7 @@ import pytest
 import scipy.io
 from statismo_by_hand import Truth, truth
 
-from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.matlab import Matlab
+from shapespace.errors import ModelFileError
 from shapespace.formats.registry import read_linear
 from shapespace.model.shape_model import ShapeModel
 
@@ -86,9 +85,3 @@ def test_parts_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     version_5(tmp_path / "m.mat", lsfm(truth()) | {"eigenvalues": np.ones(7)})
     with pytest.raises(ModelFileError, match="the shapes"):
         ShapeModel.load(tmp_path / "m.mat")
-
-
-def test_it_is_only_read(tmp_path: Path) -> None:
-    version_5(tmp_path / "m.mat", lsfm(truth()))
-    with pytest.raises(InputError, match="only read"):
-        Matlab().write(read_linear(tmp_path / "m.mat")[1], tmp_path / "out.mat")

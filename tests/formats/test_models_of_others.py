@@ -11,8 +11,8 @@ from shapespace import cli
 from shapespace.commands.convert import convert
 from shapespace.errors import ModelFileError
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.formats.parts import Format
-from shapespace.formats.registry import FORMATS
+from shapespace.formats.parts import ModelFormat
+from shapespace.formats.registry import MODEL_FORMATS
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, find_fits, model_of
@@ -21,7 +21,6 @@ from shapespace.viewer.shown import Shown
 MODELS = Path(os.environ.get("SHAPESPACE_DATA", "/nowhere")) / "models"
 FEMUR = MODELS / "femur_gp_model_50-components.h5"
 FILES = ["femur_gp_model_50-components.h5", "scalismo_asm_model.h5"]
-READ_ONLY = {"flame", "mat", "monai-physio", "gias"}
 pytestmark = pytest.mark.skipif(not MODELS.is_dir(), reason="needs SHAPESPACE_DATA with the folder models")
 
 
@@ -33,10 +32,10 @@ def covariance_gap(first: ShapeModel, second: ShapeModel) -> float:
     return float(np.sqrt(max(gap2, 0.0)) / np.linalg.norm(own))
 
 
-@pytest.mark.parametrize("one", [one for one in FORMATS if one.name not in READ_ONLY], ids=lambda one: one.name)
+@pytest.mark.parametrize("one", MODEL_FORMATS.values(), ids=lambda one: one.name)
 @pytest.mark.parametrize("file", FILES)
 def test_each_converts_to_our_format_and_to_all_that_are_written_and_back(
-    one: Format, file: str, tmp_path: Path
+    one: ModelFormat, file: str, tmp_path: Path
 ) -> None:
     convert(MODELS / file, tmp_path / "own.h5", to=None, mm=None)
     own = ShapeModel.load(tmp_path / "own.h5")

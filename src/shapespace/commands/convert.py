@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.parts import Format
-from shapespace.formats.registry import FORMATS, format_to_write
+from shapespace.formats.parts import ModelFormat
+from shapespace.formats.registry import MODEL_FORMATS, format_to_write
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign
 from shapespace.model.shape_model import ShapeModel
@@ -44,14 +44,8 @@ def convert(
     return of, OWN[0] if target is None else target.title, notes
 
 
-def formats() -> list[dict[str, str]]:
-    """Return the name, title and endings of each format that `convert` knows."""
-    rows = [(OWN[0], "shapespace's own", OWN[1]), *((one.name, one.title, one.suffixes) for one in FORMATS)]
-    return [{"name": name, "title": title, "endings": " ".join(ends)} for name, title, ends in rows]
-
-
-def _target(output: Path, to: str | None) -> Format | None:
-    named = any(output.name.lower().endswith(tuple(one.suffixes)) for one in FORMATS)
+def _target(output: Path, to: str | None) -> ModelFormat | None:
+    named = any(output.name.lower().endswith(tuple(one.suffixes)) for one in MODEL_FORMATS.values())
     if to == OWN[0] or (to is None and not named and output.suffix.lower() in OWN[1]):
         return None
     return format_to_write(output, to)

@@ -45,7 +45,7 @@ class Eos:
         return _are_blendshapes(head)
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         data = read_bytes(path)
         if _are_blendshapes(data[:16]):
@@ -59,7 +59,7 @@ class Eos:
             raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; single precision, version 4."""
+        """As `ModelFormat.write`; single precision, version 4."""
         out = bytearray(struct.pack("<I", _NEWEST))
         out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
         out += _pca_bytes(_NOTHING, _NOTHING, None)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import InputError, ModelFileError
+from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes
 from shapespace.io.archives import read_arrays
 from shapespace.io.files import read_bytes
@@ -45,7 +45,7 @@ class Flame:
         return path.suffix.lower() == ".npz" and head.startswith(b"PK") and _has_template(path)
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         wanted = [name for names in (*_KEYS.values(), _JOINTS) for name in names]
         if path.suffix.lower() == ".npz":
@@ -84,10 +84,6 @@ class Flame:
                 "Its pose rig (joints, skinning weights, corrections by pose) is left out; the pose is the template's.",
             ),
         )
-
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`: it is only read."""
-        raise InputError(f"Cannot write {path}: {self.title} is only read; choose another format.")
 
 
 def _family(arrays: Mapping[str, npt.NDArray[Any]], n: int) -> str:

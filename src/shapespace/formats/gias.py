@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from shapespace.errors import InputError, ModelFileError
+from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes, scaled
 from shapespace.io.archives import LARGEST_BYTES, npy_array, zip_members
 from shapespace.io.files import open_file
@@ -38,7 +38,7 @@ class Gias:
         return path.name.lower().endswith(".pc.npz") and named in _FIRST_MEMBERS
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, LARGEST_BYTES, _AGAIN)
         try:
             with open_file(path) as stream:
@@ -79,10 +79,6 @@ class Gias:
             provenance=f"GIAS2 principal components {path.name}",
             notes=tuple(notes),
         )
-
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; it is only read."""
-        raise InputError(f"{path} cannot be written: models of GIAS2 are only read; choose another format.")
 
 
 def _numbers(data: bytes) -> FloatArray:

@@ -52,7 +52,7 @@ class Gltf:
             return False
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
         found = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
         facts = json_object(json_object(found.extras).get(KEY))
@@ -84,7 +84,7 @@ class Gltf:
         )
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; single precision, metres, normals of mean and targets."""
+        """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
         tree, binary = _content(model, path)
         write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
         said = [

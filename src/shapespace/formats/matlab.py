@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import InputError, ModelFileError
+from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes, are_measurable, scaled
 from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
 from shapespace.io.files import open_file
@@ -83,7 +83,7 @@ class Matlab:
         return path.suffix.lower() == ".mat" and bool(head)
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             tree = _tree(path)
@@ -94,10 +94,6 @@ class Matlab:
             return _model(tree, layout)
         except ApartError as error:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
-
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`: it is only read."""
-        raise InputError(f"Cannot write {path}: {self.title} is only read; choose another format.")
 
 
 def _tree(path: Path) -> Tree:

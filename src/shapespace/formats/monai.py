@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import FileFormatError, InputError, ModelFileError
+from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.formats.facts import json_object
 from shapespace.formats.parts import LinearModel, Modes, scaled
 from shapespace.io.files import read_bytes
@@ -39,7 +39,7 @@ class Monai:
         return path.name == _MODEL or (head.lstrip()[:1] == b"{" and any(key in head for key in _KEYS))
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         file = path / _MODEL if path.is_dir() else path
         check_file(file, _LARGEST_BYTES, _AGAIN)
         surface = file.with_name(_SURFACE)
@@ -64,10 +64,6 @@ class Monai:
             faces=mean.faces,
             provenance=f"MONAI-Physio model in {file.parent.name}",
         )
-
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; it is only read."""
-        raise InputError(f"{path} cannot be written: models of MONAI-Physio are only read; choose another format.")
 
 
 def _total(variance: FloatArray, ratio: npt.NDArray[np.float64]) -> float | None:

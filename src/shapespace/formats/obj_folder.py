@@ -51,7 +51,7 @@ class ObjFolder:
             return False
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         neutral, others = _files(path)
         if neutral is None or not others or len(others) > _MOST_SHAPES:
             raise ModelFileError(
@@ -91,7 +91,7 @@ class ObjFolder:
         )
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; a new folder, in mm."""
+        """As `ModelFormat.write`; a new folder, in mm."""
         mm = model.mm or 1.0
         rest = model.mean * mm
         files = {f"{_ICT}.obj": write_obj(Mesh(rest, model.faces))}

@@ -141,8 +141,8 @@ def orthonormal(moved: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return (left * sign)[:, kept], stddev[kept], (right.T * sign)[:, kept]
 
 
-class Format(Protocol):
-    """A format of model files: one module, one class, one line in `FORMATS`."""
+class ModelReader(Protocol):
+    """A format of model files: one module, one class, one place in `MODEL_FORMATS` or `READ_ONLY_MODELS`."""
 
     name: str
     """By which `shapespace convert --to` asks for it."""
@@ -164,11 +164,15 @@ class Format(Protocol):
         """
         ...
 
+
+class ModelFormat(ModelReader, Protocol):
+    """A format that is written too."""
+
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
         """Write `model` to `path`, whole or not at all, and return sentences on what was changed or left out.
 
         Raises:
             FileError: it cannot be written.
-            InputError: the format cannot hold such a model, or is only read.
+            InputError: the format cannot hold such a model.
         """
         ...

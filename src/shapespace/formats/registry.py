@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,31 +16,24 @@ from shapespace.formats.gltf import Gltf
 from shapespace.formats.matlab import Matlab
 from shapespace.formats.monai import Monai
 from shapespace.formats.obj_folder import ObjFolder
-from shapespace.formats.parts import Format, LinearModel
+from shapespace.formats.parts import LinearModel, ModelFormat, ModelReader
 from shapespace.formats.scalismo_json import ScalismoJson
 from shapespace.formats.shapeworks import ShapeWorks
 from shapespace.formats.statismo import Statismo
 from shapespace.io.files import open_file
 from shapespace.io.json_files import check_file
 
-FORMATS: Sequence[Format] = (
-    Eos(),
-    Statismo(),
-    ScalismoJson(),
-    Gias(),
-    Flame(),
-    Matlab(),
-    Gltf(),
-    ObjFolder(),
-    ShapeWorks(),
-    Monai(),
-)
-"""In the order in which they are asked whether a file is theirs."""
+MODEL_FORMATS: Mapping[str, ModelFormat] = {
+    one.name: one for one in (Eos(), Statismo(), ScalismoJson(), Gltf(), ObjFolder(), ShapeWorks())
+}
+"""Formats that are read and written, by their names, in the order in which they are asked whether a file is theirs."""
+READ_ONLY_MODELS: Mapping[str, ModelReader] = {one.name: one for one in (Gias(), Flame(), Matlab(), Monai())}
+"""Those that are only read, which are asked next."""
 LARGEST_BYTES = 2**34
 _HEAD_BYTES = 4096
 
 
-def read_linear(path: Path) -> tuple[Format, LinearModel]:
+def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
     """Return the format of `path`, and the model in it.
 
     Raises:
@@ -50,7 +43,7 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
     check_file(path, LARGEST_BYTES, "give a model file")
     found = _format_of(path)
     if found is None:
-        known = ", ".join(one.title for one in FORMATS)
+        known = ", ".join(one.title for one in _readers())
         raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
     # The last bits hang on the number of threads, and workers, which have one, must find the same model.
     with threadpool_limits(1, user_api="blas"), np.errstate(invalid="ignore", over="ignore"):
@@ -60,27 +53,37 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
 
 
 def is_known(path: Path) -> bool:
-    """Whether `path` looks like a model in one of `FORMATS`."""
+    """Whether `path` looks like a model in one of these formats."""
     return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
-def format_to_write(path: Path, name: str | None) -> Format:
+def format_to_write(path: Path, name: str | None) -> ModelFormat:
     """Return the format called `name`, or the one whose names end as `path` does.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or it is only read.
     """
-    for one in FORMATS:
-        if one.name == name or (name is None and path.name.lower().endswith(tuple(one.suffixes))):
-            return one
-    names = ", ".join(f"{one.name} ({one.suffixes[0]})" if one.suffixes else one.name for one in FORMATS)
-    what = f"There is no format {name!r}" if name else f"The name {path.name!r} tells no format"
+
+    def is_meant(one: ModelReader) -> bool:
+        return one.name == name or (name is None and path.name.lower().endswith(tuple(one.suffixes)))
+
+    if (found := next(filter(is_meant, MODEL_FORMATS.values()), None)) is not None:
+        return found
+    if (only := next(filter(is_meant, READ_ONLY_MODELS.values()), None)) is not None:
+        what = f"Cannot write {path}: {only.title} is only read"
+    else:
+        what = f"There is no format {name!r}" if name else f"The name {path.name!r} tells no format"
+    names = ", ".join(f"{one.name} ({one.suffixes[0]})" if one.suffixes else one.name for one in MODEL_FORMATS.values())
     raise InputError(f"{what}; choose one of {names}, or .h5 for shapespace's own.")
 
 
-def _format_of(path: Path) -> Format | None:
+def _readers() -> list[ModelReader]:
+    return [*MODEL_FORMATS.values(), *READ_ONLY_MODELS.values()]
+
+
+def _format_of(path: Path) -> ModelReader | None:
     head = b""
     if not path.is_dir():
         with open_file(path) as file:
             head = file.read(_HEAD_BYTES)
-    return next((one for one in FORMATS if one.recognises(path, head)), None)
+    return next((one for one in _readers() if one.recognises(path, head)), None)

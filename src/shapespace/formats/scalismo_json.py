@@ -53,7 +53,7 @@ class ScalismoJson:
         return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             tree = _tree(read_bytes(path))
@@ -63,7 +63,7 @@ class ScalismoJson:
         return model_of(tree, path)
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`."""
+        """As `ModelFormat.write`."""
         tree, said = tree_of(model)
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
             out.writelines(_text_of(tree))

@@ -60,7 +60,7 @@ class ShapeWorks:
         return begin is not None and head.lstrip()[: len(begin)] == begin
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_PROJECT_BYTES, _AGAIN)
         content = read_bytes(path)
         facts: Mapping[str, Any] = {}
@@ -73,7 +73,7 @@ class ShapeWorks:
         return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; vertices become particles, and the model as many shapes as have its mean and covariance.
+        """As `ModelFormat.write`; vertices become particles, the model as many shapes as have its mean and covariance.
 
         K modes take K + 1 shapes, none further than 1.42 standard deviations in any mode: the rows of a cosine
         transform, which sum to zero and are orthogonal.

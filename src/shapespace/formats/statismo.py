@@ -50,7 +50,7 @@ class Statismo:
         return head.startswith(HDF5_SIGNATURE)
 
     def read(self, path: Path) -> LinearModel:
-        """As `Format.read`."""
+        """As `ModelReader.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         try:
             return model_of(read_hdf5_apart(path, leave=("/color",)), path)
@@ -58,7 +58,7 @@ class Statismo:
             raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
     def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `Format.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
+        """As `ModelFormat.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
         tree, said = tree_of(model)
         write_bytes(path, hdf5_of(tree))
         return said
