@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 
-.PHONY: demo test test-all lint types contracts check bench clean
+.PHONY: demo test test-all lint types contracts check bench docs clean
 
 demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
@@ -29,6 +29,16 @@ check: lint types contracts test
 
 bench: $(READY)
 	set -e; for name in pca accuracy speed memory throughput; do $(BIN)/python benchmarks/$$name.py; done
+
+# Strict: a link that leads nowhere fails the build. Everything is read anew, or the second build would pass.
+docs: $(VENV)/.docs
+	rm -rf build/site
+	$(BIN)/python -m sphinx -q -W --keep-going --fresh-env -c docs/site -d build/site-trees . build/site
+	@echo "The documentation is build/site/index.html; open it in a browser, it needs no server."
+
+$(VENV)/.docs: $(READY)
+	$(BIN)/python -m pip install --quiet --group docs
+	touch $@
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)

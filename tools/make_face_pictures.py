@@ -59,7 +59,13 @@ def steps(model: ss.ShapeModel, case: SimulatedScan) -> Image.Image:
     over = Layer(case.scan, colour=SCAN)
     moments = [[Layer(result.surface(model, stage)), over] for stage in ("before", "initial", "final")]
     layers = [Layer(case.scan), *moments, coloured(result.surface(), result.distances.model_to_scan_mm)]
-    titles = ["the scan", "centred", "after the search", "fitted", f"median {result.distances.model_to_scan.median:.2f} mm"]
+    titles = [
+        "the scan",
+        "centred",
+        "after the search",
+        "fitted",
+        f"median {result.distances.model_to_scan.median:.2f} mm",
+    ]
     return row(layers, titles, case.truth_vertices)
 
 

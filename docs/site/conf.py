@@ -10,10 +10,9 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path.insert(0, str(HERE))
 
-import pages  # noqa: E402
-import plots  # noqa: E402
-import sources  # noqa: E402
-
+import site_plots  # noqa: E402
+import site_text  # noqa: E402
+import site_trees  # noqa: E402
 from shapespace import __version__  # noqa: E402
 
 project, author, version, release = "shapespace", "The shapespace authors", __version__, __version__
@@ -21,9 +20,9 @@ project_copyright = "The shapespace authors, MIT licence"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 
 # The repository is the source, so that links between its files hold here as they do on a forge.
-root_doc = pages.FIRST
-include_patterns = [f"{page}.md" for page in pages.documents(ROOT)]
-_folders = {page.partition("/")[0] for page in pages.documents(ROOT)}
+root_doc = site_text.FIRST
+include_patterns = [f"{page}.md" for page in site_text.documents(ROOT)]
+_folders = {page.partition("/")[0] for page in site_text.documents(ROOT)}
 exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _folders]
 myst_heading_anchors = 4
 default_role = "literal"
@@ -48,10 +47,11 @@ pygments_style, pygments_dark_style = "friendly", "github-dark"
 def setup(app: Sphinx) -> None:
     """Add what the documents need beside the extensions."""
     app.add_lexer("layers", TextLexer)
-    app.connect("builder-inited", plots.draw_all)
-    app.connect("source-read", pages.complete)
-    app.connect("autodoc-process-docstring", pages.markup)
-    app.connect("missing-reference", pages.public_name)
+    app.connect("builder-inited", site_plots.draw_all)
+    app.connect("source-read", site_text.complete)
+    app.connect("autodoc-process-docstring", site_text.markup)
+    app.connect("missing-reference", site_text.public_name)
     # Before Sphinx collects the files to download, at 500.
-    app.connect("doctree-read", sources.link_to_pages, priority=400)
-    app.connect("html-collect-pages", sources.source_pages)
+    app.connect("doctree-read", site_trees.link_to_pages, priority=400)
+    app.connect("doctree-read", site_trees.plain_types)
+    app.connect("html-collect-pages", site_trees.source_pages)

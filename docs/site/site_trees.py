@@ -1,7 +1,8 @@
-"""Pages for the files of the repository that documents link to: code that can be read beside the text."""
+"""What the build changes in documents as read: links to code lead to pages that show it, types have short names."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,3 +44,10 @@ def source_pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
         text = (Path(app.srcdir) / file).read_text("utf-8")
         code = app.builder.highlighter.highlight_block(text, LEXERS[Path(file).suffix], linenos="inline")
         yield f"source/{file}", {"title": file, "body": f"<h1>{file}</h1>{code}"}, "page.html"
+
+
+def plain_types(app: Sphinx, tree: nodes.document) -> None:
+    """Write the names of types as they stand in the code."""
+    for text in list(tree.findall(nodes.Text)):
+        if "TypeAliasForwardRef" in text:
+            text.parent.replace(text, nodes.Text(re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)))

@@ -41,7 +41,7 @@ def section(text: str, heading: str) -> re.Match[str]:
     """Return the part of a document below `heading`, up to the next one."""
     found = re.search(rf"(?<=^#) *#* *{re.escape(heading)}$(.*?)(?=^#+ |\Z)", text, re.MULTILINE | re.DOTALL)
     if not found:
-        raise ValueError(f"There is no heading {heading!r} for a plot; see docs/site/plots.py.")
+        raise ValueError(f"There is no heading {heading!r} for a plot; see docs/site/site_plots.py.")
     return found
 
 
@@ -49,7 +49,7 @@ def table(text: str, heading: str) -> list[list[str]]:
     """Return the cells of the first table below `heading`, its head first, without marks of code and emphasis."""
     lines = re.search(r"(?:^\|.*\n)+", section(text, heading)[0], re.MULTILINE)
     if not lines:
-        raise ValueError(f"There is no table below {heading!r} for a plot; see docs/site/plots.py.")
+        raise ValueError(f"There is no table below {heading!r} for a plot; see docs/site/site_plots.py.")
     cells = [[re.sub(r"[`*]", "", cell).strip() for cell in line[1:-1].split("|")] for line in lines[0].splitlines()]
     return [cells[0], *cells[2:]]
 
@@ -68,7 +68,7 @@ def column(rows: list[list[str]], head: str) -> list[float]:
 
 def _bars(axes: Any, names: list[str], values: list[float], unit: str, *, ours: str) -> None:
     places = range(len(names))[::-1]
-    colours = [OURS if ours in name else PAPER if "paper" in name else OTHERS for name in names]
+    colours = [OURS if ours in name else PAPER if "paper" in name or "NumPy" in name else OTHERS for name in names]
     axes.barh(places, values, color=colours, height=0.7)
     for place, value in zip(places, values, strict=True):
         axes.text(value, place, f" {value:g}", va="center", fontsize=8)
@@ -76,6 +76,10 @@ def _bars(axes: Any, names: list[str], values: list[float], unit: str, *, ours: 
     axes.set_xscale("log")
     axes.set_xlabel(unit)
     axes.margins(x=0.12)
+
+
+def _legend(axes: Any) -> None:
+    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
 
 
 def _errors(rows: list[list[str]], axes: Any) -> None:
@@ -90,7 +94,7 @@ def _errors(rows: list[list[str]], axes: Any) -> None:
     axes.set_xscale("log")
     axes.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
     axes.set_xlabel("distance of the vertices from their true places, mm")
-    axes.legend(frameon=False, loc="upper right")
+    _legend(axes)
 
 
 def _times(rows: list[list[str]], axes: Any) -> None:
@@ -104,17 +108,22 @@ def _times(rows: list[list[str]], axes: Any) -> None:
 
 
 def _cases(rows: list[list[str]], axes: Any) -> None:
-    kept = [rows[0], *(row for row in rows[1:] if row[1] == "50" or "outside" in row[0] or row[0].startswith("the same"))]
+    kept = [
+        rows[0],
+        *(row for row in rows[1:] if row[1] == "50" or "outside" in row[0] or row[0].startswith("the same")),
+    ]
     names = [row[0] for row in kept[1:]]
     places = range(len(names))[::-1]
     axes.scatter(column(kept, "paper, mm"), places, color=PAPER, marker="D", s=36, label="the paper's method")
     axes.scatter(column(kept, "robust, mm"), places, color=OURS, s=42, label="robust")
-    axes.scatter(column(kept, "floor, mm"), places, color=SECOND, marker="|", s=130, label="the best that the model can do")
+    axes.scatter(
+        column(kept, "floor, mm"), places, color=SECOND, marker="|", s=130, label="the best that the model can do"
+    )
     axes.set_yticks(places, names)
     axes.set_xscale("log")
     axes.set_xticks([0.5, 1, 2, 5, 10, 20, 50], ["0.5", "1", "2", "5", "10", "20", "50"])
     axes.set_xlabel("distance of the vertices from their true places, mm")
-    axes.legend(frameon=False, loc="lower right")
+    _legend(axes)
 
 
 def _organs(rows: list[list[str]], axes: Any) -> None:
@@ -124,24 +133,26 @@ def _organs(rows: list[list[str]], axes: Any) -> None:
         found = [[float(n) for n in re.findall(r"\d+\.\d+", row[at])] for row in rows[1:]]
         for y, (value, low, high) in zip(place, found, strict=True):
             axes.plot([low, high], [y, y], color=colour, linewidth=2)
-            axes.scatter([value], [y], color=colour, marker=marker, s=36, label=head.removesuffix(", mm") if y == 0 else None)
+            axes.scatter(
+                [value], [y], color=colour, marker=marker, s=36, label=head.removesuffix(", mm") if y == 0 else None
+            )
     axes.set_yticks(place, names)
     axes.set_xlabel("mm, with 95 % intervals; less is better")
-    axes.legend(frameon=False)
+    _legend(axes)
 
 
 BENCHMARKS = "docs/benchmarks"
 PLOTS = (
     Plot(
         "accuracy", BENCHMARKS, "Accuracy",
-        "Dots on a logarithmic scale: in every case the robust method lies on the floor or close to it; the paper's lies near 1 mm "
-        "where scans are complete and far to the right where they are not",
+        "Dots on a logarithmic scale: in every case the robust method lies on the floor or close to it; the paper's "
+        "lies near 1 mm where scans are complete and far to the right where they are not",
         _cases, ((BENCHMARKS, "Accuracy"),),
     ),
     Plot(
         "peers", BENCHMARKS, "Beside the peers",
-        "Two dots for each method, a complete scan and one with a cut, a hole and extra neck: of shapespace both lie at 0.6 mm, of "
-        "the others the second lies at 7 mm and above",
+        "Two dots for each method, a complete scan and one with a cut, a hole and extra neck: of shapespace both lie "
+        "at the same place, of most others the second lies far off",
         _errors, ((BENCHMARKS, "Beside the peers"), ("docs/beside", "What was measured")),
     ),
     Plot(
@@ -151,8 +162,8 @@ PLOTS = (
     ),
     Plot(
         "organs", BENCHMARKS, "Correspondence of real organs beside the peers",
-        "Generalisation and specificity of spleens put into correspondence by shapespace, meshmonk and rustcpd, with their intervals: "
-        "those of shapespace and meshmonk overlap, those of rustcpd are larger",
+        "Generalisation and specificity of spleens put into correspondence by shapespace, meshmonk and rustcpd, with "
+        "their intervals: those of shapespace and meshmonk overlap, those of rustcpd are larger",
         _organs, ((BENCHMARKS, "Correspondence of real organs beside the peers"),),
     ),
 )  # fmt: skip
@@ -170,10 +181,11 @@ def draw_all(app: Sphinx) -> None:
         for scheme, ink in INK.items():
             colours = {f"{part}color": ink for part in ("text.", "axes.label", "axes.edge", "xtick.", "ytick.")}
             with mpl.rc_context({**colours, "font.size": 9, "svg.hashsalt": plot.name}):
-                figure = Figure(figsize=(7.4, 1.2 + 0.27 * len(rows)), layout="constrained")
+                figure = Figure(layout="constrained")
                 axes = figure.add_subplot()
                 axes.spines[["top", "right"]].set_visible(False)
                 plot.draw(rows, axes)
+                figure.set_size_inches(7.4, 1.2 + 0.27 * len(axes.get_yticks()))
                 figure.savefig(root / FOLDER / f"{plot.name}-{scheme}.svg", transparent=True, metadata={"Date": None})
 
 
@@ -191,5 +203,6 @@ def add(document: str, text: str) -> str:
 
 def _shown(plot: Plot) -> str:
     return "\n".join(
-        f"```{{image}} /{FOLDER}/{plot.name}-{scheme}.svg\n:alt: {plot.alt}\n:class: only-{scheme}\n```\n" for scheme in INK
+        f"```{{image}} /{FOLDER}/{plot.name}-{scheme}.svg\n:alt: {plot.alt}\n:class: only-{scheme}\n```\n"
+        for scheme in INK
     )

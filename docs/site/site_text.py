@@ -6,9 +6,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import plots
-
 import shapespace
+import site_plots
 
 if TYPE_CHECKING:
     from docutils.nodes import Element, TextElement
@@ -102,11 +101,11 @@ def reference(text: str) -> str:
 
     Public names that the text does not have come at its end.
     """
-    listed = re.findall(r"^- `(\w+)`", text, flags=re.MULTILINE)
+    listed = re.findall(r"^- `(\w+)`:", text, flags=re.MULTILINE)
     rest = [name for name in shapespace.__all__ if name not in listed and name != "__version__"]
     if rest:
-        text += "\n## Others\n\n" + "".join(f"- `{name}`\n" for name in rest)
-    return re.sub(r"^- `(\w+)`.*\n", lambda match: directive(match[1]), text, flags=re.MULTILINE)
+        text += "\n## Others\n\n" + "".join(f"- `{name}`:\n" for name in rest)
+    return re.sub(r"^- `(\w+)`:.*\n", lambda match: directive(match[1]), text, flags=re.MULTILINE)
 
 
 def directive(name: str) -> str:
@@ -114,7 +113,10 @@ def directive(name: str) -> str:
     thing = getattr(shapespace, name)
     home = f"shapespace.{shapespace._HOMES[name]}" if not callable(thing) else "shapespace"  # data has its text there
     if isinstance(thing, type):
-        kind, options = "autoclass", "   :members:\n   :show-inheritance:\n" if issubclass(thing, Exception) else "   :members:\n"
+        kind, options = (
+            "autoclass",
+            "   :members:\n   :show-inheritance:\n" if issubclass(thing, Exception) else "   :members:\n",
+        )
     else:
         kind, options = ("autofunction", "") if callable(thing) else ("autodata", "   :no-value:\n")
     return f"\n```{{eval-rst}}\n.. {kind}:: {home}.{name}\n{options}```\n"
@@ -126,7 +128,7 @@ def complete(app: Sphinx, name: str, source: list[str]) -> None:
         source[0] += trees(documents(Path(app.srcdir)))
     elif name == REFERENCE:
         source[0] = reference(source[0])
-    source[0] = plots.add(name, source[0])
+    source[0] = site_plots.add(name, source[0])
 
 
 def markup(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
@@ -134,13 +136,9 @@ def markup(app: Sphinx, what: str, name: str, thing: object, options: object, li
     lines[:] = [re.sub(r"(`[^`]+`)(?=\w)", r"\1\\ ", line.replace("|", r"\|")) for line in lines]
 
 
-def public_name(
-    app: Sphinx, env: BuildEnvironment, node: pending_xref, shown: TextElement
-) -> Element | None:
+def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, shown: TextElement) -> Element | None:
     """Lead from a class as its module has it to where the reference has it."""
     name: Any = node.get("reftarget", "").rpartition(".")[2]
     if node.get("refdomain") != "py" or name not in shapespace.__all__:
         return None
-    return env.domains["py"].resolve_xref(
-        env, node["refdoc"], app.builder, "obj", f"shapespace.{name}", node, shown
-    )
+    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", f"shapespace.{name}", node, shown)
