@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -30,6 +31,8 @@ default_role = "literal"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_type_aliases = {name: name for name in ("FloatArray", "IntArray", "BoolArray", "Status", "Gauge")}
+# Within other types Sphinx shows an alias as the code that makes it.
+TypeAliasForwardRef.__repr__ = lambda self: self.name
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
@@ -53,5 +56,5 @@ def setup(app: Sphinx) -> None:
     app.connect("missing-reference", site_text.public_name)
     # Before Sphinx collects the files to download, at 500.
     app.connect("doctree-read", site_trees.link_to_pages, priority=400)
-    app.connect("doctree-read", site_trees.plain_types)
     app.connect("html-collect-pages", site_trees.source_pages)
+    app.connect("build-finished", site_trees.check_nothing_is_fetched)

@@ -1,4 +1,4 @@
-"""What the build changes in documents as read: links to code lead to pages that show it, types have short names."""
+"""What the build makes of documents as read: links to code lead to pages that show it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from docutils import nodes
 from sphinx import addnodes
+from sphinx.errors import ExtensionError
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
+FETCHED = re.compile(r"""(?:\bsrc=|<link[^>]*\bhref=|url\(|@import)\s*["']?(?:https?:)?//[^\s"')>]*""")
 LEXERS = {".py": "python", ".json": "json", ".md": "markdown", ".toml": "toml", ".txt": "text"}
 """Files that are shown, the others are downloads."""
 
@@ -46,8 +48,11 @@ def source_pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
         yield f"source/{file}", {"title": file, "body": f"<h1>{file}</h1>{code}"}, "page.html"
 
 
-def plain_types(app: Sphinx, tree: nodes.document) -> None:
-    """Write the names of types as they stand in the code."""
-    for text in list(tree.findall(nodes.Text)):
-        if "TypeAliasForwardRef" in text:
-            text.parent.replace(text, nodes.Text(re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)))
+def check_nothing_is_fetched(app: Sphinx, failure: Exception | None) -> None:
+    """Fail where a page would load a font, a script, a style or a picture from elsewhere: it is read offline."""
+    if failure:
+        return
+    for path in sorted(path for ending in ("html", "css") for path in Path(app.outdir).rglob(f"*.{ending}")):
+        found = FETCHED.search(path.read_text("utf-8"))
+        if found:
+            raise ExtensionError(f"{path.relative_to(app.outdir)} loads something from elsewhere: {found[0]}")
