@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,20 +67,24 @@ def column(rows: list[list[str]], head: str) -> list[float]:
     return [number(row[place]) for row in rows[1:]]
 
 
+def _wrapped(names: list[str]) -> list[str]:
+    return [textwrap.fill(name, 30) for name in names]
+
+
 def _bars(axes: Any, names: list[str], values: list[float], unit: str, *, ours: str) -> None:
     places = range(len(names))[::-1]
     colours = [OURS if ours in name else PAPER if "paper" in name or "NumPy" in name else OTHERS for name in names]
     axes.barh(places, values, color=colours, height=0.7)
     for place, value in zip(places, values, strict=True):
         axes.text(value, place, f" {value:g}", va="center", fontsize=8)
-    axes.set_yticks(places, names)
+    axes.set_yticks(places, _wrapped(names))
     axes.set_xscale("log")
     axes.set_xlabel(unit)
     axes.margins(x=0.12)
 
 
 def _legend(axes: Any) -> None:
-    axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
+    axes.figure.legend(frameon=False, loc="outside upper left", ncols=3)
 
 
 def _errors(rows: list[list[str]], axes: Any) -> None:
@@ -90,7 +95,7 @@ def _errors(rows: list[list[str]], axes: Any) -> None:
     places = range(len(names))[::-1]
     axes.scatter(complete, places, color=OURS, s=42, label="complete scan", zorder=2)
     axes.scatter(holes, places, color=PAPER, s=42, marker="D", label="cut, with a hole and extra neck", zorder=2)
-    axes.set_yticks(places, names)
+    axes.set_yticks(places, _wrapped(names))
     axes.set_xscale("log")
     axes.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
     axes.set_xlabel("distance of the vertices from their true places, mm")
@@ -119,7 +124,7 @@ def _cases(rows: list[list[str]], axes: Any) -> None:
     axes.scatter(
         column(kept, "floor, mm"), places, color=SECOND, marker="|", s=130, label="the best that the model can do"
     )
-    axes.set_yticks(places, names)
+    axes.set_yticks(places, _wrapped(names))
     axes.set_xscale("log")
     axes.set_xticks([0.5, 1, 2, 5, 10, 20, 50], ["0.5", "1", "2", "5", "10", "20", "50"])
     axes.set_xlabel("distance of the vertices from their true places, mm")
@@ -136,7 +141,7 @@ def _organs(rows: list[list[str]], axes: Any) -> None:
             axes.scatter(
                 [value], [y], color=colour, marker=marker, s=36, label=head.removesuffix(", mm") if y == 0 else None
             )
-    axes.set_yticks(place, names)
+    axes.set_yticks(place, _wrapped(names))
     axes.set_xlabel("mm, with 95 % intervals; less is better")
     _legend(axes)
 
@@ -185,7 +190,7 @@ def draw_all(app: Sphinx) -> None:
                 axes = figure.add_subplot()
                 axes.spines[["top", "right"]].set_visible(False)
                 plot.draw(rows, axes)
-                figure.set_size_inches(7.4, 1.2 + 0.27 * len(axes.get_yticks()))
+                figure.set_size_inches(5.8, 1.2 + 0.3 * len(axes.get_yticks()))
                 figure.savefig(root / FOLDER / f"{plot.name}-{scheme}.svg", transparent=True, metadata={"Date": None})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from sphinx.environment import BuildEnvironment
 
 FIRST, REFERENCE = "docs/index", "docs/api"
+LONGEST = 600
+"""Characters of a signature that is shown."""
 NAVIGATION = {
     "Start": ["docs/start"],
     "Tutorials": [
@@ -110,16 +113,18 @@ def reference(text: str) -> str:
 
 def directive(name: str) -> str:
     """Return what has Sphinx show the docstring of a public name."""
-    thing = getattr(shapespace, name)
-    home = f"shapespace.{shapespace._HOMES[name]}" if not callable(thing) else "shapespace"  # data has its text there
+    thing, home, shown, options = getattr(shapespace, name), "shapespace", name, ""
     if isinstance(thing, type):
-        kind, options = (
-            "autoclass",
-            "   :members:\n   :show-inheritance:\n" if issubclass(thing, Exception) else "   :members:\n",
-        )
+        kind, options = "autoclass", "   :members:\n"
+        # Settings and results have dozens of arguments, which the list below tells one by one.
+        if len(str(inspect.signature(thing.__init__))) > LONGEST:
+            shown += "(...)"
+    elif callable(thing):
+        kind = "autofunction"
     else:
-        kind, options = ("autofunction", "") if callable(thing) else ("autodata", "   :no-value:\n")
-    return f"\n```{{eval-rst}}\n.. {kind}:: {home}.{name}\n{options}```\n"
+        # The text of data stands in the module that has it.
+        kind, home, options = "autodata", f"shapespace.{shapespace._HOMES[name]}", "   :no-value:\n"
+    return f"\n```{{eval-rst}}\n.. {kind}:: {home}.{shown}\n{options}```\n"
 
 
 def complete(app: Sphinx, name: str, source: list[str]) -> None:
