@@ -40,7 +40,7 @@ NAVIGATION = {
         "docs/dense",
         "docs/bspline",
         "docs/recognise",
-        "docs/beside",
+        "docs/other-tools",
         "docs/benchmarks",
         "docs/paper-map",
         "docs/errata",
