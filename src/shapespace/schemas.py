@@ -154,6 +154,18 @@ class Iteration(Struct, frozen=True, kw_only=True):
     scale: float | None = None
 
 
+class FoundLandmark(Struct, frozen=True, kw_only=True):
+    """A landmark of the model on the fitted surface.
+
+    Args:
+        at: in the scan's own frame and unit.
+        stddev_mm: along the axes of that frame, mm of the scan; None where the method finds none.
+    """
+
+    at: tuple[float, float, float]
+    stddev_mm: tuple[float, float, float] | None = None
+
+
 class FitRecord(Struct, frozen=True, kw_only=True):
     """A NAME.fit.json.
 
@@ -168,12 +180,18 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         model: by which,
         landmarks: and the landmarks it started from.
         T_scan_model: pose, in the scan's own frame and unit; None for a scan that could not be fitted, as are the rest.
-        b: (K,) coefficients in mm,
+        b: (K,) coefficients in mm: norms over all vertices, so that b over the root of `n_vertices` is the RMS by
+            which a mode moves a vertex,
         z: and in standard deviations.
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
+        found_landmarks: the model's landmarks, on the dense surface where there is one, by name.
         distances_mm: by stage, over the whole model and every scan point within its rim.
-        size_mm: root mean square distance of the fitted surface's vertices from their middle.
+        size_mm: root mean square distance of the fitted surface's vertices from their middle, mm of the scan.
+        n_vertices: of that surface, V; None, as the next three are, in records of earlier versions.
+        centroid_size_mm: root of the sum of those squares, which is size_mm times the root of V.
+        extents_mm: of that surface along its principal axes, the longest first,
+        area_mm2: and its area; None without triangles.
         shown: distances of the final stage over what the scan shows, in mm of the model's frame; None, as the next
             three are, in records of earlier versions.
         shown_scan_mm: the same in mm of the scan.
@@ -202,12 +220,17 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     T_scan_model: Pose | None = None
     mm_per_scan_unit: float | None = None
     size_mm: float | None = None
+    n_vertices: int | None = None
+    centroid_size_mm: float | None = None
+    extents_mm: tuple[float, float, float] | None = None
+    area_mm2: float | None = None
     b: tuple[float, ...] = ()
     z: tuple[float, ...] = ()
     b_stddev: tuple[float, ...] = ()
     b_stddev_calibrated: bool = False
     shrinkage: tuple[float, ...] = ()
     evidence: Mapping[str, Any] = {}
+    found_landmarks: Mapping[str, FoundLandmark] = {}
     distances_mm: Mapping[str, BothWays] = {}
     shown: ShownDistances | None = None
     shown_scan_mm: ShownDistances | None = None
@@ -369,6 +392,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
         landmark_rms: distance of its landmarks from their places on the surface.
+        metadata: by the columns of the list that named it.
     """
 
     CALLED: ClassVar = "a record of correspondence"
@@ -397,6 +421,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     moved_share: list[float] = []
     cpu_s: list[float] = []
     landmark_rms: float | None = None
+    metadata: Mapping[str, str | int | float | None] = {}
     format: str = FORMAT
     format_version: int = VERSION
 

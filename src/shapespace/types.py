@@ -191,7 +191,7 @@ def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
         if len(mesh.vertices) != len(first.vertices):
             raise CorrespondenceError(
                 f"{mesh.name} has {len(mesh.vertices)} vertices but {first.name} has {len(first.vertices)}; "
-                "a shape model needs meshes in vertex correspondence, so register them to one template first."
+                "a shape model needs meshes in vertex correspondence, so run shapespace correspond on them first."
             )
         same = (mesh.faces is None) == (first.faces is None) and (
             mesh.faces is None or first.faces is None or np.array_equal(mesh.faces, first.faces)
@@ -199,6 +199,6 @@ def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
         if not same:
             raise CorrespondenceError(
                 f"{mesh.name} and {first.name} have different triangles on the same number of vertices; "
-                "a shape model needs meshes in vertex correspondence, so register them to one template first."
+                "a shape model needs meshes in vertex correspondence, so run shapespace correspond on them first."
             )
     return None if first is None else first.faces

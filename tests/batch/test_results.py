@@ -2,12 +2,14 @@ import csv
 import errno
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from shapespace.batch.folder import names_for
 from shapespace.batch.results import (
     Source,
     coefficient_row,
@@ -221,3 +223,22 @@ def test_a_model_of_points_gives_a_point_cloud(tmp_path: Path) -> None:
     write_fitted_mesh(tmp_path / "p.fitted.ply", result, points)
     write_stages(tmp_path / "p.npz", result, points)
     assert read_mesh(tmp_path / "p.fitted.ply").faces is None
+
+
+def test_a_hundred_times_as_many_scans_take_a_hundred_times_as_long_to_name(tmp_path: Path) -> None:
+    def steps(count: int) -> int:
+        counted = 0
+
+        def count_calls(_frame: object, event: str, _: object) -> None:
+            nonlocal counted
+            counted += event in ("call", "c_call")
+
+        scans = [tmp_path / f"s{k:05d}.ply" for k in range(count)]
+        sys.setprofile(count_calls)
+        try:
+            assert len(set(names_for(scans, tmp_path))) == count
+        finally:
+            sys.setprofile(None)
+        return counted
+
+    assert steps(2000) < 12 * steps(200)

@@ -1,6 +1,7 @@
 """`correspond` takes a folder of raw scans to a folder that `build` takes."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,29 @@ def test_each_scan_has_a_surface_and_a_record_and_a_bad_one_a_reason(same: Path)
     assert json.loads((same / "torn.correspond.json").read_text("utf-8"))["status"] == "set aside"
     assert not (same / "torn.corresponding.ply").exists() and not (same / ".rounds").exists()
     np.testing.assert_array_equal(read_mesh(same / "template" / "mean.ply").faces, first.faces)
+
+
+def test_scans_come_by_address_and_list_and_what_is_known_of_them_is_kept(
+    run: Run, raw: Path, same: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("fsspec")
+    shutil.make_archive(str(tmp_path / "scans"), "zip", raw)
+    archive = f"file://{tmp_path}/scans.zip"
+    rows = [f"zip://blob{k}.ply::{archive},anna{k},{30 + k}" for k in range(SCANS)]
+    (tmp_path / "list.csv").write_text("\n".join(["scan,id,age", *rows, f"zip://torn.ply::{archive},torn,1"]))
+    out = tmp_path / "out"
+    assert run("correspond", tmp_path / "list.csv", "-o", out, *QUICK).code == 1
+    for k in range(SCANS):
+        record = json.loads((out / f"anna{k}.correspond.json").read_text("utf-8"))
+        assert record["metadata"] == {"age": str(30 + k)} and record["path"] == f"zip://blob{k}.ply::{archive}"
+        assert record["hash"] == json.loads((same / f"blob{k}.correspond.json").read_text("utf-8"))["hash"]
+        surfaces = [
+            read_mesh(f).vertices for f in (out / f"anna{k}.corresponding.ply", same / f"blob{k}.corresponding.ply")
+        ]
+        np.testing.assert_array_equal(*surfaces)
+    torn = json.loads((out / "torn.correspond.json").read_text("utf-8"))
+    assert torn["status"] == "set aside" and torn["metadata"] == {"age": "1"}
+    assert run("report", out, "--no-open").code == 0
 
 
 def test_build_takes_the_folder_as_it_stands(run: Run, same: Path, tmp_path: Path) -> None:

@@ -161,8 +161,3 @@ def test_scans_in_an_archive_and_in_a_bucket_are_scans(
         assert "s3://scans/none" in run("fit", world.model, "s3://scans/none/x.ply", "-o", out, *FAST).err
     finally:
         server.stop()
-
-
-def test_an_address_where_files_are_read_is_said(run: Run, tmp_path: Path) -> None:
-    outcome = run("correspond", "s3://x/a.ply", "s3://x/b.ply", "-o", tmp_path)
-    assert outcome.code == 2 and "copy the scans to a folder first" in outcome.sentence()

@@ -13,12 +13,15 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
 
-READ_ONLY: set[str] = set()
-ONLY_SHAPE: set[str] = set()
+READ_ONLY = {"flame", "mat", "monai-physio", "gias"}
+ONLY_SHAPE = {"shapeworks"}
 """Formats that hold no expressions apart."""
 WRITTEN = [one for one in FORMATS if one.name not in READ_ONLY]
 PARTED = [one for one in WRITTEN if one.name not in ONLY_SHAPE]
 SINGLE = 2e-6
+FLIPS = {"statismo": 8}
+"""Damaged files that are tried where it is fewer than `MOST_FLIPS`: of a format that is read in a process apart."""
+MOST_FLIPS = 60
 
 
 def name(one: Format) -> str:
@@ -92,7 +95,7 @@ def test_flipped_bytes_end_in_a_model_or_in_a_sentence(one: Format, model: Shape
     one.write(model.as_linear(), path)
     file = path if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())[0]
     data, rng = file.read_bytes(), np.random.default_rng(5)
-    for _ in range(60):
+    for _ in range(FLIPS.get(one.name, MOST_FLIPS)):
         changed = bytearray(data)
         head = rng.random() < 0.7  # where the structure stands
         for at in rng.integers(0, min(len(data), 600) if head else len(data), rng.integers(1, 4)):

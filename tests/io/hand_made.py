@@ -128,6 +128,70 @@ def bnt(depth: np.ndarray, step: float = 1.0, name: bytes = b"bs000_N_N_0.png", 
 
 
 BND = "1123\t\t-34.11 20.5 80.25\n1200 -3.0e1 21 81\n0 1 2 3\n"
+
+
+def lzf(data: bytes) -> bytes:
+    """Literal runs, and copies of four bytes before where the data repeat, as liblzf writes them."""
+    out, at = bytearray(), 0
+    while at < len(data):
+        run = 0
+        while at >= 4 and at + run < len(data) and run < 264 and data[at + run] == data[at + run - 4]:
+            run += 1
+        if run >= 3:
+            length = run - 2
+            out += bytes([(min(length, 7) << 5), *([length - 7] if length >= 7 else []), 3])
+            at += run
+        else:
+            part = data[at : at + 4]
+            out += bytes([len(part) - 1]) + part
+            at += len(part)
+    return bytes(out)
+
+
+def pcd(form: str, points: np.ndarray = POINTS, *, width: int | None = None) -> bytes:
+    """As PCL writes points with a colour, a padding of two bytes and a descriptor of three numbers."""
+    n = len(points)
+    row = np.dtype([("x", "<f4"), ("y", "<f4"), ("p", "u1", (2,)), ("z", "<f4"), ("rgb", "<u4"), ("d", "<f8", (3,))])
+    table = np.zeros(n, row)
+    for k, axis in enumerate("xyz"):
+        table[axis] = points[:, k]
+    head = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y _ z rgb d\nSIZE 4 4 1 4 4 8\n"
+        f"TYPE F F U F U F\nCOUNT 1 1 2 1 1 3\nWIDTH {width or n}\nHEIGHT {n // (width or n)}\nVIEWPOINT 0 0 0 1 0 0 "
+        f"0\nPOINTS {n}\nDATA {form}\n"
+    ).encode()
+    if form == "ascii":
+        return head + b"".join(f"{x!r} {y!r} 0 0 {z!r} 4278190080 0 0 0\n".encode() for x, y, z in points.tolist())
+    if form == "binary":
+        return head + table.tobytes()
+    runs = b"".join(np.ascontiguousarray(table[name]).tobytes() for name in row.names or ())
+    packed = lzf(runs)
+    return head + struct.pack("<II", len(packed), len(runs)) + packed
+
+
+def las(points: np.ndarray = POINTS, *, kind: int = 3, minor: int = 2, row: int = 34) -> bytes:
+    """A header and points in steps of a thousandth from an offset, with what else a point has left zero."""
+    n = len(points)
+    size = 375 if minor == 4 else 227
+    head = bytearray(size)
+    head[:4], head[24], head[25] = b"LASF", 1, minor
+    struct.pack_into("<HII", head, 94, size, size + 10, 0)
+    struct.pack_into("<BHI", head, 104, kind, row, 0 if minor == 4 else n)
+    struct.pack_into("<3d3d", head, 131, 0.001, 0.001, 0.001, 100.0, 200.0, 0.0)
+    if minor == 4:
+        struct.pack_into("<Q", head, 247, n)
+    whole = np.rint((points - (100, 200, 0)) / 0.001).astype("<i4")
+    return bytes(head) + bytes(10) + b"".join(xyz.tobytes() + bytes(row - 12) for xyz in whole)
+
+
+# As Slicer 4.10 and 4.13 write fiducials, and as geomorph's writeland.tps writes a specimen.
+FCSV = """# Markups fiducial file version = 4.10
+# CoordinateSystem = 0
+# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
+vtkMRMLMarkupsFiducialNode_0,-10.5,20,3.25,0.000,0.000,0.000,1.000,1,1,0,nose tip,,
+vtkMRMLMarkupsFiducialNode_1,0,-1e2,7,0.000,0.000,0.000,1.000,1,1,0,"left, eye",,vtkMRMLModelNode1
+"""
+TPS = "LM3=3\r\n1.5 2 -3\r\nNA NA NA\r\n4 5 6\r\nIMAGE=a.jpg\r\nID=skull 1\r\nSCALE=1.0\r\n"
 LM3 = "# Landmark file\n\n3 landmarks\nOuter left eyebrow\n-50.5 30.25 1\nNose tip\n0 0 0\nChin middle\n1 -60.0 -2e1\n"
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_made import gltf_tree, ply_header
+from hand_made import gltf_tree, las, ply_header
 
 from shapespace.commands.look import check
 from shapespace.errors import FileError, FileFormatError, ShapespaceError
@@ -111,6 +111,27 @@ def vrml_nested(size: int) -> bytes:
     depth = min(size // 80, 490)
     inside = repeated(b"Coordinate{point[0 0 0]}", size // 2)
     return b"Transform{translation 1 0 0 children " * depth + inside + b"}" * depth
+
+
+def pcd(size: int, data: bytes) -> bytes:
+    n = size // 12
+    head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA binary_compressed\n"
+    return head.encode() + struct.pack("<II", len(data), 12 * n) + data
+
+
+def pcd_runs(size: int) -> bytes:
+    """A zero, and copies of it, three bytes for 264."""
+    count = size // 3
+    made = 12 * (264 * count // 12)
+    last = made - 1 - 264 * (made // 264 - 1)
+    rest, tail = divmod(last, 264)
+    data = b"\0\0" + b"\xe0\xff\0" * (made // 264 - 1 + rest)
+    return pcd(made, data + b"\0\0" * tail)
+
+
+def pcd_ones(size: int) -> bytes:
+    """Two bytes for one."""
+    return pcd(12 * (size // 24), b"\0\0" * 12 * (size // 24))
 
 
 def gltf(**changes: object) -> bytes:
@@ -206,9 +227,20 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "indices.gltf": gltf_indices,
     "json.gltf": lambda size: b'{"a":[' + b"[]," * (size // 3) + b"0]}",
     "chunks.glb": lambda size: struct.pack("<4s2I", b"glTF", 2, 12 + size // 8 * 8) + b"\0\0\0\0ABCD" * (size // 8),
+    "many.xyz": lambda size: repeated(b"0 0 0\n", size),
+    "counts.pts": lambda size: repeated(b"1\n0 0 0\n", size),
+    "runs.pcd": pcd_runs,
+    "ones.pcd": pcd_ones,
+    "many.las": lambda size: las(np.zeros((size // 12, 3)), row=12),
     "many.csv": lambda size: b"".join(b"a%d,0,0,0\n" % k for k in range(size // 14)),
     "many.bnd": lambda size: repeated(b"1 0 0 0\n", size),
     "many.lm3": lambda size: b"%d\n" % (size // 8) + b"a\n0 0 0\n" * (size // 8),
+    "many.fcsv": lambda size: b"".join(b"%d,0,0,0\n" % k for k in range(size // 11)),
+    "heads.fcsv": lambda size: repeated(b"#columns=x,y,z\n", size),
+    "many.tps": lambda size: b"LM3=%d\n" % (size // 6) + b"0 0 0\n" * (size // 6),
+    "many.tlms": lambda size: repeated(b"a 1 0 0 0\n", size),
+    "many.txt": lambda size: repeated(b"0 0 0\n", size),
+    "heads.pts": lambda size: repeated(b"{\n", size),
     "many.pp": lambda size: repeated(b'<point x="0" y="0" z="0"/>', size, b"<PickedPoints>", b"</PickedPoints>"),
     "many.json": lambda size: b"[" + b'{"id":"a","coordinates":[0,0,0]},' * (size // 33) + b"0]",
     "many.mrk.json": lambda size: (
@@ -423,7 +455,7 @@ def test_check_goes_on_after_files_that_cannot_be_read(tmp_path: Path, monkeypat
     monkeypatch.setattr("shapespace.commands.look.read_mesh", short)
     said: list[str] = []
     reports = check([tmp_path], recursive=False, say=said.append)
-    assert [report["usable"] for report in reports] == [True, False, False, False, True]
-    assert all(str(tmp_path) in report["error"] for report in reports[1:4])
-    assert "not enough memory" in reports[3]["error"]
-    assert said == [f"{tmp_path}: 1 compressed file is not taken (e.ply.gz); unpack them with gunzip first."]
+    assert [report["usable"] for report in reports] == [True, False, False, False, False, True]
+    assert all(str(tmp_path) in report["error"] for report in reports[1:5])
+    assert "not enough memory" in reports[3]["error"] and "compressed data" in reports[4]["error"]
+    assert not said

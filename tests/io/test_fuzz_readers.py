@@ -4,6 +4,7 @@
 A new reader needs an entry in `MESHES` or `LANDMARKS`; what was found by a long run belongs into `FOUND`.
 """
 
+import gzip
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hand_made import BND, FACE, LM3, NONE, bnt, gltf_tree, vtk_5_1, vtp
+from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, las, pcd, vtk_5_1, vtp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,6 +30,9 @@ from shapespace.types import Mesh
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is bounded by what Linux tells of a process")
 MINUTES = float(os.environ.get("SHAPESPACE_FUZZ_MINUTES", "0"))
 EXAMPLES = 300
+EXAMPLES_OF_ROWS = 100
+ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".las", ".gz")
+"""Formats of rows of numbers under a short head, where less can go wrong."""
 MOST_MEMORY = 2**29
 MOST_CPU_S = 5.0
 
@@ -104,6 +108,10 @@ MESHES: dict[str, list[bytes]] = {
     ".gltf": [*written(SURFACE, ".gltf"), json.dumps(gltf_tree()).encode(), json.dumps(MORPHED).encode()],
     ".wrl": [FACE.encode(), MOVED.encode(), VRML_1.encode()],
     ".raw": [b"0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1 -0.0\n", b"a\n1 2 3 # c\n4,5,6\n7 8 9\n"],
+    ".xyz": [b"//X Y Z R\n0 0 0 255\n1 0.5 -1e3 0\n", b"2\n1,2,3\n4;5;6\n"],
+    ".pts": [b"3\n1 2 3 -700 1 2 3\n4 5 6 0 0 0 0\n7 8 9 0 0 0 0\n"],
+    ".pcd": [pcd(form) for form in ("ascii", "binary", "binary_compressed")],
+    ".las": [las(), las(minor=4, kind=7, row=36)],
     ".bnt": [bnt(np.where(np.arange(12.0) == 5, NONE, np.arange(12.0)).reshape(3, 4), name=b"a")],
 }
 LANDMARKS: dict[str, list[bytes]] = {
@@ -114,12 +122,18 @@ LANDMARKS: dict[str, list[bytes]] = {
     ".csv": [*marked(".csv"), b'# c\na,1,2,3\n"b, c",4,5,6\n'],
     ".bnd": [BND.encode()],
     ".lm3": [LM3.encode()],
+    ".fcsv": [*marked(".fcsv"), FCSV.encode()],
+    ".tps": [TPS.encode()],
+    ".tlms": [b"nose 1 1.5 -2 3\nchin 0 0 0 0\near_left 1 1e3 0 2\n"],
+    ".txt": [b"# c\nname x y z\nnose 1 2 3\nchin 4,5,6\n", b"1 2 3\n4 5 6\n"],
+    ".pts": [b"Version 1.0\n2\nS000 1 2 3\nS001 4 5 6\n", b"version: 1\nn_points: 1\n{\n0.5 1 2\n}\n"],
 }
 NO_DATA = gltf_tree(accessors=[{"componentType": 5126, "count": 5 * 10**7, "type": "VEC3"}])
 LONG_LABEL = {"landmarks": {"points": [[0, 1, 2]] * 9}, "labels": [{"label": "a" * 10**6, "mask": [*range(9)]}]}
 FOUND: list[tuple[str, bytes]] = [
     (".gltf", json.dumps(NO_DATA).encode()),
     (".ljson", json.dumps({"version": 2, **LONG_LABEL}).encode()),
+    (".gltf", json.dumps(gltf_tree(buffers=[{"byteLength": 42, "uri": "dat`:" + "a" * 5000}])).encode()),
 ]
 
 NUMBERS = [
@@ -214,7 +228,7 @@ def fuzz(read: Callable[[Path], object], path: Path, samples: list[bytes]) -> No
     readers = len(MESHES) + len(LANDMARKS) + 1
 
     @settings(
-        max_examples=EXAMPLES,
+        max_examples=EXAMPLES_OF_ROWS if path.suffix in ROWS else EXAMPLES,
         deadline=None,
         suppress_health_check=list(HealthCheck),
         derandomize=not MINUTES,
@@ -240,6 +254,10 @@ def test_a_damaged_mesh_file_is_a_mesh_or_one_sentence(ending: str, tmp_path: Pa
     fuzz(read_mesh, tmp_path / f"bad{ending}", MESHES[ending])
 
 
+def test_a_damaged_packed_file_is_a_mesh_or_one_sentence(tmp_path: Path) -> None:
+    fuzz(read_mesh, tmp_path / "bad.xyz.gz", [gzip.compress(data, mtime=0) for data in MESHES[".xyz"]])
+
+
 @pytest.mark.parametrize("ending", LANDMARKS)
 def test_a_damaged_landmark_file_is_landmarks_or_one_sentence(ending: str, tmp_path: Path) -> None:
     fuzz(read_landmarks, tmp_path / f"bad{ending}", LANDMARKS[ending])
@@ -254,12 +272,15 @@ def test_every_reader_has_a_fuzzer() -> None:
     assert set(LANDMARKS) == {*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS}
 
 
-@pytest.mark.parametrize("ending", [*MESHES, *LANDMARKS])
-def test_what_is_damaged_was_whole(ending: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("read", "ending"),
+    [*((read_mesh, ending) for ending in MESHES), *((read_landmarks, ending) for ending in LANDMARKS)],
+)
+def test_what_is_damaged_was_whole(read: Callable[[Path], object], ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"good{ending}"
-    for data in MESHES.get(ending, LANDMARKS.get(ending, [])):
+    for data in (MESHES if read is read_mesh else LANDMARKS)[ending]:
         path.write_bytes(data)
-        assert read_mesh(path) if ending in MESHES else read_landmarks(path)
+        assert read(path)
 
 
 @pytest.mark.parametrize("which", range(len(FOUND)))

@@ -174,7 +174,7 @@ def test_csv_with_and_without_header(write, text: str):
             "not there",
         ),
         ("a.ljson", '{"version": 2, "landmarks": {"points": [[1, 2]]}}', "2 coordinates"),
-        ("a.txt", "a,1,2,3\n", "not a landmark format"),
+        ("a.doc", "a,1,2,3\n", "not a landmark format"),
     ],
 )
 def test_malformed_landmarks_are_refused(write, name: str, text: str, why: str):

@@ -543,7 +543,7 @@ def test_a_ply_list_of_absurd_length_is_refused(write):
         read_mesh(write("a.ply", header + bytes(12) + b"\xff\xff\xff\xff" + bytes(8)))
 
 
-@pytest.mark.parametrize("name", ["scan.jpg", "scan", "scan.ply.gz"])
+@pytest.mark.parametrize("name", ["scan.jpg", "scan", "scan.jpg.gz"])
 def test_an_unknown_ending_is_refused_with_the_known_ones(name: str, tmp_path: Path, tetrahedron: Mesh):
     for act in (read_mesh, lambda path: write_mesh(path, tetrahedron)):
         with pytest.raises(FileFormatError, match=r"\.ply, \.obj") as caught:

@@ -173,7 +173,7 @@ def test_movements_of_vrml_1_are_refused_by_name(write, node: str):
         ("+1 0,", "+1 zero,", "text where a number"),
         ("coord Coordinate {", "other Stuff {", "has no points"),
         ("coordIndex", "] coordIndex", "brackets do not match"),
-        ("#VRML", "\x1f\x8b", "gunzip"),
+        ("#VRML", "\x1f\x8b", "compressed data"),
         ("Shape {", "Shape { " + "Group { children [ " * 600, "nested"),
         ("Shape {", "Transform { scale 2 } Shape {", "too few numbers"),
     ],

@@ -23,14 +23,16 @@ from shapespace.batch.results import (
     write_stages,
 )
 from shapespace.errors import FileError, ShapespaceError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit import OPTIONS, FitConfig, fit_scan
 from shapespace.fit.state import IcpState
-from shapespace.io.files import sha256_of_file, write_together
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
+from shapespace.io.files import sha256_of_file, write_text, write_together
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.meshes import read_mesh
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.results import wrote_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -117,7 +119,7 @@ def fit_file(
             landmarks = read_landmarks(job.landmarks)
         result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
     except (MemoryError, ShapespaceError) as error:
-        short = f"{job.called}: not enough memory to fit it; thin the scan first."
+        short = f"{job.called}: not enough memory to fit it; crop it (--crop), or thin it first, as by MeshLab."
         reason = short if isinstance(error, MemoryError) else naming(job.called, str(error))
         failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
         return _write_failed(failed, job, folder)
@@ -128,15 +130,17 @@ def fit_file(
         writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
     if stages:
         writes[files.stages] = partial(write_stages, result=result, model=model)
+    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
+    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
     writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not config.dense, stages=not stages))
+    write_together(writes, files.stale(dense=not config.dense, stages=not stages, landmarks=not texts))
     return record
 
 
 def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
     files = _Files.of(job, folder)
     # An earlier run's surface would contradict the record.
-    stale = [files.fitted, *files.stale(dense=True, stages=True)]
+    stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
     write_together({files.record: partial(write_record, record=record)}, stale)
     return record
 
@@ -149,16 +153,20 @@ class _Files:
     fitted: Path
     dense: Path
     stages: Path
+    landmarks: Mapping[str, Path]
 
     @staticmethod
     def of(job: Job, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        return _Files(*(folder / f"{job.name}{ending}" for ending in endings))
+        landmarks = {ending: folder / f"{job.name}{ending}" for ending in FIDUCIAL_ENDINGS}
+        record, fitted, dense, stages = (folder / f"{job.name}{ending}" for ending in endings)
+        return _Files(record, fitted, dense, stages, landmarks)
 
-    def stale(self, *, dense: bool, stages: bool) -> list[Path]:
+    def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
         """Return what an earlier fit may have left that this one does not write."""
-        # Without a record it is no result of ours, but perhaps a scan.
+        # Without a record they are no results of ours, but perhaps a scan and the landmarks that somebody placed.
         left = [self.dense] if dense and self.record.is_file() else []
+        left += self.landmarks.values() if landmarks and wrote_landmarks(self.record) else ()
         return [*left, self.stages] if stages else left
 
 
@@ -293,7 +301,7 @@ def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Pa
     return bool(
         record["model"]["hash"] == model_hash
         and record.get("landmarks") == marks
-        and all(record["config"].get(key) == value for key, value in settings.items())
+        and all(record["config"].get(key) == settings.get(key) for key in {*settings, *OPTIONS})
         and is_same_scan(record["scan"], job, folder)
     )
 

@@ -17,6 +17,7 @@ from shapespace.batch.results import Source, coefficient_row, read_record, write
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.json_files import LARGEST_BYTES, check_file
+from shapespace.io.meshes import stem_of
 from shapespace.schemas import FIT_AGAIN, File
 from shapespace.store.results import results_at
 
@@ -81,15 +82,17 @@ def names_for(
     for scan, key in keys.items():
         if key not in names:
             groups.setdefault(_stem(scan).casefold(), {})[key] = scan
+    used = {name.casefold() for name in (*taken, *names.values())}
     # Names that stand alone come first, so that none is taken from its owner.
     for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
-        used = {name.casefold() for name in (*taken, *names.values())}
         (key, scan), *others = group.items()
         stem = _stem(scan)
         if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
-            names[key] = stem
+            found = {key: stem}
         else:
-            names |= _told_apart(group, used)
+            found = _told_apart(group, used)
+        names |= found
+        used |= {name.casefold() for name in found.values()}
     return [names[keys[scan]] for scan in scans]
 
 
@@ -122,7 +125,7 @@ def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
 
 
 def _stem(scan: Path) -> str:
-    return _shortened(scan.stem or scan.name)
+    return _shortened(stem_of(scan) or scan.name)
 
 
 def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, folder: Path | None) -> bool:
@@ -139,7 +142,7 @@ def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, fold
 
 def _told_apart(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]:
     folders = {key: scan.parent.resolve().parts[1:] for key, scan in group.items()}
-    ends = {key: scan.stem or scan.name for key, scan in group.items()}
+    ends = {key: stem_of(scan) or scan.name for key, scan in group.items()}
     if len({(folders[key], end) for key, end in ends.items()}) < len(group):
         ends = {key: scan.name for key, scan in group.items()}
     for depth in range(1, 1 + max(map(len, folders.values()))):
@@ -149,7 +152,7 @@ def _told_apart(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]
         if short and max(counts.values()) == 1 and not counts.keys() & used:
             return names
     return {
-        key: f"{_shortened(scan.stem, 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
+        key: f"{_shortened(stem_of(scan), 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
         for key, scan in group.items()
     }
 

@@ -127,10 +127,10 @@ def _holds(there: _Stored, job: Job, model: ShapeModel, config: FitConfig, folde
     """Return whether a stored fit is what is asked for, or more: a dense surface, or stages."""
     if there.status == "failed" or not there.identity or (stages and not there.stages):
         return False
-    marks = sha256_of_file(job.landmarks) if job.landmarks else ""
     asked = [config] if config.dense else [config, replace(config, dense=True)]
-    identities = {fit_identity(there.scan["hash"] or "", model.content_hash, one.as_dict(), marks) for one in asked}
     try:
+        marks = sha256_of_file(job.landmarks) if job.landmarks else ""
+        identities = {fit_identity(there.scan["hash"] or "", model.content_hash, one.as_dict(), marks) for one in asked}
         return there.identity in identities and is_same_scan(there.scan, job, folder)
     except FileError:
         return False  # the fit says why

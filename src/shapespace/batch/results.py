@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ import numpy as np
 from shapespace.errors import FileFormatError
 from shapespace.fit.result import FitResult
 from shapespace.fit.stages import stage_arrays
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.surface import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
 from shapespace.io.ply import ply_comment, write_ply
 from shapespace.io.tables import checked_table_text
@@ -28,6 +29,16 @@ from shapespace.version import __version__
 
 RECORD_FORMAT, RECORD_VERSION = FitRecord.FORMAT, FitRecord.VERSION
 _LARGEST_RECORD = 2**24
+
+
+@lru_cache(maxsize=1024)
+def _resolved_folder(folder: Path) -> Path:
+    return folder.resolve()
+
+
+def _resolved(file: Path) -> Path:
+    """Return the real path of `file`; its folder's is found once, since that takes longest of what is known of it."""
+    return file.resolve() if file.is_symlink() else _resolved_folder(file.parent.absolute()) / file.name
 
 
 @dataclass(frozen=True)
@@ -54,7 +65,7 @@ class Source:
     def at(file: Path, content_hash: str, folder: Path) -> Source:
         """Return the source `file` as results in `folder` refer to it."""
         try:
-            path = os.path.relpath(file.resolve(), folder.resolve())
+            path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
         except (ValueError, OSError):  # another drive, or a folder that is gone
             path = str(file)
         return Source(file.name, content_hash, Path(path).as_posix())
@@ -128,13 +139,14 @@ def fit_record(
             "translation": T.translation.tolist(),
         },
         "mm_per_scan_unit": result.mm_per_scan_unit,
-        "size_mm": rms_size(result.surface().vertices) * result.mm_per_scan_unit,
+        **_size(result),
         "b": result.b.tolist(),
         "z": result.z.tolist(),
         "b_stddev": result.b_stddev.tolist(),
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
+        **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [
             {
@@ -149,6 +161,31 @@ def fit_record(
         "iterations": result.iterations,
         "seconds": dict(result.seconds),
         "version": __version__,
+    }
+
+
+def _size(result: FitResult) -> dict[str, Any]:
+    """Return how large the fitted surface is, in mm of the scan: RMS, centroid size, extents, area."""
+    surface = result.surface()
+    x = (surface.vertices - surface.vertices.mean(axis=0)) * result.mm_per_scan_unit
+    axes = np.linalg.svd(x, full_matrices=False)[2]
+    size_mm = rms_size(surface.vertices) * result.mm_per_scan_unit
+    area = {} if surface.faces is None else {"area_mm2": float(face_areas(surface).sum()) * result.mm_per_scan_unit**2}
+    return {
+        "size_mm": size_mm,
+        "n_vertices": len(x),
+        "centroid_size_mm": size_mm * float(np.sqrt(len(x))),
+        "extents_mm": np.sort(np.ptp(x @ axes.T, axis=0))[::-1].tolist(),
+        **area,
+    }
+
+
+def found_landmarks(result: FitResult) -> dict[str, dict[str, list[float] | None]]:
+    """Return what a record says of the model's landmarks on the fitted surface; nothing where the model has none."""
+    stddev_mm = result.landmark_stddev_mm or {}
+    return {
+        name: {"at": point.tolist(), "stddev_mm": stddev_mm[name].tolist() if name in stddev_mm else None}
+        for name, point in result.landmarks.items()
     }
 
 

@@ -16,6 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.files import atomic_path, make_folder, remove_file, sha256_of_file, sweep, write_error
 from shapespace.io.tables import CHECKSUM
 from shapespace.schemas import FitRecord
@@ -186,7 +187,8 @@ class Store:
 
     def _remove_singles(self, name: str) -> None:
         # The record goes last: what lies beside it is never without it.
-        for ending in (*ENDINGS.values(), ENDING):
+        landmarks = FIDUCIAL_ENDINGS if reading.wrote_landmarks(self.folder / f"{name}{ENDING}") else ()
+        for ending in (*ENDINGS.values(), *landmarks, ENDING):
             remove_file(self.folder / f"{name}{ending}")
 
     def _read(self, name: str, there: frozenset[str]) -> _Result:
@@ -383,7 +385,7 @@ def _ordered(columns: set[str]) -> list[str]:
 
 def _natural(column: str) -> tuple[str, int, str]:
     """Return a key that sorts b2 before b10."""
-    letter, number = column[:1], column[1:].removesuffix("_stddev")
+    letter, number = column[:1], column[1:].removesuffix("_stddev").removesuffix("_rms_mm")
     return (f"{letter}{column.removeprefix(letter + number)}", int(number), "") if number.isdigit() else (column, 0, "")
 
 

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 
+from shapespace.batch.workers import is_first_to_say
 from shapespace.compiled import on_compiling
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
@@ -22,8 +23,9 @@ COMPILING = "shapespace: compiling, once on this machine; this takes a while ...
 
 
 def tell_compiling() -> None:
-    """Say on standard error why the user waits."""
-    print(COMPILING, file=sys.stderr, flush=True)
+    """Say on standard error why the user waits, unless another process of the same command has said so."""
+    if is_first_to_say():
+        print(COMPILING, file=sys.stderr, flush=True)
 
 
 def warm_up(*, tell: bool) -> None:

@@ -91,6 +91,8 @@ def _add_data(commands: Any) -> None:
                        help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
     faces.add_argument("--wide", action="store_true",
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
+    faces.add_argument("--intensity", type=_intensities, default=(1.0, 1.0), metavar="LOW[-HIGH]",
+                       help="of the bundled expressions, drawn between the two (default 1: full)")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
     organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
                   "shapespace data organs -o organs --count 40")  # fmt: skip
@@ -130,7 +132,7 @@ def _add_correspond(commands: Any) -> None:
                "shapespace correspond scans -o same\n"
                "         shapespace build same -o model.h5")  # fmt: skip
     sub.add_argument("scans", nargs="+", metavar="SCAN",
-                     help="scans of one kind of object, folders, patterns, or lists (.csv, .txt) of these")  # fmt: skip
+                     help="scans of one kind of object, folders, patterns, addresses or lists (.csv)")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
@@ -187,6 +189,8 @@ def _add_build(commands: Any) -> None:
     sub.add_argument("--unit", choices=_UNITS[1:], default="mm", help="of the meshes (default mm)")
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
                      help="CSV of name,vertex, or points on the first mesh")  # fmt: skip
+    sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
+                     help="a part of the surface to hold fits to: a CSV file of vertices; can be repeated")  # fmt: skip
     sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
     sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
@@ -215,6 +219,7 @@ def _add_quality(commands: Any) -> None:
                      default=["vertices"], help="as of build; two are compared")  # fmt: skip
     sub.add_argument("--control-points", type=_control_points, metavar="MxN", help="of a B-spline (default 24x24)")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="of folds and samples")
+    _add_where(sub, "folds")
     sub.set_defaults(run=run.quality)
 
 
@@ -250,7 +255,17 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
                      help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
     sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
-    sub.add_argument("--landmarks", type=Path, metavar="FILE", help="to start from, named as in the model")
+    sub.add_argument("--landmarks", type=Path, metavar="FILE|DIR",
+                     help="to start from and be held to, named as in the model: of one scan, or a folder with a file "
+                          "for each, named as it; or the column landmarks of a list of scans")  # fmt: skip
+    sub.add_argument("--landmark-sd", type=_stddev, metavar="MM",
+                     help="their standard deviation (default: 3 %% of the model's size); inf: none")  # fmt: skip
+    sub.add_argument("--crop", default="", metavar="KIND:NUMBERS",
+                     help="fit what lies in sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z (the scan's frame and unit), or within "
+                          "so many mm of the landmarks, landmarks:MM")  # fmt: skip
+    sub.add_argument("--region", metavar="NAME|FILE.csv",
+                     help="hold fit, distances and verdict to a part of the model: a region that it has by name, or a "
+                          "CSV file of its vertices")  # fmt: skip
     _add_where(sub, "scans")
     results = sub.add_mutually_exclusive_group()
     results.add_argument("--again", action="store_true", help="fit also scans whose results of earlier runs still hold")
@@ -313,6 +328,8 @@ def _add_convert(commands: Any) -> None:
     sub.add_argument("output", type=Path, metavar="OUT", help="its ending tells the format; .h5 is shapespace's own")
     sub.add_argument("--to", metavar="FORMAT", help="the format by its name, where the ending does not tell it")
     sub.add_argument("--unit", choices=("um", "mm", "cm", "inch", "m"), help="of IN, where its format does not say")
+    sub.add_argument("--expressions", type=Path, metavar="FILE.bin",
+                     help="blendshapes that eos keeps in a file of their own")  # fmt: skip
     sub.set_defaults(run=run.convert)
 
 
@@ -453,6 +470,28 @@ def _control_points(text: str) -> tuple[int, int]:
     if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
         raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
     return int(counts[0]), int(counts[1])
+
+
+def _intensities(text: str) -> tuple[float, float]:
+    low, dash, high = text.partition("-")
+    return _share(low), _share(high if dash else low)
+
+
+def _named_file(text: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not (name.strip() and equals and file):
+        raise argparse.ArgumentTypeError(f"must be NAME=FILE, not {text!r}")
+    return name.strip(), Path(file)
+
+
+def _stddev(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
+    return value
 
 
 def _smoothing(text: str) -> float:

@@ -97,6 +97,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         quiet=arguments.quiet,
         raw=arguments.raw,
         wide=arguments.wide,
+        intensity=arguments.intensity,
     )
     if arguments.json:
         show_json({"folder": str(arguments.output), "faces": count})
@@ -254,6 +255,7 @@ def build(arguments: argparse.Namespace) -> int:
         add=arguments.add,
         recursive=arguments.recursive,
         with_doubtful=arguments.with_doubtful,
+        regions=dict(arguments.region),
     )
     if settings.streams:
         arguments.goes_on = "; the same command goes on from there"
@@ -289,7 +291,7 @@ def quality(arguments: argparse.Namespace) -> int:
         control_points=arguments.control_points,
     )
     options = QualityOptions(settings, arguments.representation, arguments.scans, arguments.unseen)
-    found, notes = quality(arguments.targets, arguments.output, options, quiet=arguments.quiet)
+    found, notes = quality(arguments.targets, arguments.output, options, _where(arguments), quiet=arguments.quiet)
     for note in notes:
         say(note)
     if arguments.json:
@@ -360,6 +362,9 @@ def fit(arguments: argparse.Namespace) -> int:
         max_iterations=arguments.max_iterations,
         seed=arguments.seed,
         dense=arguments.dense,
+        landmark_stddev_mm=arguments.landmark_sd,
+        crop=arguments.crop,
+        region=_region(arguments.region),
     )
     settings = BatchSettings(
         config,
@@ -382,6 +387,14 @@ def fit(arguments: argparse.Namespace) -> int:
     if counts["failed"] == every:
         return 2
     return 1 if counts["failed"] or (arguments.strict and counts["doubtful"]) else 0
+
+
+def _region(region: str | None) -> str | tuple[int, ...] | None:
+    if region is None or not Path(region).is_file():
+        return region
+    from shapespace.io.regions import read_region
+
+    return read_region(region)
 
 
 def _where(arguments: argparse.Namespace) -> Where:
@@ -536,7 +549,9 @@ def convert(arguments: argparse.Namespace) -> int:
     from shapespace.types import MM_PER_UNIT
 
     mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
-    source, target, notes = convert(arguments.source, arguments.output, to=arguments.to, mm=mm)
+    source, target, notes = convert(
+        arguments.source, arguments.output, to=arguments.to, mm=mm, expressions=arguments.expressions
+    )
     if arguments.json:
         show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})
     else:
@@ -578,9 +593,11 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
 
 
 def _print_fit(name: str, record: Mapping[str, Any]) -> None:
+    from shapespace.io.meshes import stem_of
+
     file = str(record["scan"]["name"])
     # A scan that shares its file's name with others goes by the name of its results.
-    called = file if Path(file).stem == name else f"{name} ({file})"
+    called = file if stem_of(file) == name else f"{name} ({file})"
     told = _distances(record, "shown")
     show(f"{called}: {record['status']}" + (f"; {told}" if told else ""))
     if told := _distances(record, "shown_dense", measure="median"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -21,10 +21,11 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
+from shapespace.io.regions import read_region
 from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
-from shapespace.model.shape_model import ShapeModel
+from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.scans import NEUTRAL
 from shapespace.store.results import is_result, mesh_at
@@ -55,6 +56,7 @@ class BuildSettings:
         control_points: of a B-spline.
         min_seen: share of the meshes that must show a vertex of a model of vertices; None for a half.
         landmarks: a file of vertices, or of points on the first mesh; None looks for them.
+        regions: name -> file with its vertices of the meshes, kept in the model for fits that are held to one.
         labels: a table of subjects and expressions, for a model that parts both; None for a plain one.
         expression_variance: with `labels`, the share that the modes of expression hold.
         provenance: what the meshes are.
@@ -88,6 +90,7 @@ class BuildSettings:
     add: Path | None = None
     recursive: bool = False
     with_doubtful: bool = False
+    regions: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
     def __post_init__(self) -> None:
         representation_named(self.representation, self.control_points)
@@ -112,6 +115,11 @@ class BuildSettings:
             raise InputError(
                 "--add takes gauge, alignment and landmarks from the model; leave --gauge, --no-align and --landmarks "
                 "out."
+            )
+
+        if self.regions and (self.keep_shapes or self.add is not None):
+            raise InputError(
+                "--region cannot go with --keep-shapes or --add; leave it out, and give fit a file instead."
             )
 
     @property
@@ -157,6 +165,9 @@ def build(
     if found.unit_ratios:
         notes.append(found.told_units(settings.unit))
     marks = {} if parent is not None else _landmarks(files, records, first, settings, notes)
+    regions = {
+        name: region_vertices(read_region(file), len(first.vertices), name) for name, file in settings.regions.items()
+    }
     settings = _with_origin(files, settings, notes)
     count = len(files) + (0 if parent is None else parent.n_training)
     if settings.modes == "auto" and count < 4:
@@ -166,11 +177,15 @@ def build(
         notes.append(f"The number of modes is chosen by {MOST_SHAPES} of the {count} shapes, drawn by --seed.")
     if not isinstance(loaded, list):
         model = _streamed(on_disk, output, settings, gauge, marks, parent, notes, quiet=quiet)
+        if regions:
+            model = replace(model, regions=regions)
+            model.save(output)
         return model, notes + _told(model, settings)
     notes += _missing(loaded, marks, settings)
     with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
         if settings.labels is not None:
             additive = _additive(files, loaded, settings.labels, settings, gauge, marks)
+            additive = replace(additive, shape=replace(additive.shape, regions=regions))
             additive.save(output)
             notes.append(
                 f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
@@ -191,6 +206,9 @@ def build(
             licence=settings.licence,
             seed=settings.seed,
         )
+        if regions:
+            kept = Kept.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
+            model = replace(model, regions=regions if kept is None else kept.regions(regions))
         model.save(output)
     return model, notes + _told(model, settings)
 

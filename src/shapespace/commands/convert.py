@@ -14,7 +14,9 @@ from shapespace.model.shape_model import ShapeModel
 OWN = ("shapespace", OWN_ENDINGS)
 
 
-def convert(source: Path, output: Path, *, to: str | None, mm: float | None) -> tuple[str, str, list[str]]:
+def convert(
+    source: Path, output: Path, *, to: str | None, mm: float | None, expressions: Path | None = None
+) -> tuple[str, str, list[str]]:
     """Write the model in `source` to `output`; return the formats of both, and sentences on what became of it.
 
     Args:
@@ -22,6 +24,7 @@ def convert(source: Path, output: Path, *, to: str | None, mm: float | None) -> 
         output: its name tells the format, where `to` does not.
         to: a format by its name, or None.
         mm: how many mm one unit of `source` is, where its format does not say; None for what the format says, or 1.
+        expressions: a file of blendshapes of eos that belong to `source`, or None.
 
     Raises:
         FileError: `source` cannot be read, or `output` not written.
@@ -30,15 +33,15 @@ def convert(source: Path, output: Path, *, to: str | None, mm: float | None) -> 
     target = _target(output, to)
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the model itself; give another name to write to.")
-    model, of, notes = _load(source, mm)
+    model, of, notes = _load(source, mm, expressions)
+    linear = model.as_linear()
     if target is None:
         model.save(output)
-        return of, OWN[0], notes
-    linear = model.as_linear()
-    notes += target.write(linear, output)
+    else:
+        notes += target.write(linear, output)
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
-        notes.append(f"The licence goes along: {linear.licence}")
-    return of, target.title, notes
+        notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
+    return of, OWN[0] if target is None else target.title, notes
 
 
 def formats() -> list[dict[str, str]]:
@@ -48,21 +51,26 @@ def formats() -> list[dict[str, str]]:
 
 
 def _target(output: Path, to: str | None) -> Format | None:
-    if to == OWN[0] or (to is None and output.suffix.lower() in OWN[1]):
+    named = any(output.name.lower().endswith(tuple(one.suffixes)) for one in FORMATS)
+    if to == OWN[0] or (to is None and not named and output.suffix.lower() in OWN[1]):
         return None
     return format_to_write(output, to)
 
 
-def _load(source: Path, mm: float | None) -> tuple[ShapeModel | AdditiveModel, str, list[str]]:
+def _load(
+    source: Path, mm: float | None, expressions: Path | None
+) -> tuple[ShapeModel | AdditiveModel, str, list[str]]:
     if not is_foreign(source):
         if mm is not None:
             raise InputError(f"{source} is in mm, as all models of shapespace; leave --unit out.")
+        if expressions is not None:
+            raise InputError(f"{source} is a model of shapespace; --expressions goes with the models of eos.")
         shape = ShapeModel.load(source)
         try:
             return AdditiveModel.load(source), OWN[0], []
         except ModelFileError:
             return shape, OWN[0], []
-    foreign = load_foreign(source, mm)
+    foreign = load_foreign(source, mm, expressions)
     shape = ShapeModel.of_foreign(foreign, source)
     notes = list[str](foreign.notes)
     if foreign.rotation is None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
 
+from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
@@ -18,7 +19,7 @@ from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.batch.where import Where
 from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.commands.inputs import files_of
+from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
@@ -59,7 +60,7 @@ class CorrespondFiles:
     """What is brought into correspondence, and how.
 
     Args:
-        scans: files, folders, patterns and lists of these.
+        scans: files, folders, patterns, addresses and lists of these.
         template: a mesh to begin with, or None.
         model: to begin with, or None.
         landmarks: a folder of files that are named as the scans, or None.
@@ -91,22 +92,29 @@ def correspond_files(
         FileError: the results cannot be written.
         InputError: fewer than two scans, or too few that can be reached.
     """
-    found = list(dict.fromkeys(files_of(files.scans, folder, recursive=files.recursive, say=say)))
-    paths = [path for path in found if not path.name.endswith(SURFACE)]
-    if len(paths) < len(found):
-        say(f"{len(found) - len(paths)} surfaces of an earlier correspondence are not taken for scans.")
+    given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
+    found = list({one.place: one for one in given}.values())
+    scans = [one for one in found if not one.path.name.endswith(SURFACE)]
+    if len(scans) < len(found):
+        say(f"{len(found) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
     make_folder(folder)
     with only_writer(folder):
-        return _corresponding(paths, files, folder, settings, quiet=quiet, say=say)
+        return _corresponding(_jobs(scans), files, folder, settings, quiet=quiet, say=say)
+
+
+def _jobs(given: Sequence[Given]) -> list[Job]:
+    paths = [one.path for one in given]
+    names = names_for(paths, None, {one.path: one.address for one in given if one.address})
+    return with_ids([Job(n, one.path, address=one.address) for n, one in zip(names, given, strict=True)], given)
 
 
 def _corresponding(
-    paths: Sequence[Path], files: CorrespondFiles, folder: Path, settings: CorrespondSettings, *, quiet: bool, say: _Say
+    jobs: Sequence[Job], files: CorrespondFiles, folder: Path, settings: CorrespondSettings, *, quiet: bool, say: _Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    names = names_for(paths, None)
     marks = LandmarkFiles.of(files.landmarks)
-    marks.refuse_shared(paths)
-    scans, unread, notes = _read_all(paths, names, marks, quiet=quiet)
+    marks.refuse_shared([job.scan for job in jobs])
+    read = _read_all(jobs, marks, quiet=quiet)
+    scans, notes = read.scans, read.notes
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     marks.tell(say)
     if template is not None:
@@ -121,7 +129,7 @@ def _corresponding(
     given = template.name if template is not None else "" if model is None else "The model's mean"
     if not given or made.moved[0] < _ANOTHER_SHAPE:
         _note_other_objects(made, notes)
-    records = _records(made, scans, notes, names, paths, unread, folder)
+    records = _records(made, read, jobs, folder)
     _tell(records, made, given, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
@@ -158,23 +166,32 @@ class _Rounds:
             return list(KeptRounds(self._folder, self._where, self._quiet, one_more)(bench, tasks))
 
 
-def _read_all(
-    paths: Sequence[Path], names: Sequence[str], marks: LandmarkFiles, *, quiet: bool
-) -> tuple[dict[str, Mesh], dict[str, str], dict[str, list[str]]]:
-    """Return the scans by name, why others cannot be read, and what is to be known of each scan."""
-    scans: dict[str, Mesh] = {}
-    unread: dict[str, str] = {}
-    notes: dict[str, list[str]] = {}
-    with progress(len(paths), "reading", "scan", quiet=quiet) as bar:
-        for path, name in zip(paths, names, strict=True):
+@dataclass(frozen=True)
+class _Read:
+    """By the names of the scans: what they hold, what is to be known of them, their hashes, and why others are not."""
+
+    scans: dict[str, Mesh] = field(default_factory=dict[str, Mesh])
+    notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    hashes: dict[str, str] = field(default_factory=dict[str, str])
+    unread: dict[str, str] = field(default_factory=dict[str, str])
+
+
+def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Read:
+    read = _Read()
+    with progress(len(jobs), "reading", "scan", quiet=quiet) as bar:
+        for job in jobs:
             try:
-                mesh = marks.onto(read_mesh(path), path)
+                with job.readable() as file:
+                    mesh, content_hash = read_mesh(file), sha256_of_file(file)
+                mesh = marks.onto(mesh, job.scan)
             except ShapespaceError as error:
-                unread[name] = f"broken: {error}"
+                read.unread[job.name] = f"broken: {error}"
             else:
-                scans[name], notes[name] = _looked_at(Mesh(mesh.vertices, mesh.faces, mesh.landmarks, name))
+                own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
+                read.scans[job.name], read.notes[job.name] = _looked_at(own)
+                read.hashes[job.name] = content_hash
             bar.update()
-    return scans, unread, notes
+    return read
 
 
 def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
@@ -242,23 +259,22 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
 
 def _records(
     made: Correspondence,
-    read: Mapping[str, Mesh],
-    notes: dict[str, list[str]],
-    names: Sequence[str],
-    paths: Sequence[Path],
-    unread: dict[str, str],
+    read: _Read,
+    jobs: Sequence[Job],
     folder: Path,
 ) -> list[CorrespondRecord]:
     came = {scan.name: scan for scan in made.scans}
     scaled = {scan.name: scan.T_scan_template.scale for scan in made.scans if scan.T_scan_template is not None}
     sizes = dict(zip(scaled, zip(*unit_ratios(list(scaled.values())), strict=True), strict=True))
     records: list[CorrespondRecord] = []
-    for name, path in zip(names, paths, strict=True):
-        source = Source.at(path, sha256_of_file(path) if name in came else "", folder)
-        one = came.get(name)
-        record = _record(name, source, one, unread.get(name, ""), notes.get(name, []))
+    for job in jobs:
+        name, one = job.name, came.get(job.name)
+        source = replace(job.source(folder), content_hash=read.hashes.get(name, ""))
+        record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
+        record = structs.replace(record, metadata=dict(job.metadata))
         if one is not None and one.vertices is not None:
-            record = _judged(record, Mesh(one.vertices, made.template.faces, name=name), made.template, read[name])
+            surface = Mesh(one.vertices, made.template.faces, name=name)
+            record = _judged(record, surface, made.template, read.scans[name])
         if name in sizes:
             scale, ratio = map(float, sizes[name])
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]

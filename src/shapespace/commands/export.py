@@ -8,7 +8,8 @@ from typing import Any
 
 from shapespace.batch.progress import progress
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error
+from shapespace.io.fiducials import fiducial_texts
+from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import CHECKSUM, write_checked
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
@@ -27,7 +28,7 @@ def export(
 ) -> tuple[list[str], list[str]]:
     """Write fits of a folder as the single files that `fit` writes; return the names written, and those that failed.
 
-    Records are the same to the byte, surfaces to a 16-millionth of their half extent (float32).
+    Records and landmarks are the same to the byte, surfaces to a 16-millionth of their half extent (float32).
 
     Args:
         folder: that `shapespace fit` wrote, with a store or without.
@@ -79,6 +80,11 @@ def _write(results: Results, name: str, output: Path) -> None:
             write_bytes(path, results.stages(name))
         else:
             write_mesh(path, results.surface(name, kind))
+    record = results.record(name)
+    # No table of a store has the landmarks in columns; the record has them, and their files are made of it again.
+    if found := record.get("found_landmarks"):
+        for ending, text in fiducial_texts(found).items():
+            write_text(output / f"{name}{ending}", text)
     write_bytes(output / f"{name}{ENDING}", results.record_bytes(name))
 
 

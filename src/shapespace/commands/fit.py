@@ -15,17 +15,18 @@ from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.batch.where import Where
-from shapespace.commands.inputs import Given, given_scans
+from shapespace.commands.inputs import Given, given_scans, with_ids
+from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.files import make_folder, remove_file, write_bytes
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.manifest import read_manifest
 
 _SURFACES = (".fitted.ply", ".dense.ply")
-_ROOT = "/"
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class BatchSettings:
 
     Args:
         config: settings of each fit.
-        landmarks: of the one scan there is, or None.
+        landmarks: a file of the one scan there is, or a folder with a file for each, named as the scans; None where
+            there are none, or a list of scans names them.
         where: they are fitted.
         again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
@@ -74,16 +76,16 @@ def fit_scans(
 
     Raises:
         FileError: the model cannot be read, or the results not written.
-        InputError: landmarks for more than one scan, or no scans.
+        InputError: one file of landmarks for more than one scan, landmarks of no scan, or no scans.
     """
     given = _scans(scans, folder, recursive=settings.recursive, say=say)
-    if settings.landmarks is not None and len(given) > 1:
-        raise InputError("--landmarks belongs to one scan, but several were given; fit them one at a time.")
+    one, many = _landmarks(settings.landmarks, len(given))
     model = ShapeModel.load(model_path)
     make_folder(folder)
     write_bytes(folder / ".writable", b"")
     remove_file(folder / ".writable")
-    work = list({job.name: job for job in _jobs(given, settings.landmarks, folder)}.values())
+    work = list({job.name: job for job in _jobs(given, one, many, folder)}.values())
+    many.tell(say)
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
     counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
@@ -135,29 +137,43 @@ class _Watch:
         self.say(record["reason"] if failed else f"{job.called}: {record['status']}: {record['reason']}")
 
 
-def _jobs(given: Sequence[Given], landmarks: Path | None, folder: Path) -> list[Job]:
-    """Return a job for each scan; one that lies elsewhere is named by its address as by a path."""
-    addresses: dict[Path, str] = {}
-    paths: list[Path] = []
-    for one in given:
-        path = Path(_ROOT, *_parts(one.place)) if isinstance(one.place, str) else one.place
-        paths.append(path)
-        if isinstance(one.place, str):
-            addresses[path] = one.place
+def _landmarks(landmarks: Path | None, scans: int) -> tuple[Path | None, LandmarkFiles]:
+    """Return the landmarks of the one scan there is, or those of many in a folder."""
+    if landmarks is None or landmarks.is_dir():
+        return None, LandmarkFiles.of(landmarks)
+    if scans > 1:
+        raise InputError(
+            "--landmarks belongs to one scan, but several were given; give a folder with a file for each, named as it, "
+            "or name the files in the column landmarks of a list of scans."
+        )
+    return landmarks, LandmarkFiles.of(None)
+
+
+def _jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[Job]:
+    """Return a job for each scan; one that lies elsewhere is named by its address as by a path.
+
+    Args:
+        given: the scans.
+        landmarks: of the one scan there is.
+        many: of many scans; the columns of a list go before.
+        folder: of the results.
+    """
+    many.refuse_shared([one.path for one in given if one.landmarks is None])
+    addresses = {one.path: one.address for one in given if one.address}
+    made = with_ids(make_jobs([one.path for one in given], landmarks, folder, addresses), given)
     jobs = [
-        replace(job, name=one.called or job.name, metadata=one.metadata)
-        for job, one in zip(make_jobs(paths, landmarks, folder, addresses), given, strict=True)
+        replace(job, landmarks=one.landmarks or job.landmarks or many.of_scan(job.scan))
+        for job, one in zip(made, given, strict=True)
     ]
-    seen: dict[str, Job] = {}
     for job in jobs:
-        if seen.setdefault(job.name.casefold(), job).called != job.called:
-            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
+        _refuse_to_overwrite(job, folder)
     return jobs
 
 
-def _parts(address: str) -> Sequence[str]:
-    head = address.split("::", 1)[0].partition("?")[0]
-    return [part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")]
+def _refuse_to_overwrite(job: Job, folder: Path) -> None:
+    written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
+    if job.landmarks is not None and job.landmarks.resolve() in written:
+        raise InputError(f"{job.landmarks} would be overwritten by the landmarks of the fit; rename it.")
 
 
 def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:

@@ -6,17 +6,19 @@ import csv
 import glob
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from shapespace.batch.fit_work import Job
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import MESH_ENDINGS
+from shapespace.io.meshes import MESH_FILE_ENDINGS
 from shapespace.io.remote import addresses, is_address
 
 _LISTS = (".csv", ".tsv", ".txt")
 _PLACES = ("scan", "file", "path")
+_LANDMARKS = "landmarks"
 _LONGEST = 200
 
 
@@ -28,11 +30,26 @@ class Given:
         place: path of the scan, or its address.
         called: by the column `id` of a list, or empty.
         metadata: the other columns of the list.
+        landmarks: of the scan, by the column `landmarks` of the list; None where it names none.
     """
 
     place: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
+    landmarks: Path | None = None
+
+    @property
+    def address(self) -> str:
+        """Of a scan that lies elsewhere; else empty."""
+        return self.place if isinstance(self.place, str) else ""
+
+    @property
+    def path(self) -> Path:
+        """Of the scan; of one that lies elsewhere, what it would be, for its name."""
+        if isinstance(self.place, Path):
+            return self.place
+        head = self.place.split("::", 1)[0].partition("?")[0]
+        return Path("/", *(part for part in head.replace("://", "/").split("/") if part not in ("", ".", "..")))
 
 
 def given_scans(
@@ -42,7 +59,8 @@ def given_scans(
 
     Args:
         scans: paths of scans and of folders, patterns, addresses, and lists: a text file with one of these in a line,
-            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id`, and others that are kept.
+            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id` and `landmarks`, and others that
+            are kept.
         folder: of the results, not looked into.
         recursive: whether to take what lies in folders below too.
         say: told what was not taken.
@@ -59,36 +77,41 @@ def given_scans(
                 there = _expanded(row.place, folder, recursive=recursive, say=say)
                 if row.called and len(there) > 1:
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
-                found += [Given(place, row.called, row.metadata) for place in there]
+                if row.landmarks is not None and len(there) > 1:
+                    raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
+                found += [replace(row, place=place) for place in there]
         else:
             found += [Given(place) for place in _expanded(text, folder, recursive=recursive, say=say)]
     _refuse_doubles(found)
     return found
 
 
-def files_of(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Path]:
-    """Return the same where only files can be read.
+def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
+    """Return `jobs` by the ids of the scans that they are of, where these have some, with what is known of the scans.
 
     Raises:
-        InputError: there is nothing, or an address among them.
-        FileError: a folder or a list cannot be read.
+        InputError: two scans would have one name.
     """
-    found = given_scans(scans, folder, recursive=recursive, say=say)
-    if there := [one.place for one in found if not isinstance(one.place, Path)]:
-        raise InputError(f"{there[0]} is an address, and this command reads files; copy the scans to a folder first.")
-    return [Path(one.place) for one in found]
+    named = [
+        replace(job, name=one.called or job.name, metadata=one.metadata) for job, one in zip(jobs, given, strict=True)
+    ]
+    seen: dict[str, Job] = {}
+    for job in named:
+        if seen.setdefault(job.name.casefold(), job).called != job.called:
+            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
+    return named
 
 
 def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]) -> Sequence[Path | str]:
     if isinstance(text, str) and is_address(text):
-        return addresses(text, MESH_ENDINGS, recursive=recursive)
+        return addresses(text, MESH_FILE_ENDINGS, recursive=recursive)
     path = Path(text)
     if glob.has_magic(str(path)) and not path.exists():
         matched = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
         if not matched:
             raise InputError(f"No file matches {path}; check the pattern.")
         # A pattern that ends in an ending names scans; another one may take what is none.
-        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(tuple(MESH_ENDINGS))]
+        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(MESH_FILE_ENDINGS)]
         paths = files or matched
     else:
         paths = [path]
@@ -139,7 +162,8 @@ def _table(file: Path, text: str) -> list[Given]:
             raise InputError(f"{file}: row {number} names no scan in the column {column}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
-        rows.append(Given(_beside(file, place), called, cells))
+        marks = cells.pop(_LANDMARKS, "")
+        rows.append(Given(_beside(file, place), called, cells, file.parent / marks if marks else None))
     return rows
 
 

@@ -7,10 +7,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.landmarks import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.meshes import stem_of
 from shapespace.types import Mesh
 
 _LISTED = 5
+
+
+def _is_result(file: Path) -> bool:
+    """Return whether a fit wrote `file` beside its record."""
+    name = next((file.name.removesuffix(e) for e in FIDUCIAL_ENDINGS if file.name.endswith(e)), None)
+    return name is not None and file.with_name(f"{name}.fit.json").is_file()
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class LandmarkFiles:
         unread: list[str] = []
         for file in sorted(folder.iterdir()):
             ending = next((one for one in endings if file.name.lower().endswith(one)), None)
-            if ending is None or not file.is_file():
+            if ending is None or not file.is_file() or _is_result(file):
                 continue
             first = found.setdefault(file.name[: -len(ending)], file)
             if first is not file:
@@ -58,18 +66,26 @@ class LandmarkFiles:
         """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""
         owner: dict[str, Path] = {}
         for path in scans:
-            if path.stem in self.files and owner.setdefault(path.stem, path) != path:
+            name = stem_of(path)
+            if name in self.files and owner.setdefault(name, path) != path:
                 raise InputError(
-                    f"{owner[path.stem]} and {path} would both take the landmarks in {self.files[path.stem]}; rename "
-                    "one of the scans."
+                    f"{owner[name]} and {path} would both take the landmarks in {self.files[name]}; rename one of the "
+                    "scans."
                 )
+
+    def of_scan(self, scan: Path) -> Path | None:
+        """Return the file with the landmarks of `scan`, None where there is none."""
+        file = self.files.get(scan.stem)
+        if file is not None:
+            self.used.add(scan.stem)
+        return file
 
     def onto(self, mesh: Mesh, path: Path) -> Mesh:
         """Return `mesh`, read from `path`, with the landmarks that the folder has for it."""
-        file = self.files.get(path.stem)
+        file = self.files.get(stem_of(path))
         if file is None:
             return mesh
-        self.used.add(path.stem)
+        self.used.add(stem_of(path))
         try:
             return replace(mesh, landmarks=read_landmarks(file))
         except ShapespaceError as error:

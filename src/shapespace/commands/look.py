@@ -12,11 +12,12 @@ import numpy as np
 from shapespace.batch.fit_work import naming
 from shapespace.batch.results import read_record
 from shapespace.commands.corresponding import json_of
-from shapespace.errors import FileError, ShapespaceError
+from shapespace.errors import FileError, ModelFileError, ShapespaceError
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.surface import faces_of
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
+from shapespace.model.additive import AdditiveModel
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
@@ -44,7 +45,7 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
         except MemoryError:
-            short = f"{path}: not enough memory to read it; thin the scan first."
+            short = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
             reports.append({"file": str(path), "usable": False, "error": short})
             continue
         facts = asdict(report)
@@ -61,13 +62,15 @@ def info(path: Path) -> dict[str, Any]:
     """
     if path.is_dir() and (results := results_at(path)) is not None:
         return {"kind": "store", **store_facts(results)}
+    if path.is_dir() and looks_like_model(path):
+        return {"kind": "model", **model_facts(ShapeModel.load(path))}
     if path.is_dir() or path.name == CorrespondenceRecord.FILE:
         return {"kind": "correspondence", **correspondence_facts(path if path.is_dir() else path.parent)}
     if path.name.endswith(CorrespondRecord.ENDING):
         record = read(CorrespondRecord, json_of(path), path.name, CORRESPOND_AGAIN)
         return {"kind": "scan in correspondence", **to_json(record)}
     if looks_like_model(path):
-        return {"kind": "model", **model_facts(ShapeModel.load(path))}
+        return {"kind": "model", **model_facts(ShapeModel.load(path)), **_parted(path)}
     if path.name.endswith(".json"):
         record = read_record(path)
         return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
@@ -168,12 +171,22 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({} if model.residuals is None else _residual_facts(model)),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
+        **({"regions": {name: len(at) for name, at in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,
         "licence": model.licence,
         "hash": model.content_hash,
     }
+
+
+def _parted(path: Path) -> dict[str, Any]:
+    """Return what an additive model says of its two parts; nothing of other models."""
+    try:
+        additive = AdditiveModel.load(path)
+    except ModelFileError:
+        return {}
+    return {"additive": {"identity_modes": additive.n_identity, "expression_modes": additive.n_expression}}
 
 
 def _residual_facts(model: ShapeModel) -> dict[str, Any]:

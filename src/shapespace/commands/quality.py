@@ -11,6 +11,8 @@ import numpy as np
 
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
+from shapespace.batch.quality_work import QualityElsewhere
+from shapespace.batch.where import Where
 from shapespace.commands.corresponding import SURFACE, surface_files
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
@@ -18,7 +20,7 @@ from shapespace.io.files import make_folder, write_text
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
 from shapespace.model.foreign import looks_like_model
-from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.model.quality import Curve, ModelQuality, QualitySettings, Runner, measure_quality
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
@@ -70,9 +72,16 @@ class _Target:
 
 
 def quality(
-    targets: Sequence[Path], output: Path, options: QualityOptions, *, quiet: bool
+    targets: Sequence[Path], output: Path, options: QualityOptions, where: Where, *, quiet: bool
 ) -> tuple[Quality, list[str]]:
     """Measure one target or two, write `quality.json` and the curves, and return what was found and what to know.
+
+    Args:
+        targets: models, or folders of meshes in correspondence.
+        output: the folder to write to.
+        options: what to measure.
+        where: folds and random shapes are done.
+        quiet: no progress.
 
     Raises:
         FileError: something cannot be read or written.
@@ -82,7 +91,8 @@ def quality(
     notes: list[str] = []
     found = _targets(targets, options, notes, quiet=quiet)
     make_folder(output)
-    measured = [_measure(target, options, quiet=quiet) for target in found]
+    run = QualityElsewhere(where, output, quiet)
+    measured = [_measure(target, options, run, quiet=quiet) for target in found]
     parts = [_as_quality(t, m, options) for t, m in zip(found, measured, strict=True)]
     notes += [_missing(t, m) for t, m in zip(found, measured, strict=True) if m.missing_share or m.left_out_vertices]
     result = parts[0]
@@ -212,7 +222,7 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
     return out
 
 
-def _measure(target: _Target, options: QualityOptions, *, quiet: bool) -> ModelQuality:
+def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
     with progress(None, f"measuring {target.name}, in", "step", quiet=quiet) as bar:
@@ -221,7 +231,7 @@ def _measure(target: _Target, options: QualityOptions, *, quiet: bool) -> ModelQ
             bar.total = total
             bar.update(done - bar.n)
 
-        return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step)
+        return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step, run=run)
 
 
 def _missing(target: _Target, found: ModelQuality) -> str:

@@ -68,7 +68,7 @@ def write_surfaces(
             try:
                 made = surface_of_volume(read_volume(path), labels, smooth=smooth, keep_pieces=keep_pieces)
             except (ShapespaceError, MemoryError) as error:
-                short = f"{path}: there is not enough memory for it; crop it or resample it."
+                short = f"{path}: there is not enough memory for it; crop or resample it, as by 3D Slicer."
                 reason = short if isinstance(error, MemoryError) else naming(path, str(error))
                 # A surface of an earlier run would contradict what is said.
                 remove_file(target)

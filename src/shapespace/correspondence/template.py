@@ -128,7 +128,9 @@ def given(template: Mesh) -> Mesh:
         MeshError: it has no triangles, cannot be repaired, or has too few vertices to follow a scan.
     """
     if template.faces is None:
-        raise MeshError(f"{template.name} is a point cloud, and a template needs triangles; give a mesh.")
+        raise MeshError(
+            f"{template.name} is a point cloud, and a template needs triangles; give a mesh, as MeshLab makes of one."
+        )
     mesh = repair(template)[0]
     if len(mesh.vertices) < _FEWEST:
         raise MeshError(

@@ -25,6 +25,7 @@ def write_faces(
     raw: bool = False,
     wide: bool = False,
     face_only: bool = False,
+    intensity: tuple[float, float] = (1.0, 1.0),
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
@@ -34,18 +35,19 @@ def write_faces(
     Args:
         folder: created when missing.
         subjects: how many people, 1 to 100,000.
-        expressions: names out of `EXPRESSIONS`, each drawn once per person at full intensity.
+        expressions: names out of `EXPRESSIONS`, each drawn once per person.
         seed: a number of 0 or more.
         raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
         wide: whether people vary as widely as real ones; see `FaceGenerator.draw_person`.
         face_only: whether to leave out ears, crown, nape and neck; see `FaceGenerator.cut_to_face`.
+        intensity: least and greatest of the expressions, drawn evenly between them; 1 is full.
         progress: called with (files written, files in all).
 
     Returns:
         The folder.
 
     Raises:
-        InputError: no subjects, too many, a negative seed, or an unknown or repeated expression.
+        InputError: no subjects, too many, a negative seed, an unknown or repeated expression, or such intensities.
         FileError: the folder cannot be written.
     """
     known = list(EXPRESSIONS)
@@ -58,19 +60,23 @@ def write_faces(
     for name in expressions:
         if name not in known:
             raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
+    low, high = intensity
+    if not 0 < low <= high <= 1:
+        raise InputError(f"Intensities must lie above 0 and at most at 1, in order, not {low:g} to {high:g}.")
     folder = make_folder(Path(folder))
     faces = load_faces()
     labels: list[tuple[str, str, str, str]] = []
     for k in range(subjects):
         person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}", wide=wide)
         for name in expressions:
-            expression = faces.draw_expression(name, 1.0, np.random.default_rng([seed, k, 1 + known.index(name)]))
+            shown = np.random.default_rng([seed, k, 1 + known.index(name), 2]).uniform(low, high) if low < 1 else 1.0
+            expression = faces.draw_expression(name, shown, np.random.default_rng([seed, k, 1 + known.index(name)]))
             file = f"{person.name}_{name}.ply"
             face = faces.face(person, expression)
             face = faces.cut_to_face(face) if face_only else face
             rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
             write_mesh(folder / file, plain_scan(face, rng) if raw else face)
-            labels.append((file, person.name, name, "0" if name == "neutral" else "1"))
+            labels.append((file, person.name, name, "0" if name == "neutral" else f"{shown:.3g}"))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))
     write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)

@@ -68,7 +68,10 @@ def another_beside(
     if score(other.evidence) > 0.0 or other.evidence["spread_mm"] > _AS_GOOD * fitted.evidence["spread_mm"]:
         return None
     away = np.linalg.norm(other.vertices_scan_mm.mean(axis=0) - fitted.vertices_scan_mm.mean(axis=0)) / scale
-    return f"The scan shows another one that the model fits as well, {away:.0f} mm away; crop it to the one you mean."
+    return (
+        f"The scan shows another one that the model fits as well, {away:.0f} mm away; crop it to the one you mean "
+        "(--crop)."
+    )
 
 
 def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:

@@ -72,12 +72,14 @@ class NormalEquations:
         prior: (7 + k,) diagonal of the Hessian of the prior, times that variance.
         gradient: (7 + k,) of both.
         holds_scale: whether the scale has no say.
+        marks: (7 + k, 7 + k) Hessian of landmarks as a step weighs them, times that variance; None without any.
     """
 
     data: FloatArray
     prior: FloatArray
     gradient: FloatArray
     holds_scale: bool
+    marks: FloatArray | None = None
 
     def step(self) -> FloatArray:
         """Return delta (7 + k,), solved with a unit diagonal and hardly damped (eq 15).
@@ -87,6 +89,8 @@ class NormalEquations:
         """
         free = np.delete(np.arange(len(self.gradient)), [SCALE] if self.holds_scale else [])
         hessian = self.data[np.ix_(free, free)] if self.holds_scale else self.data.copy()
+        if self.marks is not None:
+            hessian += self.marks[np.ix_(free, free)]
         hessian[np.diag_indices_from(hessian)] += self.prior[free]
         unit = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-30))
         hessian *= np.outer(unit, unit)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +13,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.crop import Crop
+from shapespace.fit.held_to import HeldTo
+from shapespace.fit.marks import SHARE, Marks
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.methods import method_named
 from shapespace.fit.result import FitResult, Stage
@@ -24,7 +28,7 @@ from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
 from shapespace.version import __version__
 
 _FAR_OUT = 3.0
@@ -32,6 +36,9 @@ _FAR_OUT_BY_CHANCE = 0.01
 _ALL_BUT_THE_RIM = 0.95
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
+
+OPTIONS = ("landmark_stddev_mm", "crop", "region")
+"""Settings that a record tells only where they are given."""
 
 OnState: TypeAlias = Callable[[IcpState], None]
 
@@ -49,8 +56,14 @@ class FitConfig:
         scale: `free` fits a similarity, `fixed` a rigid motion; `auto` goes by the model's gauge.
         max_iterations: cap of each phase.
         seed: of the subsample that the start is searched on.
+        landmark_stddev_mm: of landmarks that are given, mm of the scan: how well they are placed. The robust method is
+            held to them by it; infinity takes them for the start alone. None for 3 % of the model's size (RMS distance
+            from its centre).
         dense: whether the surface is then taken the rest of the way to the scan, as the stage `dense`.
         dense_settings: settings of that.
+        crop: what of the scan is fitted, such as `sphere:0,0,0,90`, see `fit.crop.Crop`; empty for all of it.
+        region: the part of the model that fit, distances and verdict are held to: a name of `ShapeModel.regions`, or
+            vertices; None for all of it.
 
     Raises:
         InputError: a name that does not exist, numbers below one, or a dense stage after a method that has none.
@@ -64,6 +77,9 @@ class FitConfig:
     seed: int = 0
     dense: bool = False
     dense_settings: DenseSettings = field(default_factory=DenseSettings)
+    landmark_stddev_mm: float | None = None
+    crop: str = ""
+    region: str | tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         for value, choices, what in (
@@ -77,6 +93,14 @@ class FitConfig:
             raise InputError(
                 f"The dense stage needs the robust method; leave out dense, or the method {fitting.name!r}."
             )
+        if self.landmark_stddev_mm is not None and not self.landmark_stddev_mm > 0:
+            raise InputError(f"Landmarks need a positive standard deviation in mm, not {self.landmark_stddev_mm}.")
+        if self.crop:
+            object.__setattr__(self, "crop", Crop.of(self.crop).text)
+        if self.region is not None and not isinstance(self.region, str):
+            object.__setattr__(self, "region", tuple(sorted({int(vertex) for vertex in self.region})))
+        if self.dense and self.region is not None:
+            raise InputError("The dense stage follows all of a scan; leave out dense, or the region.")
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
         if self.max_iterations < 1:
@@ -97,6 +121,14 @@ class FitConfig:
         # Not `asdict` of the whole: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
+        # Options that are left out are not told, so that such fits are those of versions that did not know them.
+        if self.landmark_stddev_mm is not None:
+            # JSON has no infinity.
+            common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
+        if self.crop:
+            common["crop"] = self.crop
+        if self.region is not None:
+            common["region"] = self.region if isinstance(self.region, str) else _told_vertices(self.region)
         return {
             "method": method.name, **common, "dense_settings": asdict(self.dense_settings),
             method.name: asdict(method),  # type: ignore[call-overload]
@@ -118,7 +150,8 @@ def fit_scan(
         model: the shape space.
         scan: a mesh or point cloud, in its own frame and unit.
         config: settings; None for the defaults.
-        landmarks: name -> (3,) in the scan's frame and unit, to start from; None to use none.
+        landmarks: name -> (3,) in the scan's frame and unit, to start from and, by the robust method, to be held to
+            (`FitConfig.landmark_stddev_mm`); None to use none.
         T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
         on_state: called with each state of the loop, for progress bars and viewers.
 
@@ -131,14 +164,27 @@ def fit_scan(
     # Products this small go slower by several threads, and many fits at a time share the cores anyway.
     with threadpool_limits(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
-        placed = _place(model, scan, config, landmarks, T_scan_model)
+        held = None if config.region is None else HeldTo.of(model, config.region)
+        own = model if held is None else held.part.model
+        placed = _place(model, own, scan, config, landmarks, T_scan_model)
         clock.append(time.perf_counter())
-        driven = _drive(model, placed, config, on_state)
+        limits = config.limits(model)
+        if held is not None:
+            limits, on_state = replace(limits, modes=None), None if on_state is None else held.telling(on_state)
+        driven = _drive(own, placed, config, limits, on_state)
         clock.append(time.perf_counter())
-        stages = _measure(model, placed, driven, config)
+        stages = _measure(own, placed, driven, config)
         clock.append(time.perf_counter())
-        ended = Ended(model, placed.start, driven.fitted, stages, driven.ended, rms_size(model.mean_vertices))
+        ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, rms_size(own.mean_vertices))
         status, reason = verdict(config.fitting, ended)
+        if held is not None:
+            driven = replace(
+                driven,
+                history=[held.state(state) for state in driven.history],
+                ended={phase: held.state(state) for phase, state in driven.ended.items()},
+                fitted=held.fitted(driven.fitted, config.modes),
+            )
+            stages = _measure(model, placed, driven, config, held.part.inside)
         clock.append(time.perf_counter())
     fitted = driven.fitted
     return FitResult(
@@ -165,6 +211,7 @@ def fit_scan(
         evidence=fitted.evidence,
         notes=[
             *placed.findings,
+            *([] if held is None else [held.note(config.region)]),
             *_far_out(model, fitted.b),
             *_no_triangles(placed.scan),
             *_not_all_seen(stages),
@@ -180,6 +227,7 @@ def fit_scan(
         model=model,
         scan=placed.scan,
         find_regions=fitted.regions,
+        landmark_stddev_mm=_landmark_stddev_mm(model, fitted, held, dense=config.dense),
     )
 
 
@@ -206,30 +254,38 @@ class _Driven:
 
 
 def _place(
+    whole: ShapeModel,
     model: ShapeModel,
     scan: Mesh,
     config: FitConfig,
     landmarks: Mapping[str, FloatArray] | None,
     T_scan_model: Similarity | None,
 ) -> _Placed:
-    """Repair the scan, find its unit, and find where to begin."""
+    """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
+    said: list[str] = []
+    if config.crop:
+        scan, cropped = Crop.of(config.crop).cut(scan, whole, landmarks, config.unit)
+        said.append(cropped)
     scan, findings = repair(scan)
     mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
     T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
     with_scale = config.limits(model).with_scale
+    marks_mm = {name: T_mm_scan.apply(point) for name, point in (landmarks or {}).items()}
     if T_scan_model is not None:
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
-        marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
-        start = start_from_landmarks(model, marks_mm, scan.name, with_scale=with_scale)
+        start = start_from_landmarks(whole, marks_mm, scan.name, with_scale=with_scale)
     else:
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
-    said = [f"{finding.what} {finding.action}".strip() for finding in findings]
+    if landmarks:
+        stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
+        start = replace(start, marks=Marks.of(model, marks_mm, stddev_mm))
+    said += [f"{finding.what} {finding.action}".strip() for finding in findings]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
 
 
-def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, on_state: OnState | None) -> _Driven:
+def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, limits: Limits, on_state: OnState | None) -> _Driven:
     """Run the method to its end.
 
     Raises:
@@ -238,7 +294,7 @@ def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, on_state: OnSt
     history: list[IcpState] = []
     ended: dict[int, IcpState] = {}
     phase_2_from, name = time.perf_counter(), placed.scan.name
-    states = config.fitting.states(model, placed.target, placed.start, config.limits(model))
+    states = config.fitting.states(model, placed.target, placed.start, limits)
     try:
         while True:
             state = next(states)
@@ -251,16 +307,20 @@ def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, on_state: OnSt
             if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
                 raise FitError(
                     f"{name}: the model shrank to a point, as the plain method does when a large part of the "
-                    "scan is missing; hold the scale (--scale fixed), or crop the model to what the scan shows."
+                    "scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
                 )
     except StopIteration as end:
         return _Driven(history, ended, phase_2_from, end.value)
     except InputError as error:
-        raise FitError(f"{name}: the fit diverged ({error}); give landmarks, or crop the scan.") from error
+        raise FitError(
+            f"{name}: the fit diverged ({error}); give landmarks (--landmarks), or crop the scan (--crop)."
+        ) from error
 
 
-def _measure(model: ShapeModel, placed: _Placed, driven: _Driven, config: FitConfig) -> dict[str, Stage]:
-    """Return the surface at each stage, with its distances when they are asked for."""
+def _measure(
+    model: ShapeModel, placed: _Placed, driven: _Driven, config: FitConfig, region: BoolArray | None = None
+) -> dict[str, Stage]:
+    """Return the surface at each stage, with its distances, held to `region` (V,), when they are asked for."""
     target, fitted, T_scan_mm = placed.target, driven.fitted, placed.T_scan_mm
     together = target.mesh.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0)
     moments = {
@@ -269,11 +329,34 @@ def _measure(model: ShapeModel, placed: _Placed, driven: _Driven, config: FitCon
         "final": (fitted.T_scan_model, fitted.b),
     }
     stages = {
-        name: Stage(T_scan_mm @ T, b, partial(_distances, model, target, T, b)) for name, (T, b) in moments.items()
+        name: Stage(T_scan_mm @ T, b, partial(_distances, model, target, T, b, None, region))
+        for name, (T, b) in moments.items()
     }
     if config.dense:
         stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
     return stages
+
+
+def _landmark_stddev_mm(
+    model: ShapeModel, fitted: Fitted, held: HeldTo | None, *, dense: bool
+) -> dict[str, FloatArray] | None:
+    """Return name -> (3,) of where each of the model's landmarks lies, mm of the scan."""
+    if fitted.landmark_covariance is None:
+        return None
+    variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
+    landmarks = model.landmarks if held is None else held.landmarks(model)
+    if not dense:
+        # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
+        vertex = list(landmarks.values())
+        told = fitted.T_scan_model.apply(model.reconstruct(fitted.b)[vertex])
+        variance += (told - fitted.vertices_scan_mm[vertex]) ** 2
+    return dict(zip(landmarks, np.sqrt(variance), strict=True))
+
+
+def _told_vertices(vertices: tuple[int, ...]) -> dict[str, Any]:
+    """Return what a record says of a region that no model has by name."""
+    numbers = np.array(vertices, dtype="<i8").tobytes()
+    return {"vertices": len(vertices), "hash": hashlib.sha256(numbers).hexdigest()}
 
 
 def _in_standard_deviations(b_covariance: FloatArray | None, model: ShapeModel) -> FloatArray | None:
@@ -306,7 +389,7 @@ def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
         return []
     return [
         f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
-        "details of the scan that the model does not know, so build it with fewer modes for plausible ones."
+        "details of the scan that the model does not know, so build it with fewer modes (--modes) for plausible ones."
     ]
 
 
@@ -328,9 +411,13 @@ def _dense_stage(
 
 
 def _distances(
-    model: ShapeModel, target: ScanTarget, T: Similarity, b: FloatArray, vertices_scan_mm: FloatArray | None = None
-) -> SurfaceDistances:
-    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it."""
+    model: ShapeModel, target: ScanTarget, T: Similarity, b: FloatArray, vertices_scan_mm: FloatArray | None = None,
+    region: BoolArray | None = None,
+) -> SurfaceDistances:  # fmt: skip
+    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it.
+
+    Only the vertices of `region` (V,) count where there is one.
+    """
     vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
     placed = Mesh(vertices, model.faces, name="model")
-    return surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale)
+    return surface_distances(placed, target.mesh, scan_engine=target.engine, mm_per_length=1.0 / T.scale, region=region)

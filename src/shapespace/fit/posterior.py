@@ -16,13 +16,14 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from shapespace.fit.equations import SCALE, NormalEquations, Prior
+from shapespace.fit.marks import worth
 from shapespace.fit.matching import Weights
 from shapespace.fit.moving_model import MovingSurface
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, IntArray
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 _NOISE_TEMPERATURE = 1.7
@@ -101,6 +102,9 @@ def posterior(
         # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
         temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # eq 20
         scaled = data / temperature * np.outer(unit, unit)
+        if equations.marks is not None:
+            # Weighed up in a step by what matches are worth, they are what they are beside tempered ones.
+            scaled += equations.marks / (sigma_mm**2 * worth(matches)) * np.outer(unit, unit)
         scaled[np.diag_indices(n)] += known_before
         inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # eq 21
         if equations.holds_scale:
@@ -111,6 +115,16 @@ def posterior(
     dark = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else told
     off_mm2 = float((dark * _gram(surface)).sum()) / len(surface.vertices)  # eq 22, first term
     return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
+
+
+def covariance_of_vertices(known: Posterior, surface: MovingSurface, vertex: IntArray) -> FloatArray:
+    """Return the covariance (L, 3, 3), mm^2 of the model's frame, of where the vertices `vertex` (L,) lie.
+
+    Pose, coefficients and modes beside the model move a vertex together, so it is that of their sum.
+    """
+    pose = small_poses(surface.vertices[vertex]).reshape(len(vertex), 3, POSE)
+    rows = np.concatenate([pose, surface.modes[vertex]], axis=2)
+    return rows @ known.covariance @ rows.transpose(0, 2, 1)
 
 
 def new_shapes(model: ShapeModel) -> FloatArray:

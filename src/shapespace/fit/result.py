@@ -100,6 +100,9 @@ class FitResult:
         model: the model that was fitted.
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
+        landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
+            scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
+            the region that the fit was held to.
     """
 
     scan_name: str
@@ -124,14 +127,24 @@ class FitResult:
     model: ShapeModel = field(repr=False)
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
+    landmark_stddev_mm: Mapping[str, FloatArray] | None = field(default=None, repr=False)
 
     @cached_property
     def regions(self) -> IntArray:
         """(V,) code of each model vertex in `fit.regions.REGIONS`, found when first asked for.
 
         The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
+        Outside the region that a fit is held to (`FitConfig.region`) nothing is seen.
         """
         return self.find_regions()
+
+    @cached_property
+    def landmarks(self) -> dict[str, FloatArray]:
+        """Name -> (3,) of the model's landmarks in the scan's frame and unit, on the dense surface if there is one.
+
+        Empty where the model has no landmarks.
+        """
+        return dict(self.surface(stage="dense" if "dense" in self.stages else "final").landmarks)
 
     @property
     def iterations(self) -> dict[str, int]:
@@ -164,7 +177,11 @@ class FitResult:
     def shown_at(self, stage: str) -> ShownDistances:
         """Return the distances at `stage` over what the scan shows, as it is known at the end of the fit."""
         distances, seen = self.stages[stage].distances, np.isin(self.regions, SHOWN)
-        forward, backward = DistanceSummary.of(distances.model_to_scan_mm, seen), distances.scan_to_model
+        counted = slice(None) if distances.model_counted is None else distances.model_counted
+        forward, backward = (
+            DistanceSummary.of(distances.model_to_scan_mm[counted], seen[counted]),
+            distances.scan_to_model,
+        )
         return ShownDistances(forward, backward, forward.fraction, backward.fraction)
 
     def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:

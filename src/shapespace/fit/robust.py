@@ -26,9 +26,10 @@ from scipy.linalg import LinAlgError
 from shapespace.errors import FitError
 from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
 from shapespace.fit.final_matches import FinalMatches
+from shapespace.fit.marks import Marks, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
-from shapespace.fit.posterior import lack_of_new_shapes, new_shapes, posterior
+from shapespace.fit.posterior import Posterior, covariance_of_vertices, lack_of_new_shapes, new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -39,7 +40,7 @@ from shapespace.fit.weights import spread, tails
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray, IntArray, Similarity
 
 _MOTION_STRIDE = 7
 _FEWEST_MATCHES = 30
@@ -48,6 +49,8 @@ _CLEARLY_BETTER = 0.95
 _FARTHEST = 5.0
 _HALF, _LEADING, _NEAR = 0.5, 10, 0.05
 """A match counts at half weight; so many modes lead; near is this share of the model's size."""
+_LACK_LEFT = 0.5
+"""Of the variance outside the model, so that landmarks lie within their standard deviations (docs/landmarks.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,7 @@ class Problem:
         settings: of the method.
         prior: of pose and shape.
         surface: the model's surface, which moves.
+        marks: landmarks that it is held to, if any.
     """
 
     prepared: PreparedModel
@@ -102,15 +106,17 @@ class Problem:
     settings: RobustSettings
     prior: Prior
     surface: MovingSurface
+    marks: Marks | None = None
 
     @staticmethod
     def of(
-        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool
-    ) -> Problem:
+        prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool,
+        marks: Marks | None = None,
+    ) -> Problem:  # fmt: skip
         """Return the problem with the model's own modes."""
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
         surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        return Problem(prepared, target, settings, prior, surface)
+        return Problem(prepared, target, settings, prior, surface, marks)
 
     def with_modes_beside(self) -> Problem:
         """Return the problem with the modes that the model lacks, weighed as `beyond_prior` says."""
@@ -141,8 +147,8 @@ class Problem:
         residual = matches.residuals()
         if len(residual) < _FEWEST_MATCHES:
             raise FitError(
-                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks, or "
-                "check that it shows what the model does."
+                f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks "
+                "(--landmarks), or check that it shows what the model does."
             )
         sigma_mm = max(spread(residual), s.least_spread_mm)
         width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
@@ -155,7 +161,12 @@ class Problem:
     def equations(self, look: Look, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
         """Return what each vertex carries of the matches, and the equations of a step from there."""
         gathered = look.matches.gathered(look.weights, self.prepared.topology.faces, len(self.surface.vertices))
-        return gathered, normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
+        equations = normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
+        if self.marks is None:
+            return gathered, equations
+        hessian, gradient = self.marks.equations(self.surface, at.T_scan_model, modes)
+        gain = look.sigma_mm**2 * worth(float(look.weights.points.sum() + look.weights.vertices.sum()))
+        return gathered, replace(equations, gradient=equations.gradient + gain * gradient, marks=gain * hessian)
 
     def step(self, matcher: Matcher, at: Estimate, modes: int) -> Step:
         """Return one Gauss-Newton step on the pose and the first `modes` coefficients; the surface moves with it.
@@ -169,7 +180,8 @@ class Problem:
             delta = equations.step()  # eq 15
         except LinAlgError as error:
             raise FitError(
-                f"{self.target.mesh.name}: the fit diverged; give landmarks, or crop the scan to what the model shows."
+                f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
+                "what the model shows (--crop)."
             ) from error
         some = slice(None, None, _MOTION_STRIDE)
         before, at = at.T_scan_model.apply(self.surface.vertices[some]), at.moved_by(delta)  # eq 16
@@ -256,7 +268,8 @@ def robust_icp(
         FitError: hardly anything matches, or the fit diverged.
     """
     prepared = prepare(model)
-    problem = Problem.of(prepared, target, settings, start.T_scan_model.scale, with_scale=with_scale)
+    scale = start.T_scan_model.scale
+    problem = Problem.of(prepared, target, settings, scale, with_scale=with_scale, marks=start.marks)
     at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
     tree, tree_fits = prepared.tree, False
     matcher = problem.matcher(settings.levels[0], at, tree, None)
@@ -320,9 +333,28 @@ def robust_icp(
             "left_out_mm": float(np.sqrt(left_out_mm2)),
             "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
             "model_lack_mm": lack_of_new_shapes(model),
+            **_of_marks(problem, at),
             "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         },
+        notes=() if problem.marks is None else problem.marks.notes(surface, at.T_scan_model),
+        landmark_covariance=_of_landmarks(model, known, surface, at.T_scan_model),
     )  # fmt: skip
+
+
+def _of_marks(problem: Problem, at: Estimate) -> dict[str, float]:
+    """Return the standard deviation of landmarks that were given, and how far off they are (RMS), mm of the scan."""
+    if problem.marks is None:
+        return {}
+    off_mm = problem.marks.off_mm(problem.surface, at.T_scan_model)
+    return {"marks_stddev_mm": problem.marks.stddev_mm, "marks_rms_mm": float(np.sqrt((off_mm**2).mean()))}
+
+
+def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T: Similarity) -> FloatArray:
+    """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
+    covariance = covariance_of_vertices(known, surface, np.array(list(model.landmarks.values()), dtype=np.int32))
+    # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
+    covariance += np.eye(3) * _LACK_LEFT * lack_of_new_shapes(model) ** 2 / 3.0
+    return T.scale**2 * T.rotation @ covariance @ T.rotation.T
 
 
 def _matched(look: Look, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray) -> dict[str, float]:

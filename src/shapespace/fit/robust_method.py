@@ -46,7 +46,7 @@ class Robust(RobustSettings):
         evidence = {**fitted.evidence, **start_evidence(start), **layers(model, scan, fitted)}
         evidence |= reliability(evidence).as_evidence()
         beside = another_beside(model, scan, fitted, self, with_scale=limits.with_scale)
-        return replace(fitted, evidence=evidence, notes=() if beside is None else (beside,))
+        return replace(fitted, evidence=evidence, notes=(*fitted.notes, *(() if beside is None else (beside,))))
 
     def doubts(self, ended: Ended) -> list[str]:
         """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""

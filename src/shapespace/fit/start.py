@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.marks import Marks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
@@ -36,6 +37,7 @@ class Start:
         b: (K',) coefficients of the leading modes found there, mm; (0,) where none were.
         runner_up_score_mm: `score_mm` of the best pose that is another one; infinite where none was tried.
         alternatives: up to three such other poses, best first, without alternatives of their own.
+        marks: landmarks of the scan that the fit is held to; None without any.
     """
 
     T_scan_model: Similarity
@@ -44,6 +46,7 @@ class Start:
     b: FloatArray = field(default_factory=lambda: np.zeros(0))
     runner_up_score_mm: float = float("inf")
     alternatives: tuple[Start, ...] = ()
+    marks: Marks | None = None
 
 
 def start_evidence(start: Start) -> dict[str, float]:
@@ -69,8 +72,8 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     best, second = sorted(penalty, key=lambda name: penalty[name])[:2]
     if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
         raise FitError(
-            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit, or crop it to "
-            "what the model shows."
+            f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop "
+            "it to what the model shows (--crop)."
         )
     low, high = _PLAUSIBLE_COVER
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
@@ -95,7 +98,10 @@ def start_from_landmarks(
         FitError: the model has no landmarks, or fewer than three names are shared.
     """
     if not model.landmarks:
-        raise FitError(f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out.")
+        raise FitError(
+            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it "
+            "with --landmarks."
+        )
     names = [name for name in model.landmarks if name in scan_landmarks_mm]
     if len(names) < 3:
         raise FitError(

@@ -51,6 +51,8 @@ class Fitted:
         evidence: what the verdict goes by, by name.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
         notes: what was noticed in the scan, a sentence each.
+        landmark_covariance: (L, 3, 3) of where the model's landmarks lie in that frame, mm^2, in the model's order,
+            where the method finds it.
     """
 
     T_scan_model: Similarity
@@ -64,6 +66,7 @@ class Fitted:
     evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
     b_covariance: FloatArray | None = None
     notes: Sequence[str] = ()
+    landmark_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True)

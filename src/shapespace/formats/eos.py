@@ -17,6 +17,7 @@ from shapespace.io.json_files import check_file
 from shapespace.types import FloatArray
 
 _AGAIN = "give a model that eos has saved"
+_BLENDSHAPES_AGAIN = "give the blendshapes that eos has saved"
 _LARGEST_BYTES = 2**32
 _NEWEST = 4
 _MOST_NAME_BYTES = 4096
@@ -39,15 +40,19 @@ class Eos:
         if path.suffix.lower() != ".bin" or len(head) < 12:
             return False
         version, rows, columns = struct.unpack_from("<Iii", head)
-        blendshapes, length = struct.unpack_from("<QQ", head) if len(head) >= 16 else (0, 0)
         if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
             return True
-        return bool(0 < blendshapes < 2**16 and 0 < length < _MOST_NAME_BYTES)
+        return _are_blendshapes(head)
 
     def read(self, path: Path) -> LinearModel:
         """As `Format.read`."""
         check_file(path, _LARGEST_BYTES, _AGAIN)
         data = read_bytes(path)
+        if _are_blendshapes(data[:16]):
+            raise ModelFileError(
+                f"{path} holds the blendshapes of an eos model, without the model; give that, and this with "
+                "--expressions."
+            )
         try:
             return _model(_Archive(data))
         except (_DamagedError, ValueError, OverflowError) as error:
@@ -76,6 +81,33 @@ class Eos:
         if model.provenance or model.licence:
             said.append("Provenance and licence are left out: eos has no place for them.")
         return said
+
+
+def read_blendshapes(path: Path) -> Modes:
+    """Return the expressions in a file that `eos.morphablemodel.save_blendshapes` wrote.
+
+    Raises:
+        FileError: it cannot be read.
+        ModelFileError: it is damaged, or another thing.
+    """
+    check_file(path, _LARGEST_BYTES, _BLENDSHAPES_AGAIN)
+    archive = _Archive(read_bytes(path))
+    try:
+        with np.errstate(invalid="ignore"):
+            found = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+        if not archive.at_end:
+            raise _DamagedError("there is more in it than blendshapes")
+        if not found or any(len(moved) != len(found[0][1]) or len(moved) % 3 for _, moved in found):
+            raise _DamagedError("they have different numbers of vertices")
+    except (_DamagedError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path} holds no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
+    return Modes(np.stack([moved for _, moved in found], axis=1), tuple(name for name, _ in found))
+
+
+def _are_blendshapes(head: bytes) -> bool:
+    """Whether a file begins with a number of blendshapes and the length of the first one's name."""
+    count, length = struct.unpack_from("<QQ", head) if len(head) >= 16 else (0, 0)
+    return bool(0 < count < 2**16 and 0 < length < _MOST_NAME_BYTES)
 
 
 class _DamagedError(ValueError):

@@ -14,6 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import qr, svd
+from threadpoolctl import threadpool_limits
 
 from shapespace.errors import ModelFileError
 from shapespace.types import FloatArray, IntArray, read_only
@@ -121,12 +122,14 @@ def orthonormal(moved: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     order = np.argsort(-length, kind="stable")
     keep = order[length[order] > _NO_STDDEV * length.max()] if length.size and length.max() > 0 else order[:0]
     unit = moved[:, keep] / length[keep]
-    if np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL and len(keep) == moved.shape[1]:
-        # As it stands but for the rounding of single precision, so that modes stay the file's own.
-        found, upper = qr(unit, mode="economic")
-        exact = np.asarray(found * np.sign(np.diag(upper)), dtype=np.float64)
-        return exact, length[keep], np.eye(moved.shape[1])[:, keep]
-    left, stddev, right = svd(moved, full_matrices=False)
+    # The last bits hang on the number of threads, and workers, which have one, must find the same model.
+    with threadpool_limits(1, user_api="blas"):
+        if np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL and len(keep) == moved.shape[1]:
+            # As it stands but for the rounding of single precision, so that modes stay the file's own.
+            found, upper = qr(unit, mode="economic")
+            exact = np.asarray(found * np.sign(np.diag(upper)), dtype=np.float64)
+            return exact, length[keep], np.eye(moved.shape[1])[:, keep]
+        left, stddev, right = svd(moved, full_matrices=False)
     kept = stddev > _NO_STDDEV * stddev.max(initial=0.0)
     sign = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
     return (left * sign)[:, kept], stddev[kept], (right.T * sign)[:, kept]

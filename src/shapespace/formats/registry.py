@@ -5,12 +5,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shapespace.errors import FileError, InputError, ModelFileError
-from shapespace.formats.eos import Eos
-from shapespace.formats.parts import Format, LinearModel
+import numpy as np
+from threadpoolctl import threadpool_limits
 
-FORMATS: Sequence[Format] = (Eos(),)
+from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.eos import Eos
+from shapespace.formats.flame import Flame
+from shapespace.formats.gias import Gias
+from shapespace.formats.gltf import Gltf
+from shapespace.formats.matlab import Matlab
+from shapespace.formats.monai import Monai
+from shapespace.formats.obj_folder import ObjFolder
+from shapespace.formats.parts import Format, LinearModel
+from shapespace.formats.scalismo_json import ScalismoJson
+from shapespace.formats.shapeworks import ShapeWorks
+from shapespace.formats.statismo import Statismo
+from shapespace.io.files import open_file
+from shapespace.io.json_files import check_file
+
+FORMATS: Sequence[Format] = (
+    Eos(),
+    Statismo(),
+    ScalismoJson(),
+    Gias(),
+    Flame(),
+    Matlab(),
+    Gltf(),
+    ObjFolder(),
+    ShapeWorks(),
+    Monai(),
+)
 """In the order in which they are asked whether a file is theirs."""
+LARGEST_BYTES = 2**34
 _HEAD_BYTES = 4096
 
 
@@ -21,18 +47,21 @@ def read_linear(path: Path) -> tuple[Format, LinearModel]:
         FileError: it cannot be read.
         ModelFileError: no format is recognised, or it is damaged.
     """
+    check_file(path, LARGEST_BYTES, "give a model file")
     found = _format_of(path)
     if found is None:
         known = ", ".join(one.title for one in FORMATS)
         raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
-    model = found.read(path)
+    # The last bits hang on the number of threads, and workers, which have one, must find the same model.
+    with threadpool_limits(1, user_api="blas"), np.errstate(invalid="ignore", over="ignore"):
+        model = found.read(path)
     model.check(path)
     return found, model
 
 
 def is_known(path: Path) -> bool:
     """Whether `path` looks like a model in one of `FORMATS`."""
-    return path.exists() and _format_of(path) is not None
+    return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
 def format_to_write(path: Path, name: str | None) -> Format:
@@ -52,9 +81,6 @@ def format_to_write(path: Path, name: str | None) -> Format:
 def _format_of(path: Path) -> Format | None:
     head = b""
     if not path.is_dir():
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES)
-        except OSError as error:
-            raise FileError(f"{path} cannot be read: {error.strerror or error}.") from error
+        with open_file(path) as file:
+            head = file.read(_HEAD_BYTES)
     return next((one for one in FORMATS if one.recognises(path, head)), None)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices, vertex_normals
+from shapespace.geometry.surface import boundary_vertices, vertex_normals, without_vertices
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 
@@ -64,6 +64,7 @@ class SurfaceDistances:
         outside_of_model: (V,) True where the scan lies on the side to which the model's normal points; all True
             where the model has no triangles.
         scan_outside: (S,) the same of each scan vertex.
+        model_counted: (V,) False outside the region that they are held to; None where that is the whole model.
     """
 
     model_to_scan_mm: FloatArray
@@ -71,6 +72,7 @@ class SurfaceDistances:
     scan_counted: BoolArray
     outside_of_model: BoolArray
     scan_outside: BoolArray
+    model_counted: BoolArray | None = None
 
     @property
     def model_to_scan_signed_mm(self) -> FloatArray:
@@ -85,8 +87,9 @@ class SurfaceDistances:
 
     @property
     def model_to_scan(self) -> DistanceSummary:
-        """Summary over all model vertices: the paper's metric."""
-        return DistanceSummary.of(self.model_to_scan_mm)
+        """Summary over all model vertices that count: the paper's metric."""
+        counted = self.model_counted
+        return DistanceSummary.of(self.model_to_scan_mm if counted is None else self.model_to_scan_mm[counted])
 
     @property
     def scan_to_model(self) -> DistanceSummary:
@@ -99,7 +102,12 @@ class SurfaceDistances:
 
 
 def surface_distances(
-    model: Mesh, scan: Mesh, *, scan_engine: ClosestPointEngine | None = None, mm_per_length: float = 1.0
+    model: Mesh,
+    scan: Mesh,
+    *,
+    scan_engine: ClosestPointEngine | None = None,
+    mm_per_length: float = 1.0,
+    region: BoolArray | None = None,
 ) -> SurfaceDistances:
     """Measure closest distances between the vertices of each surface and the other surface.
 
@@ -108,19 +116,29 @@ def surface_distances(
         scan: the scan; point clouds are measured to their points.
         scan_engine: the scan's search structure when it is there already.
         mm_per_length: what one length in this frame is worth in mm of the model's frame.
+        region: (V,) the model's vertices that count; the scan is then measured to what lies between them. None for all.
     """
     engine = scan_engine or build_engine(scan)
     forward = engine.query(model.vertices)
-    backward = build_engine(model).query(scan.vertices)
-    counted = ~on_boundary(backward, model, boundary_vertices(model))
+    part = model if region is None else _part(model, region)
+    backward = build_engine(part).query(scan.vertices)
+    counted = ~on_boundary(backward, part, boundary_vertices(part))
     outside, scan_outside = np.ones(len(model.vertices), dtype=bool), np.ones(len(scan.vertices), dtype=bool)
     if model.faces is not None:
         normals = vertex_normals(model)
         outside = _in_front(forward.points - model.vertices, normals)
-        scan_outside = _in_front(scan.vertices - backward.points, _normals_at(backward, model, normals))
+        part_normals = normals if region is None else vertex_normals(part)
+        scan_outside = _in_front(scan.vertices - backward.points, _normals_at(backward, part, part_normals))
     return SurfaceDistances(
-        forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside
-    )
+        forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside,
+        region,
+    )  # fmt: skip
+
+
+def _part(mesh: Mesh, kept: BoolArray) -> Mesh:
+    if mesh.faces is None:
+        return Mesh(mesh.vertices[kept], None, name=mesh.name)
+    return Mesh(*without_vertices(mesh.vertices, mesh.faces, kept), name=mesh.name)
 
 
 def _in_front(away: FloatArray, normals: FloatArray) -> BoolArray:

@@ -67,7 +67,7 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
     if best[1] is None:
         raise MeshError(
             f"{mesh.name}: its surface cannot be spread out on a square, since triangles fold over; repair it, or use "
-            "the representation vertices."
+            "--representation vertices."
         )
     return np.ascontiguousarray(best[1][: len(mesh.vertices)])
 
@@ -128,7 +128,7 @@ def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntAr
     name, count = mesh.name, len(mesh.vertices)
     if not np.isfinite(mesh.vertices).all():
         raise MeshError(f"{name}: vertices that are not finite have no place on a square; fill or remove them.")
-    advice = "a B-spline surface needs one sheet with a rim; crop or repair it, or use the representation vertices."
+    advice = "a B-spline surface needs one sheet with a rim; crop or repair it, or use --representation vertices."
     if np.bincount(faces.ravel(), minlength=count).min() == 0:
         raise MeshError(f"{name}: some vertices belong to no triangle, but {advice}")
     start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)

@@ -50,7 +50,9 @@ def collapse(
     asked = _asked(vertices, faces, name)
     coarse, left, _, origin = _igl().decimate(*asked, triangles)
     if not len(left):
-        raise MeshError(f"{name} cannot be re-triangulated, since borders of it touch; clean the mesh first.")
+        raise MeshError(
+            f"{name} cannot be re-triangulated, since borders of it touch; clean the mesh in MeshLab (Cleaning) first."
+        )
     return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64), np.asarray(origin, dtype=np.int64)
 
 
@@ -75,7 +77,7 @@ def _asked(vertices: FloatArray, faces: npt.NDArray[np.integer], name: str) -> t
     if not is_sheet(faces):
         raise MeshError(
             f"{name} cannot be re-triangulated: more than two triangles share an edge, or neighbours disagree on which "
-            "side is outside; clean the mesh first."
+            "side is outside; clean the mesh in MeshLab (Cleaning) first."
         )
     return _plain(vertices, faces)
 

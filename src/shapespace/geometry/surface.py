@@ -15,7 +15,9 @@ def faces_of(mesh: Mesh) -> IntArray:
         MeshError: it is a point cloud.
     """
     if mesh.faces is None:
-        raise MeshError(f"{mesh.name} has no faces, and triangles are needed here; give a mesh, not a point cloud.")
+        raise MeshError(
+            f"{mesh.name} has no faces, and triangles are needed here; make a mesh of its points, as by MeshLab."
+        )
     return mesh.faces
 
 

@@ -169,7 +169,9 @@ def _cut_out(inside: BoolArray, margin: npt.NDArray[np.int_], name: str) -> tupl
         low[axis], high[axis] = along[0], along[-1] + 1
     if np.prod(high - low + 2 * margin) > _MOST_VOXELS:
         size = " x ".join(map(str, high - low))
-        raise InputError(f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it.")
+        raise InputError(
+            f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it, as by 3D Slicer."
+        )
     box = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     return np.pad(box, [(int(m), int(m)) for m in margin]), (low - margin).astype(np.float64)
 

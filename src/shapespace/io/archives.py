@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -27,12 +27,13 @@ _TOLD = 80
 _PLAIN_KINDS = "biufU"
 
 
-def read_arrays(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
+def read_arrays(path: Path, again: str, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of an .npz file by name.
 
     Args:
         path: of the file.
         again: what a reader can do about a file that is wrong.
+        wanted: names of arrays; others are not looked at. None for all.
 
     Raises:
         FileError: it cannot be read.
@@ -41,7 +42,7 @@ def read_arrays(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
     check_file(path, LARGEST_BYTES, again)
     try:
         with path.open("rb") as stream:
-            return arrays_in(stream, path.stat().st_size)
+            return arrays_in(stream, path.stat().st_size, wanted)
     except OSError as error:
         raise read_error(path, error) from error
     except ValueError as error:
@@ -50,14 +51,14 @@ def read_arrays(path: Path, again: str) -> dict[str, npt.NDArray[Any]]:
         ) from error
 
 
-def arrays_in(stream: BinaryIO, size: int) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an .npz in `stream`, of `size` bytes, by name.
+def arrays_in(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an .npz in `stream`, of `size` bytes, by name, those of `wanted` or all.
 
     Raises:
         OSError: it cannot be read.
         ValueError: as `read_arrays` refuses.
     """
-    members = zip_members(stream, size)
+    members = zip_members(stream, size, None if wanted is None else {f"{name}.npy" for name in wanted})
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name in list(members):
         try:
@@ -67,8 +68,8 @@ def arrays_in(stream: BinaryIO, size: int) -> dict[str, npt.NDArray[Any]]:
     return arrays
 
 
-def zip_members(stream: BinaryIO, size: int) -> dict[str, bytes]:
-    """Return the members of the archive in `stream`, of `size` bytes, by name.
+def zip_members(stream: BinaryIO, size: int, wanted: Collection[str] | None = None) -> dict[str, bytes]:
+    """Return the members of the archive in `stream`, of `size` bytes, by name, those of `wanted` or all.
 
     Raises:
         OSError: it cannot be read.
@@ -84,7 +85,7 @@ def zip_members(stream: BinaryIO, size: int) -> dict[str, bytes]:
                 raise ValueError("it would unpack to far more than its size")
             if any(info.compress_type not in _PACKED for info in infos):
                 raise ValueError("it is packed in a way that we do not use")
-            return {name: archive.read(name) for name in names}
+            return {name: archive.read(name) for name in names if wanted is None or name in wanted}
     except OSError:
         raise
     except Exception as error:  # a damaged archive may raise anything at all

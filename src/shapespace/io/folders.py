@@ -8,7 +8,7 @@ from pathlib import Path
 
 from shapespace.errors import InputError
 from shapespace.io.files import read_error
-from shapespace.io.meshes import MESH_ENDINGS
+from shapespace.io.meshes import MESH_ENDINGS, MESH_FILE_ENDINGS
 
 _NAMED = 3
 
@@ -41,7 +41,7 @@ def mesh_files(
     *,
     recursive: bool = False,
     apart_from: Path | None = None,
-    endings: Sequence[str] = MESH_ENDINGS,
+    endings: Sequence[str] = MESH_FILE_ENDINGS,
     what: str = "meshes",
 ) -> MeshFiles:
     """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
@@ -68,7 +68,8 @@ def mesh_files(
         if not found.files:
             below = "; give --recursive for what lies in the folders below it" if found.folders else ""
             below += "; unpack those that are compressed with gunzip" if found.packed else ""
-            raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(endings)}.")
+            known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
+            raise InputError(f"{path} holds no {what}{below}; shapespace reads {', '.join(known)}.")
         files += found.files
         left_out += _sentences(path, found, what)
     return MeshFiles(tuple(files), tuple(left_out))

@@ -8,9 +8,10 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -42,6 +43,32 @@ _HARMLESS_TOO = ("KHR_mesh_quantization", "KHR_animation_pointer")
 _FAR = 16.0
 
 Values = npt.NDArray[Any]
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True, eq=False)
+class Morphs:
+    """A mesh with morph targets.
+
+    Args:
+        vertices: (V, 3) where all weights are zero, in the frame of the scene.
+        faces: (F, 3), or None for points.
+        targets: (K, V, 3) what a weight of one adds to the vertices.
+        names: (K,) of the targets, or none.
+        weights: (K,) with which the file shows it.
+        extras: what the mesh says beside.
+        copyright: what the file says of it.
+        n_others: how many more meshes there are in the scene.
+    """
+
+    vertices: FloatArray
+    faces: IndexArray | None
+    targets: FloatArray
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    extras: Any
+    copyright: str
+    n_others: int
 
 
 @dataclass
@@ -76,10 +103,14 @@ class _Gltf:
                 raise damaged(self.path, "it has a buffer that is not base64; export it again")
             return base64.b64decode(body, validate=True)
         folder = self.path.parent.resolve()
-        target = (folder / unquote(uri)).resolve()
+        try:
+            target = (folder / unquote(uri)).resolve()
+            is_there = target.exists()
+        except OSError as error:  # a name too long for the system
+            raise damaged(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
         if "://" in uri or not target.is_relative_to(folder):
             raise damaged(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
-        if not target.exists():
+        if not is_there:
             raise damaged(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
         try:
             data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
@@ -159,6 +190,23 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
             holds no points, or makes more of its bytes than `io.limits` allows.
         MeshError: faces that point past the end of the vertices.
     """
+    return _parsed(data, path, _scene)
+
+
+def read_morphs(data: bytes, path: Path) -> Morphs:
+    """Read the mesh with morph targets in glTF or GLB that has most vertices; the others are counted.
+
+    Args:
+        data: the whole file.
+        path: its name; buffers beside it are read as in `read_gltf`.
+
+    Raises:
+        FileFormatError: as `read_gltf`, or no mesh has morph targets.
+    """
+    return _parsed(data, path, _morphs)
+
+
+def _parsed(data: bytes, path: Path, read: Callable[[_Gltf], Found]) -> Found:
     binary: bytes | None = None
     if data[:4] == b"glTF":
         text, binary = _chunks(data, path)
@@ -170,7 +218,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
         if not str(tree["asset"]["version"]).startswith("2"):
             raise damaged(path, "it is not glTF of version 2")
         _refuse_unknown(tree.get("extensionsRequired", []), path)
-        return _scene(_Gltf(path, tree, binary, Allowance(len(data), path)))
+        return read(_Gltf(path, tree, binary, Allowance(len(data), path)))
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
         raise damaged(path, f"it is not valid glTF; {CUT_SHORT}") from error
     except ValueError as error:
@@ -208,7 +256,8 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     return found[b"JSON"], found.get(b"BIN\0")
 
 
-def _scene(gltf: _Gltf) -> Mesh:
+def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray]]:
+    """Yield the nodes of the scene that show a mesh, and the (4, 4) transforms from theirs to the scene's frame."""
     tree = gltf.tree
     nodes: list[Any] = tree.get("nodes", [])
     scenes: list[Any] = tree.get("scenes", [])
@@ -220,9 +269,6 @@ def _scene(gltf: _Gltf) -> Mesh:
         roots = [i for i in range(len(nodes)) if i not in children]
     if not nodes and tree.get("meshes"):
         nodes, roots = [{"mesh": i} for i in range(len(tree["meshes"]))], list(range(len(tree["meshes"])))
-    points: list[FloatArray] = []
-    faces: list[IndexArray] = []
-    before = 0
     seen: set[int] = set()
     stack: list[tuple[int, FloatArray]] = [(int(root), np.eye(4)) for root in reversed(roots)]
     while stack:
@@ -234,8 +280,15 @@ def _scene(gltf: _Gltf) -> Mesh:
         node = nodes[index]
         matrix = parent @ _local(node)
         stack += [(int(child), matrix) for child in reversed(node.get("children", []))]
-        if "mesh" not in node:
-            continue
+        if "mesh" in node:
+            yield node, matrix
+
+
+def _scene(gltf: _Gltf) -> Mesh:
+    points: list[FloatArray] = []
+    faces: list[IndexArray] = []
+    before = 0
+    for node, matrix in _nodes_with_meshes(gltf):
         for vertices, triangles in _primitives(gltf, node):
             gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
@@ -248,6 +301,61 @@ def _scene(gltf: _Gltf) -> Mesh:
         raise damaged(gltf.path, "its scene holds no points and no triangles")
     joined = np.concatenate(faces) if faces else None
     return mesh_of(np.concatenate(points), joined, gltf.path)
+
+
+def _morphs(gltf: _Gltf) -> Morphs:
+    """Return the mesh with morph targets of most vertices."""
+    shown = list(_nodes_with_meshes(gltf))
+    sizes = [_morphed_vertices(gltf, node) for node, _ in shown]
+    if not any(sizes):
+        raise damaged(gltf.path, "it has no mesh with morph targets")
+    node, matrix = shown[int(np.argmax(sizes))]
+    mesh = gltf.tree["meshes"][node["mesh"]]
+    count = len(mesh["primitives"][0]["targets"])
+    gltf.allowance.part(count)
+    # Without its weights, so that what is read is the shape from which the targets are counted.
+    parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()})
+    vertices = np.concatenate([points for points, _ in parts])
+    gltf.allowance.take(vertices.size * (count + 1), 8)
+    targets = np.zeros((count, len(vertices), 3))
+    before, done, faces = 0, set[int](), list[IndexArray]()
+    for primitive in mesh["primitives"]:
+        key = primitive["attributes"]["POSITION"]
+        if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in done:
+            continue
+        done.add(key)
+        points, triangles = parts[len(done) - 1]
+        for k, target in enumerate(primitive.get("targets", ())):
+            gltf.allowance.part()
+            if "POSITION" in target:
+                targets[k, before : before + len(points)] = gltf.accessor(target["POSITION"]).reshape(len(points), 3)
+        if triangles is not None:
+            faces.append(triangles + before)
+        before += len(points)
+    turned = matrix[:3, :3]
+    joined_faces = np.concatenate(faces) if faces else None
+    if joined_faces is not None and np.linalg.det(turned) < 0:
+        joined_faces = joined_faces[:, ::-1]
+    extras: Any = mesh.get("extras", {})
+    names = tuple(map(str, extras.get("targetNames", ()) if isinstance(extras, dict) else ()))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+    weights = node.get("weights", mesh.get("weights", []))
+    return Morphs(
+        vertices=vertices @ turned.T + matrix[:3, 3],
+        faces=joined_faces,
+        targets=targets @ turned.T,
+        names=names if len(names) == count else (),
+        weights=tuple(float(weight) for weight in weights),
+        extras=extras,
+        copyright=str(gltf.tree["asset"].get("copyright", "")),
+        n_others=len(shown) - 1,
+    )
+
+
+def _morphed_vertices(gltf: _Gltf, node: dict[str, Any]) -> int:
+    primitives = gltf.tree["meshes"][node["mesh"]]["primitives"]
+    gltf.allowance.part(len(primitives))
+    accessors = gltf.tree["accessors"]
+    return sum(int(accessors[one["attributes"]["POSITION"]]["count"]) for one in primitives if one.get("targets"))
 
 
 def _local(node: dict[str, Any]) -> FloatArray:
@@ -342,7 +450,6 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": len(binary)}],
     }
     return tree, binary
 
@@ -353,9 +460,7 @@ def write_gltf(mesh: Mesh) -> bytes:
     Raises:
         InputError: no points, or coordinates that are not finite or too large for float32.
     """
-    tree, binary = _content(mesh)
-    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
-    return json.dumps(tree).encode("utf-8")
+    return gltf_bytes(*_content(mesh))
 
 
 def write_glb(mesh: Mesh) -> bytes:
@@ -364,9 +469,20 @@ def write_glb(mesh: Mesh) -> bytes:
     Raises:
         InputError: no points, or coordinates that are not finite or too large for float32.
     """
-    tree, binary = _content(mesh)
-    text = json.dumps(tree).encode("utf-8")
+    return glb_bytes(*_content(mesh))
+
+
+def gltf_bytes(tree: dict[str, Any], binary: bytes) -> bytes:
+    """Return the JSON file of `tree` with `binary`, its only buffer, inside."""
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    return json.dumps({**tree, "buffers": [{"byteLength": len(binary), "uri": uri}]}).encode("utf-8")
+
+
+def glb_bytes(tree: dict[str, Any], binary: bytes) -> bytes:
+    """Return the binary file of `tree` and `binary`, its only buffer."""
+    text = json.dumps({**tree, "buffers": [{"byteLength": len(binary)}]}).encode("utf-8")
     text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
     length = 12 + 8 + len(text) + 8 + len(binary)
     out = b"glTF" + (2).to_bytes(4, "little") + length.to_bytes(4, "little")
     out += len(text).to_bytes(4, "little") + b"JSON" + text

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.errors import FileFormatError
-from shapespace.io.files import read_bytes, write_bytes
+from shapespace.errors import FileError, FileFormatError
+from shapespace.io.files import open_file, read_bytes, write_bytes
 from shapespace.io.hdf5_parts import SIGNATURE, Attribute, OtherHdf5Error, hdf5_parts
 from shapespace.io.json_files import check_file
 
@@ -78,11 +78,13 @@ def _user_block(data: bytes | memoryview) -> bytes:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether `path` begins as `write_hdf5` has files begin; False where it cannot be read."""
+    """Whether `path` is a file that begins as `write_hdf5` has files begin; False where it cannot be read."""
+    if not path.is_file():  # a pipe would have its reader wait
+        return False
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.read(len(_MAGIC)) == _MAGIC
-    except OSError:
+    except (OSError, FileError):
         return False
 
 

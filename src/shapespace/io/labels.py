@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes
+from shapespace.io.meshes import stem_of
 
 LABELS_FILE = "labels.csv"
 _NAMES = ("file", "scan", "name")
@@ -74,7 +75,7 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
         text = _printable(row.get(label) or "")
         subject = _printable(row.get("subject") or "")
         if row.get(name) and (text or subject):
-            place = PurePath(row[name].replace("\\", "/")).with_suffix("")
+            place = PurePath(row[name].replace("\\", "/").removesuffix(".gz")).with_suffix("")
             named.setdefault(place.name, {})[place] = Label(text, _intensity(row.get("intensity")), subject)
     found: dict[str, Label] = {}
     for stem, group in named.items():
@@ -88,7 +89,7 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
 def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
     """Return the label of the scan in `file`, from `labels` as `read_labels` gives them; None if they have none."""
     parts = file.resolve().parent.parts[1:]
-    names = ("_".join((*parts[len(parts) - depth :], file.stem)) for depth in range(len(parts) + 1))
+    names = ("_".join((*parts[len(parts) - depth :], stem_of(file))) for depth in range(len(parts) + 1))
     return next((labels[name] for name in names if name in labels), None)
 
 

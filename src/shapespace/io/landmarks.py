@@ -45,12 +45,14 @@ def read_landmarks(path: Path | str) -> dict[str, FloatArray]:
     """Read named points, in the file's own frame and unit; those marked as absent are left out.
 
     menpo `.ljson` names groups of points, not points: the points of a label with several are called `label_0`,
-    `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the
-    label, points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes
-    before. 3D Slicer files are returned in LPS, the frame in which Slicer saves meshes: RAS is turned by
-    changing the sign of x and y. CSV is `name,x,y,z`, with or without that header, `#` for comments. The points of
-    BU-3DFE (`.bnd`, a vertex number and x y z in each row) have no names: they are called `point_0`, ... by their
-    position in the file. Bosphorus (`.lm3`) names its points.
+    `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the label,
+    points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes before. 3D
+    Slicer files (`.mrk.json`, `.fcsv`) are returned in LPS, the frame in which Slicer saves meshes: RAS, in which
+    an `.fcsv` is that does not say, is turned by changing the sign of x and y. CSV is `name,x,y,z`, with or without
+    that header, `#` for comments. The points of BU-3DFE (`.bnd`, a vertex number and x y z in each row) have no
+    names: they are called `point_0`, ... by their position in the file, as those of `.tps` are, and of the plain
+    rows `x y z` in `.txt` and `.pts` that have no name before them. Bosphorus (`.lm3`) and scalismo (`.tlms`) name
+    their points.
 
     Args:
         path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; `.json` is told
@@ -403,6 +405,99 @@ def _read_lm3(data: bytes, path: Path) -> Pairs:
     ]
 
 
+_FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+
+
+def _read_fcsv(data: bytes, path: Path) -> Pairs:
+    columns, system = _FCSV_COLUMNS.split(","), "RAS"
+    for line in _text_lines(data):
+        name, found, value = line.lstrip("# ").partition("=")
+        if line.startswith("#") and found:
+            if name.strip().lower() == "columns":
+                columns = [cell.strip() for cell in value.split(",")]
+            elif name.strip().lower() == "coordinatesystem":
+                system = {"0": "RAS", "1": "LPS"}.get(value.strip(), value.strip().upper())
+    if system not in ("LPS", "RAS"):
+        raise damaged(path, f"its coordinate system is '{system[:20]}', neither LPS nor RAS")
+    if not {"x", "y", "z"} <= set(columns):
+        raise damaged(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
+    sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
+    out: Pairs = []
+    for row in _csv_rows(data, path):
+        entry = dict(zip(columns, row, strict=False))
+        name = entry.get("label") or entry.get("id") or ""
+        point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)
+        out.append((name, sign * point + 0.0))
+    return out
+
+
+def _write_fcsv(landmarks: Mapping[str, FloatArray]) -> str:
+    head = f"# Markups fiducial file version = 5.6\n# CoordinateSystem = LPS\n# columns = {_FCSV_COLUMNS}\n"
+    rows = (
+        [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, "", ""]
+        for i, (name, point) in enumerate(landmarks.items(), start=1)
+    )
+    return head + _csv_text(rows)
+
+
+def _read_tps(data: bytes, path: Path) -> Pairs:
+    lines = [line for line in _text_lines(data) if line]
+    heads = [re.fullmatch(r"LM(3?)\s*=\s*(\d{1,6})", line, re.IGNORECASE) for line in lines]
+    starts = [at for at, head in enumerate(heads) if head]
+    if len(starts) != 1:
+        what = f"it has {len(starts)} specimens, so save each in a file of its own" if starts else "it has no LM3="
+        raise damaged(path, what)
+    head = heads[starts[0]]
+    if head is None or not head[1]:
+        raise damaged(path, "its landmarks are of two dimensions (LM=), and those of a surface have three (LM3=)")
+    rest = lines[starts[0] + 1 :]
+    points = [line for line in rest if "=" not in line]
+    if len(points) != int(head[2]):
+        raise damaged(path, f"it says {head[2]} landmarks, but {len(points)} rows follow; it is damaged or cut short")
+    return [
+        (f"point_{i}", _point(line.split(), f"point_{i}", path))
+        for i, line in enumerate(points)
+        # As geomorph and tps programs have a point that is not there.
+        if "NA" not in line.upper().split()
+    ]
+
+
+def _read_tlms(data: bytes, path: Path) -> Pairs:
+    out: Pairs = []
+    for line in filter(None, _text_lines(data)):
+        words = line.split()
+        if len(words) != 5 or words[1] not in ("0", "1"):
+            raise damaged(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
+        if words[1] == "1":
+            out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path)))
+    return out
+
+
+_POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,6})|[{}]", re.IGNORECASE)
+
+
+def _read_points(data: bytes, path: Path) -> Pairs:
+    """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
+    out: Pairs = []
+    said = None
+    for line in _text_lines(data):
+        row = line.partition("#")[0].strip()
+        head = _POINTS_HEAD.fullmatch(row)
+        if not row or head:
+            said = int(next(filter(None, head.groups()), 0)) or said if head else said
+            continue
+        words = re.split(r"[\s,;]+", row.rstrip(",;"))
+        name = words[0] if len(words) == 4 else f"point_{len(out)}"
+        if not out and not any(map(_is_number, words)):
+            continue  # names of columns
+        if len(words) not in (3, 4):
+            raise damaged(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
+        out.append((name, _point(words[-3:], f"landmark '{name[:60]}'", path)))
+    if said is not None and said != len(out):
+        raise damaged(path, f"it says {said} landmarks, but {len(out)} rows follow; it is damaged or cut short")
+    return out
+
+
 LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
         ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
@@ -410,11 +505,19 @@ LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
         ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
         ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
+        ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, _write_fcsv),
     }
 )
 """File name ending -> landmark format that is read and written."""
 
 READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxyType(
-    {".bnd": _read_bnd, ".lm3": _read_lm3}
+    {
+        ".bnd": _read_bnd,
+        ".lm3": _read_lm3,
+        ".tps": _read_tps,
+        ".tlms": _read_tlms,
+        ".txt": _read_points,
+        ".pts": _read_points,
+    }
 )
 """File name ending -> reader (content, path) -> names and points, for formats that are not written."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import MappingProxyType
 
 import numpy as np
@@ -13,18 +13,23 @@ from shapespace.errors import FileFormatError
 from shapespace.io.bnt import read_bnt
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
+from shapespace.io.las import read_las
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
+from shapespace.io.mat_mesh import read_mat_mesh
 from shapespace.io.obj import read_obj, write_obj
 from shapespace.io.off import read_off, write_off
+from shapespace.io.packed import GZIP, unpacked
 from shapespace.io.parsing import plain_text
+from shapespace.io.pcd import read_pcd
 from shapespace.io.ply import read_ply, write_ply
 from shapespace.io.raw import read_raw
 from shapespace.io.stl import read_stl, write_stl
 from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
+from shapespace.io.xyz import read_xyz
 from shapespace.types import Mesh
 
-_GZIP = b"\x1f\x8b"
+_PACKED = ".gz"
 
 
 @dataclass(frozen=True)
@@ -55,24 +60,26 @@ def read_mesh(path: Path | str) -> Mesh:
     equal ones are merged in the order of first appearance). Polygons become fans of triangles.
 
     Args:
-        path: a file with one of the endings in `MESH_ENDINGS`, in any case.
+        path: a file with one of the endings in `MESH_ENDINGS` or `NAMED_FORMATS`, in any case, packed by gzip
+            (`.ply.gz`) or not.
 
     Returns:
         The mesh as the file has it, with whatever is wrong with it.
 
     Raises:
         FileError: it does not exist, cannot be read, is no file, or is longer than `LARGEST_MESH_FILE_BYTES`.
-        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, compressed
-            as a whole, or out of proportion to the file (`io.limits`).
+        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, or out of
+            proportion to the file (`io.limits`).
         MeshError: faces that point past the end of the vertices.
     """
     path = Path(path)
-    read = READ_ONLY_FORMATS.get(path.suffix.lower()) or _format(path, "read").read
+    ending = ending_of(path)
+    read = READ_ONLY_FORMATS.get(ending) or NAMED_FORMATS.get(ending) or _format(path, "read").read
     data = read_bytes(path, LARGEST_MESH_FILE_BYTES)
+    if data.startswith(GZIP):
+        data = unpacked(data, path, LARGEST_MESH_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
-    if data.startswith(_GZIP):
-        raise FileFormatError(f"Cannot read {path}: it is compressed by gzip, so unpack it with gunzip first.")
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
     with np.errstate(invalid="ignore", over="ignore"):
         return read(data, path)
@@ -94,14 +101,28 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
     write_bytes(path, _format(path, "write").write(mesh))
 
 
+def ending_of(path: PurePath | str) -> str:
+    """Return the ending that tells the format, in small letters: `.ply` of `a.PLY` and of `a.ply.gz`."""
+    return _unpacked_name(path).suffix.lower()
+
+
+def stem_of(path: PurePath | str) -> str:
+    """Return the name of a scan without its ending: `a` of `a.ply` and of `a.ply.gz`."""
+    return _unpacked_name(path).stem
+
+
+def _unpacked_name(path: PurePath | str) -> PurePath:
+    name = PurePath(path).name
+    return PurePath(name[: -len(_PACKED)] if name.lower().endswith(_PACKED) else name)
+
+
 def _format(path: Path, verb: str) -> MeshFormat:
-    found = MESH_FORMATS.get(path.suffix.lower())
+    ending = ending_of(path) if verb == "read" else path.suffix.lower()
+    found = MESH_FORMATS.get(ending)
     if found is None:
-        known = path.suffix.lower() in READ_ONLY_FORMATS
+        known = ending in READ_ONLY_FORMATS
         what = "can be read, not written" if known else "is not a mesh format"
         endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
-        if verb == "read" and path.suffix.lower() == ".gz":
-            what += ", so unpack it with gunzip first"
         raise FileFormatError(
             f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}."
         )
@@ -129,9 +150,23 @@ MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
 """File name ending -> format that is read and written."""
 
 READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType(
-    {".wrl": read_vrml, ".raw": read_raw, ".bnt": read_bnt}
+    {
+        ".wrl": read_vrml,
+        ".raw": read_raw,
+        ".bnt": read_bnt,
+        ".xyz": read_xyz,
+        ".pts": read_xyz,
+        ".pcd": read_pcd,
+        ".las": read_las,
+    }
 )
 """File name ending -> reader (content, path) -> mesh, for formats that are not written."""
 
+NAMED_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType({".mat": read_mat_mesh})
+"""The same for endings under which most files are none, so that those are read where they are named, not in folders."""
+
 MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
 """The endings that `read_mesh` takes."""
+
+MESH_FILE_ENDINGS = (*MESH_ENDINGS, *(f"{ending}{_PACKED}" for ending in MESH_ENDINGS))
+"""With those of files packed by gzip."""

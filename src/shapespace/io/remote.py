@@ -101,7 +101,7 @@ def _copy(address: str, file: Path, most_bytes: int) -> None:
             while piece := source.read(_PIECE):
                 count += len(piece)
                 if count > most_bytes:
-                    raise InputError(f"{address} is larger than {most_bytes:,} bytes; thin the scan.")
+                    raise InputError(f"{address} is larger than {most_bytes:,} bytes; thin the scan, as by MeshLab.")
                 copy.write(piece)
 
 

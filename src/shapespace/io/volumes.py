@@ -148,7 +148,9 @@ def _bounded(path: Path) -> bytes:
     except OSError as error:
         raise read_error(path, error) from error
     if size > _MOST_BYTES + _MOST_HEADER:
-        raise FileError(f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it.")
+        raise FileError(
+            f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer."
+        )
     data = read_bytes(path)
     if not data:
         raise damaged(path, "it is empty; export or copy it again")
@@ -333,7 +335,9 @@ def _check_declared(head: _Head, available: int, growth: int, path: Path) -> Non
         raise damaged(path, f"its header declares {size} voxels, so that there are none; export it again")
     if head.bytes > _MOST_BYTES:
         raise damaged(
-            path, f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it"
+            path,
+            f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
+            "by 3D Slicer",
         )
     if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > growth * available:
         raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")

@@ -325,7 +325,9 @@ def _neutrals_and_expressions(
     neutrals = np.stack([np.asarray(np.mean(shapes, axis=0)) for shapes in own_neutrals.values()])
     expressions = np.stack([meshes[i].vertices for i in expressive])
     if not (np.isfinite(neutrals).all() and np.isfinite(expressions).all()):
-        raise InputError("The training meshes hold vertices that are not finite; repair them or leave them out.")
+        raise InputError(
+            "The training meshes hold vertices that are not finite; see shapespace check, and repair or leave them out."
+        )
     return neutrals, expressions, list(own_neutrals), expressive
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import ModelFileError
+from shapespace.formats.eos import read_blendshapes
 from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, orthonormal
 from shapespace.formats.registry import is_known, read_linear
 from shapespace.io.hdf5 import is_ours
@@ -43,21 +44,24 @@ def is_foreign(path: Path) -> bool:
 
 def looks_like_model(path: Path) -> bool:
     """Whether `path` is named as a model of shapespace, or is one of another tool."""
-    return path.suffix.lower() in OWN_ENDINGS or is_foreign(path)
+    return (path.suffix.lower() in OWN_ENDINGS and not path.is_dir()) or is_foreign(path)
 
 
-def load_foreign(path: Path, mm: float | None = None) -> Foreign:
+def load_foreign(path: Path, mm: float | None = None, expressions: Path | None = None) -> Foreign:
     """Return the model in `path`, in whatever format of another tool it is.
 
     Args:
         path: a file or a folder.
         mm: how many mm one unit of it is; None for what its format says, or 1.
+        expressions: a file of blendshapes that belong to it, in the same unit; None for those that it brings.
 
     Raises:
         FileError: it cannot be read.
-        ModelFileError: it is in no known format, damaged, or holds no variation.
+        ModelFileError: it is in no known format, damaged, or holds no variation; or the expressions are of another.
     """
     found, linear = read_linear(path)
+    if expressions is not None:
+        linear = _with_expressions(linear, path, expressions)
     notes = list(linear.notes)
     if mm is None and linear.mm is None:
         notes.append("The file names no unit; mm are taken.")
@@ -99,6 +103,7 @@ def load_foreign(path: Path, mm: float | None = None) -> Foreign:
         "licence": linear.licence,
         "held_out": linear.held_out,
         "residuals": None,
+        "regions": {},
     }
     return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
 
@@ -131,6 +136,20 @@ def parted(linear: LinearModel, rotation: FloatArray, n_identity: int) -> Linear
     return replace(linear, shape=Modes(moved[:, :n_identity]), expression=Modes(moved[:, n_identity:]))
 
 
+def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> LinearModel:
+    block = read_blendshapes(expressions)
+    if linear.expression is not None:
+        raise ModelFileError(f"{path} has expressions of its own; leave those in {expressions} out.")
+    if len(block.moved) != linear.mean.size:
+        raise ModelFileError(
+            f"{expressions} is of {len(block.moved) // 3} vertices, and {path} has {len(linear.mean)}; give the "
+            "blendshapes of that model."
+        )
+    whole = replace(linear, expression=block)
+    whole.check(expressions)
+    return whole.noting(f"A weight of one of the {block.moved.shape[1]} blendshapes is one standard deviation.")
+
+
 def _changes(moved: FloatArray, kept: int, *, parted: bool) -> list[str]:
     length = np.linalg.norm(moved, axis=0)
     there = length > 0
@@ -138,8 +157,8 @@ def _changes(moved: FloatArray, kept: int, *, parted: bool) -> list[str]:
     skew = float(np.abs(unit.T @ unit - np.eye(unit.shape[1])).max(initial=0.0))
     said: list[str] = []
     if skew > ORTHOGONAL:
-        why = "Identity and expression overlap" if parted else "The basis was not orthonormal"
-        said.append(f"{why} (by {skew:.2g}) and was made so, which keeps the covariance.")
+        what = "Modes of identity and expression were" if parted else "The basis was"
+        said.append(f"{what} not orthonormal (by {skew:.2g}) and made so, which keeps the covariance.")
     if kept < moved.shape[1]:
         said.append(f"{moved.shape[1] - kept} of {moved.shape[1]} modes do not vary and are left out.")
     return said

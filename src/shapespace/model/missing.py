@@ -82,6 +82,11 @@ class Kept:
         cut = [_cut(mesh, kept) for mesh in meshes]
         return Kept(cut, kept)
 
+    def regions(self, regions: Mapping[str, IntArray]) -> dict[str, IntArray]:
+        """Return what is left of each region, in new numbers; regions of which nothing is left are left out."""
+        number = np.cumsum(self.vertices, dtype=np.int32) - 1
+        return {name: number[at[self.vertices[at]]] for name, at in regions.items() if self.vertices[at].any()}
+
     def landmarks(self, landmarks: Mapping[str, int]) -> dict[str, int]:
         """Return those that lie on kept vertices, in their new numbers."""
         number = np.cumsum(self.vertices) - 1

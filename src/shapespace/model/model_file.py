@@ -23,11 +23,12 @@ FORMAT_NAME = "shapespace model"
 FORMAT_VERSION = 1
 _HELD_OUT = "held out"
 _RESIDUALS = "residuals"
-_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS)
+_REGIONS = "regions"
+_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS)
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3
 _TOLD = 200
-_WHOLE_NUMBERS = ("faces", "control_counts", "degree")
+_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS)
 
 
 class _Told(Struct, frozen=True):
@@ -41,6 +42,7 @@ class _Told(Struct, frozen=True):
     provenance: str
     licence: str
     variance_divisor: str = ""
+    regions: str = "{}"
 
 
 class ModelFields(TypedDict):
@@ -60,6 +62,7 @@ class ModelFields(TypedDict):
     licence: str
     held_out: bool
     residuals: FloatArray | None
+    regions: Mapping[str, IntArray]
 
 
 def hash_of(model: ModelFields) -> str:
@@ -100,7 +103,22 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "provenance": model["provenance"],
         "licence": model["licence"],
     }
+    # Only where there are some, so that models without any keep their hash.
+    if regions := model["regions"]:
+        arrays[_REGIONS] = np.concatenate(list(regions.values()))
+        attributes[_REGIONS] = json.dumps({name: len(vertices) for name, vertices in regions.items()})
     return arrays, attributes
+
+
+def _regions(told: str, vertices: IntArray | None) -> dict[str, IntArray]:
+    """Return name -> vertices, of what the attribute tells of how many each has, and the array of all of them."""
+    counts = msgspec.convert(plain_json(told), dict[str, int])
+    ends = np.cumsum(list(counts.values()), dtype=np.int64)
+    if any(count < 1 for count in counts.values()) or sum(counts.values()) != (
+        0 if vertices is None else vertices.size
+    ):
+        raise ValueError("regions do not belong to their names")
+    return dict(zip(counts, np.split(vertices, ends[:-1]), strict=True)) if vertices is not None else {}
 
 
 def load(path: Path) -> ModelFields:
@@ -150,6 +168,7 @@ def load(path: Path) -> ModelFields:
             "licence": told.licence,
             "held_out": told.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
+            "regions": _regions(told.regions, owned.get(_REGIONS)),
         }
     except (KeyError, ValueError) as error:
         what = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")

@@ -11,9 +11,10 @@ second does not see it at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from functools import cached_property
+from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -42,6 +43,8 @@ _ANY = 1e-9
 """Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
 _LEAST_NOISE = 1e-6
 """Share of the variance that is noise where the modes hold all of it."""
+_DRAWN_AT_ONCE = 5
+"""Random shapes of one part of the work."""
 _FAR = 0.05
 """Of the size of a surface: what lies farther from its scan is no surface of it."""
 
@@ -263,6 +266,139 @@ def _cut(shape: Mesh, kept: BoolArray) -> Mesh:
     return Mesh(*without_vertices(shape.vertices, shape.faces, kept), name=shape.name)
 
 
+@dataclass(frozen=True)
+class Part:
+    """A part of a measurement that needs no other: a fold, or some random shapes.
+
+    Args:
+        held: numbers of the shapes that are left out.
+        order: of all others, of which the first ones make the smaller models.
+        drawn: numbers of the random shapes.
+    """
+
+    held: tuple[int, ...] = ()
+    order: tuple[int, ...] = ()
+    drawn: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What all parts of a measurement share.
+
+    Args:
+        meshes: at least three, in correspondence.
+        scans: one a mesh, or None for the meshes themselves.
+        settings: of the measurement.
+    """
+
+    meshes: Sequence[Mesh]
+    scans: Sequence[Mesh] | None
+    settings: QualitySettings
+
+    @cached_property
+    def folds(self) -> list[IntArray]:
+        """Numbers of the shapes in each fold."""
+        return _folds(len(self.meshes), self.settings)
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """Numbers of modes that are tried."""
+        most = len(self.meshes) - max(len(fold) for fold in self.folds) - 1
+        return _counts(min(self.settings.modes or most, most))
+
+    @cached_property
+    def few_counts(self) -> IntArray:
+        """Those for the specificity."""
+        counts = self.counts
+        picked = np.linspace(0, len(counts) - 1, min(len(counts), _MOST_SPECIFIC))
+        return counts[np.unique(picked.round().astype(int))]
+
+    @cached_property
+    def sizes(self) -> list[int]:
+        """Numbers of training shapes of the smaller models."""
+        least = len(self.meshes) - max(len(fold) for fold in self.folds)
+        return sorted({max(2, round(share * least)) for share in _PARTS})
+
+    @cached_property
+    def space(self) -> _Space:
+        """The shape space of all."""
+        return self.settings.space(self.meshes)
+
+    @cached_property
+    def targets(self) -> list[_Target]:
+        """What each shape is judged against."""
+        return [_Target.of(mesh, None if self.scans is None else self.scans[i]) for i, mesh in enumerate(self.meshes)]
+
+    @cached_property
+    def trained(self) -> list[_Target]:
+        """The same of the vertices that the shape space has."""
+        return [target.cut_to(self.space.kept) for target in self.targets]
+
+    @cached_property
+    def drawn(self) -> FloatArray:
+        """(S, K) coefficients of the random shapes."""
+        return self.space.model.sample(self.settings.samples, np.random.default_rng(self.settings.seed + 2))
+
+    @cached_property
+    def nearest(self) -> _Nearest:
+        """The training shapes in the pose of the model."""
+        return _Nearest.of(_posed(self.space.model, self.trained, self.settings), self.space.model.n_vertices)
+
+    def parts(self) -> list[Part]:
+        """Return all parts of the work, in the order in which they are told."""
+        n, rng = len(self.meshes), np.random.default_rng(self.settings.seed + 1)
+        folds: list[Part] = []
+        for fold in self.folds:
+            order = tuple(int(i) for i in rng.permutation(n) if i not in fold)
+            folds.append(Part(tuple(fold.tolist()), order))
+        samples = range(self.settings.samples)
+        return folds + [Part(drawn=tuple(samples[at : at + _DRAWN_AT_ONCE])) for at in samples[::_DRAWN_AT_ONCE]]
+
+    def do(self, part: Part) -> FloatArray:
+        """Return errors, mm: of shapes left out (H, n + m, 2), the last m of models of fewer shapes; or of random ones.
+
+        Raises:
+            InputError: scans that are not theirs.
+        """
+        return self._left_out(part) if part.held else self._drawn(part)
+
+    def _left_out(self, part: Part) -> FloatArray:
+        held = [self.targets[i] for i in part.held]
+        space = self.settings.space([self.meshes[i] for i in sorted(part.order)])
+        out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
+        for row, target in enumerate(held):
+            out[row, : len(self.counts)] = _told(space.model, target.cut_to(space.kept), self.counts)
+        for column, size in enumerate(self.sizes, len(self.counts)):
+            fewer = self.settings.space([self.meshes[i] for i in sorted(part.order[:size])])
+            only = np.array([min(self.settings.modes or size - 1, size - 1)], dtype=np.int32)
+            for row, target in enumerate(held):
+                out[row, column] = _told(fewer.model, target.cut_to(fewer.kept), only, surface=False)[0]
+        return out
+
+    def _drawn(self, part: Part) -> FloatArray:
+        """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
+        model, counts = self.space.model, self.few_counts
+        mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
+        out = np.zeros((len(part.drawn), len(counts), 2))
+        for row, b in enumerate(self.drawn[list(part.drawn)]):
+            for column, k in enumerate(counts):
+                out[row, column] = self.nearest.off(mean + (b[:k] @ modes[:k]).reshape(-1, 3))
+        return out
+
+
+class Runner(Protocol):
+    """Does the parts of a measurement, here or elsewhere, and yields them as they end."""
+
+    def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
+        """Yield what came of each of `parts`, in any order."""
+        ...
+
+
+def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
+    """Do one part after the other in this process."""
+    return ((part, shapes.do(part)) for part in parts)
+
+
 @dataclass
 class _Steps:
     """Counts what is done for whoever waits."""
@@ -271,8 +407,8 @@ class _Steps:
     on_step: OnStep | None
     done: int = field(default=0)
 
-    def step(self) -> None:
-        self.done += 1
+    def step(self, count: int = 1) -> None:
+        self.done += count
         if self.on_step is not None:
             self.on_step(self.done, self.total)
 
@@ -284,6 +420,7 @@ def measure_quality(
     scans: Sequence[Mesh] | None = None,
     unseen: Sequence[Mesh] = (),
     on_step: OnStep | None = None,
+    run: Runner = run_here,
 ) -> ModelQuality:
     """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
 
@@ -294,6 +431,7 @@ def measure_quality(
         scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
         unseen: meshes in correspondence that no model saw.
         on_step: called with what is done and what there is to do.
+        run: does folds and random shapes, here or elsewhere.
 
     Raises:
         CorrespondenceError: meshes differ in vertices or triangles.
@@ -312,7 +450,8 @@ def measure_quality(
     kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
     if not kept.all():
         meshes, unseen = [_cut(mesh, kept) for mesh in meshes], [_cut(mesh, kept) for mesh in unseen]
-    return _of_meshes(meshes, scans, unseen, settings, on_step, left_out=int((~kept).sum()))
+    shapes = Shapes(meshes, scans, settings)
+    return _of_meshes(shapes, unseen, on_step, run, left_out=int((~kept).sum()))
 
 
 def _of_model(
@@ -332,39 +471,32 @@ def _of_model(
 
 
 def _of_meshes(
-    meshes: Sequence[Mesh],
-    scans: Sequence[Mesh] | None,
-    unseen: Sequence[Mesh],
-    settings: QualitySettings,
-    on_step: OnStep | None,
-    *,
-    left_out: int,
+    shapes: Shapes, unseen: Sequence[Mesh], on_step: OnStep | None, run: Runner, *, left_out: int
 ) -> ModelQuality:
-    space = settings.space(meshes)
-    parts = _parts(len(meshes), settings)
-    most = len(meshes) - max(len(part) for part in parts) - 1
-    counts = _counts(min(settings.modes or most, most))
-    few = counts[np.unique(np.linspace(0, len(counts) - 1, min(len(counts), _MOST_SPECIFIC)).round().astype(int))]
-    steps = _Steps(len(meshes) * 2 + len(unseen) + settings.samples, on_step)
-    targets = [_Target.of(m, None if scans is None else scans[i]) for i, m in enumerate(meshes)]
-    errors, by_shapes = _left_out(targets, parts, counts, settings, steps)
-    general = _curves(errors, counts, settings.seed)
-    trained = [target.cut_to(space.kept) for target in targets]
-    specific = _curves(_specificity(space.model, trained, few, settings, steps), few, settings.seed)
+    meshes, settings, counts, few = shapes.meshes, shapes.settings, shapes.counts, shapes.few_counts
+    steps = _Steps(len(meshes) + len(unseen) + settings.samples, on_step)
+    errors = np.zeros((len(meshes), len(counts) + len(shapes.sizes), 2))
+    drawn = np.zeros((settings.samples, len(few), 2))
+    for part, found in run(shapes, shapes.parts()):
+        (errors if part.held else drawn)[list(part.held or part.drawn)] = found
+        steps.step(len(found))
+    general = _curves(errors[:, : len(counts)], counts, settings.seed)
+    specific = _curves(drawn, few, settings.seed)
+    space = shapes.space
     told = _unseen(space, unseen, counts, settings, steps)
-    there = np.mean([len(target.seen) for target in targets]) / len(meshes[0].vertices)
+    there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
-        _compactness(space.model, trained, counts, settings),
+        _compactness(space.model, shapes.trained, counts, settings),
         generalisation=general[0],
         generalisation_vertices=general[1],
         specificity=specific[0],
         specificity_vertices=specific[1],
         reconstruction=told[0],
         reconstruction_vertices=told[1],
-        by_shapes=by_shapes,
+        by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, settings.seed),
         supported_modes=settings.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
         shapes=len(meshes),
-        folds=len(parts),
+        folds=len(shapes.folds),
         points=_points(space.model.n_vertices),
         seed=settings.seed,
         missing_share=1.0 - float(there),
@@ -388,7 +520,7 @@ def _refuse_other(mesh: Mesh, vertices: int) -> None:
     if len(mesh.vertices) != vertices:
         raise CorrespondenceError(
             f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {vertices}; unseen shapes must be in "
-            "correspondence with it."
+            "correspondence with it, so bring them there by shapespace fit with --dense."
         )
 
 
@@ -412,7 +544,7 @@ def _counts(most: int) -> IntArray:
     return np.array(sorted(spaced), dtype=np.int32)
 
 
-def _parts(n: int, settings: QualitySettings) -> list[IntArray]:
+def _folds(n: int, settings: QualitySettings) -> list[IntArray]:
     folds = n if settings.folds is None else min(settings.folds, n)
     order = np.random.default_rng(settings.seed).permutation(n).astype(np.int32)
     return [np.asarray(part, dtype=np.int32) for part in np.array_split(order, folds)]
@@ -424,32 +556,6 @@ def _points(vertices: int) -> int:
 
 def _spread(vertices: int) -> IntArray:
     return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
-
-
-def _left_out(
-    targets: Sequence[_Target], parts: Sequence[IntArray], counts: IntArray, settings: QualitySettings, steps: _Steps
-) -> tuple[FloatArray, Curve]:
-    """Return the errors of shapes left out (N, n, 2), and of their vertices by the number of training shapes."""
-    n = len(targets)
-    errors, rng = np.zeros((n, len(counts), 2)), np.random.default_rng(settings.seed + 1)
-    least = n - max(len(part) for part in parts)
-    sizes = sorted({max(2, round(share * least)) for share in _PARTS})
-    by_size = np.zeros((n, len(sizes)))
-    for part in parts:
-        order = [int(i) for i in rng.permutation(n) if i not in part]
-        held: list[_Target] = [targets[int(i)] for i in part]
-        space = settings.space([targets[i].shape for i in sorted(order)])
-        errors[part] = _over_shapes(space, held, counts, steps)
-        for column, size in enumerate(sizes):
-            fewer = settings.space([targets[i].shape for i in sorted(order[:size])])
-            k = min(settings.modes or size - 1, size - 1)
-            only = np.array([k], dtype=np.int32)
-            by_size[part, column] = [
-                _told(fewer.model, one.cut_to(fewer.kept), only, surface=False)[0, 0] for one in held
-            ]
-        for _ in held:
-            steps.step()
-    return errors, Curve.over(by_size, sizes, settings.seed)
 
 
 def _over_shapes(space: _Space, targets: Sequence[_Target], counts: IntArray, steps: _Steps) -> FloatArray:
@@ -513,26 +619,34 @@ def _apart(fitted: Mesh, target: _Target) -> float:
     return float(0.5 * (there + (back.distance[counted].mean() if counted.any() else there)))
 
 
-def _specificity(
-    model: ShapeModel, targets: Sequence[_Target], counts: IntArray, settings: QualitySettings, steps: _Steps
-) -> FloatArray:
-    """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
-    mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
-    posed = _posed(model, targets, settings)
-    trained = [_Target.of(m, None) for m in posed]
-    picked = _spread(model.n_vertices)
-    vertices = np.stack([m.vertices[picked] for m in posed])
-    mean_of = np.nanmean if np.isnan(vertices).any() else np.mean
-    out = np.zeros((settings.samples, len(counts), 2))
-    for row, b in enumerate(model.sample(settings.samples, np.random.default_rng(settings.seed + 2))):
-        for column, k in enumerate(counts):
-            shape = mean + (b[:k] @ modes[:k]).reshape(-1, 3)
-            off = mean_of(np.linalg.norm(vertices - shape[picked], axis=2), axis=1)
-            drawn, nearest = posed[0].with_vertices(shape), [int(i) for i in np.argsort(off, kind="stable")[:_NEAREST]]
-            out[row, column, 0] = off.min()
-            out[row, column, 1] = min(_apart(drawn, trained[i]) for i in nearest)
-        steps.step()
-    return out
+@dataclass(frozen=True, eq=False)
+class _Nearest:
+    """Training shapes in the pose of the model, to find how far others lie from the nearest one.
+
+    Args:
+        targets: their surfaces.
+        meshes: their vertices.
+        picked: the numbers of vertices by which they are compared.
+        vertices: (N, P, 3) of those.
+    """
+
+    targets: Sequence[_Target]
+    meshes: Sequence[Mesh]
+    picked: IntArray
+    vertices: FloatArray
+
+    @staticmethod
+    def of(posed: Sequence[Mesh], vertices: int) -> _Nearest:
+        picked = _spread(vertices)
+        compared = np.stack([mesh.vertices[picked] for mesh in posed])
+        return _Nearest([_Target.of(mesh, None) for mesh in posed], posed, picked, compared)
+
+    def off(self, shape: FloatArray) -> tuple[float, float]:
+        """Return how far `shape` (V, 3), mm, lies from the nearest one: its vertices, and its surface."""
+        mean_of = np.nanmean if np.isnan(self.vertices).any() else np.mean
+        off = mean_of(np.linalg.norm(self.vertices - shape[self.picked], axis=2), axis=1)
+        drawn, nearest = self.meshes[0].with_vertices(shape), np.argsort(off, kind="stable")[:_NEAREST]
+        return float(off.min()), min(_apart(drawn, self.targets[int(i)]) for i in nearest)
 
 
 def _posed(model: ShapeModel, targets: Sequence[_Target], settings: QualitySettings) -> list[Mesh]:

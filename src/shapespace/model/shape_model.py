@@ -73,6 +73,7 @@ class ShapeModel:
         held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
         residuals: (K,) mm^2, |C v - lambda v| of each mode where it was found by passes over the shapes (PCA beyond
             memory); None where the modes are exact to rounding.
+        regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be held to.
         left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
 
     Raises:
@@ -94,6 +95,7 @@ class ShapeModel:
     held_out: bool = False
     residuals: FloatArray | None = None
     left_out: int = 0
+    regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
 
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
@@ -131,6 +133,8 @@ class ShapeModel:
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
         _refuse_far_landmarks(self.landmarks, len(checked.vertices))
+        regions = {str(name): region_vertices(at, len(checked.vertices), name) for name, at in self.regions.items()}
+        object.__setattr__(self, "regions", MappingProxyType(regions))
 
     @classmethod
     def fit(
@@ -467,7 +471,7 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected, so fit this one instead."
+                "model's vertex order can be projected, so fit this one instead (shapespace fit, or fit_scan)."
             )
         if not np.isfinite(vertices).all():
             raise InputError("A shape to be projected must be finite.")
@@ -606,6 +610,22 @@ def _components_of_codes(
     return PrincipalComponents(mean, (codes - mean).T @ shares, pc.variance, total, pc.n_samples)
 
 
+def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntArray:
+    """Return the vertices of a region, (n,) int32, each once, in order; `name` is what errors call it.
+
+    Raises:
+        InputError: there are none, or one that a model of `n_vertices` does not have.
+    """
+    found = np.unique(np.asarray(vertices, dtype=np.int64))
+    if found.ndim != 1 or not len(found) or found[0] < 0 or found[-1] >= n_vertices:
+        raise InputError(
+            f"The region {name!r} needs vertices from 0 to {n_vertices - 1}, which the model has; give some of those."
+        )
+    region = found.astype(np.int32)
+    region.setflags(write=False)
+    return region
+
+
 def _refuse_far_landmarks(landmarks: Mapping[str, int], n_vertices: int) -> None:
     for name, vertex in landmarks.items():
         if not 0 <= vertex < n_vertices:
@@ -650,7 +670,8 @@ def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
     finite = np.isfinite(values).all(axis=(1, 2))
     if not finite.all():
         raise InputError(
-            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; repair it or leave it out."
+            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; see shapespace check, and repair it "
+            "or leave it out."
         )
 
 

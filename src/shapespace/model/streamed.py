@@ -541,7 +541,9 @@ def _refuse_holes(mesh: Mesh) -> None:
             "out, or build from fewer meshes in memory."
         )
     if not (np.abs(mesh.vertices) < np.finfo(np.float32).max).all():
-        raise InputError(f"{mesh.name} holds vertices that are not finite; repair it or leave it out.")
+        raise InputError(
+            f"{mesh.name} holds vertices that are not finite; see shapespace check, and repair it or leave it out."
+        )
 
 
 def _sample(shapes: Spill, seed: int) -> FloatArray:

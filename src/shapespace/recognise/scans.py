@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.labels import Label
+from shapespace.io.meshes import stem_of
 from shapespace.io.tables import table_rows
 from shapespace.store.results import Results, modes_of
 from shapespace.types import FloatArray, read_only
@@ -168,8 +169,8 @@ def labelled(scans: Sequence[ScanCoefficients], labels: Mapping[str, Label]) -> 
     """Return `scans` with labels and subjects, found by the name of the scan's file or of the fit."""
     found: list[ScanCoefficients] = []
     for scan in scans:
-        label = labels.get(PurePath(scan.file).stem) if scan.file else None
-        label = label or labels.get(scan.name) or labels.get(PurePath(scan.name).stem)
+        label = labels.get(stem_of(scan.file)) if scan.file else None
+        label = label or labels.get(scan.name) or labels.get(stem_of(scan.name))
         found.append(replace(scan, label=label.text, subject=label.subject) if label else scan)
     return found
 

@@ -39,7 +39,7 @@ def checker_places(mean: Mesh, yaw_deg: float = 0.0) -> tuple[FloatArray, FloatA
     # Of a long thin object, the squares must be small enough that there are some across.
     side = max(math.sqrt(wide * high_up) / _SQUARES, max(wide, high_up) / _MOST_SQUARES)
     if not side > 0:
-        raise InputError("The mean shape has no extent; bring the scans into correspondence again.")
+        raise InputError("The mean shape has no extent; run shapespace correspond again.")
     at = (at - ((low + high) / 2)[:, None]) / side
     return at[0], at[1]
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 
 from shapespace.io.labels import LABELS_FILE, Label, read_labels
+from shapespace.io.meshes import stem_of
 from shapespace.report.saved import Folder, SavedFit
 from shapespace.report.wording import listed
 
@@ -41,7 +42,7 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) ->
 def labelled(fit: SavedFit, labels: Mapping[str, Label]) -> SavedFit:
     """Return `fit` with its label, found by the scan's file name or the name of the fit; as it is without one."""
     scan = fit.record.scan.name
-    label = labels.get(PurePath(scan).stem if scan else fit.name) or labels.get(fit.name)
+    label = labels.get(stem_of(scan) if scan else fit.name) or labels.get(fit.name)
     if label is None or not label.text:
         return fit
     return fit.with_entry(expression=label.text, subject=label.subject, intensity=label.intensity)

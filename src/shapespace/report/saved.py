@@ -311,7 +311,7 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], given: Path | None = None
     if len(hashes) > 1 and given is None:
         raise InputError(f"{folder.root}: its fits are by {len(hashes)} different models; give one with --model.")
     path = given or folder.root / (sources[0].path or sources[0].name)
-    if given is None and not path.is_file():
+    if given is None and not path.exists():
         raise InputError(f"{folder.root}: the model {path.name} is no longer at {path}; give it with --model.")
     model = ShapeModel.load(path)
     if model.content_hash not in hashes:

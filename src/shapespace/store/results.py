@@ -388,6 +388,14 @@ def kept_at(path: Path) -> bool:
     return name in results and (what == "record" or results.has(name, what))
 
 
+def wrote_landmarks(record: Path) -> bool:
+    """Return whether the fit that `record` is of wrote landmarks beside it; files of that name may be a user's own."""
+    try:
+        return b'"found_landmarks"' in read_bytes(record)
+    except ShapespaceError:
+        return False
+
+
 def is_result(path: Path) -> bool:
     """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
     return path.is_file() or kept_at(path)

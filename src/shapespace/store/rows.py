@@ -15,6 +15,7 @@ _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
 _SHARES = ("model_seen_share", "scan_covered_share")
 _EXPECTED = ("expected_error_mm", "beyond_model_mm")
 _AXES = "xyz"
+_SIZES = ("centroid_size_mm", "length_mm", "width_mm", "depth_mm", "area_mm2")
 _TOLD_OF_FITS = (
     *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
     *_SHARES,
@@ -22,6 +23,8 @@ _TOLD_OF_FITS = (
     "path",
     *_EXPECTED,
     "size_mm",
+    *_SIZES,
+    "shape_rms_mm",
     *(f"rotation_{axis}_deg" for axis in _AXES),
     *(f"translation_{axis}" for axis in _AXES),
 )
@@ -68,8 +71,24 @@ def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
         row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
     row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
     row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
+    row |= _size_cells(record) | _moved_cells(record)
     row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
     return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
+
+
+def _size_cells(record: Mapping[str, Any]) -> dict[str, Any]:
+    extents = record.get("extents_mm") or (None, None, None)
+    told = record.get("centroid_size_mm"), *extents, record.get("area_mm2")
+    return {key: value for key, value in zip(_SIZES, told, strict=True) if value is not None}
+
+
+def _moved_cells(record: Mapping[str, Any]) -> dict[str, float]:
+    """Return the RMS by which each mode, and all together, move a vertex from the mean; b is a norm over all."""
+    if not record.get("n_vertices"):
+        return {}
+    moved = np.abs(np.asarray(record["b"], dtype=np.float64)) / np.sqrt(float(record["n_vertices"]))
+    cells = {f"b{k}_rms_mm": float(value) for k, value in enumerate(moved, 1)}
+    return cells | {"shape_rms_mm": float(np.linalg.norm(moved))}
 
 
 def _distance_column(direction: str, measure: str) -> str:
@@ -105,7 +124,13 @@ def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
     every = [_distance_column(direction, measure) for direction in _DIRECTIONS for measure in _DISTANCE_COLUMNS]
     columns = ["scan", "status", "reason", *(f"b{k}" for k in modes), *(f"z{k}" for k in modes), *lead]
     columns += [column for column in every if column not in lead]
-    columns += ["scale", "mm_per_scan_unit", *(f"b{k}_stddev" for k in modes), *_TOLD_OF_FITS]
+    columns += [
+        "scale",
+        "mm_per_scan_unit",
+        *(f"b{k}_stddev" for k in modes),
+        *(f"b{k}_rms_mm" for k in modes),
+        *_TOLD_OF_FITS,
+    ]
     return [*columns, *known, CHECKSUM, "model_hash"]
 
 

@@ -62,7 +62,7 @@ class Shown:
             FileFormatError: it is damaged.
             InputError: it is neither, or the model is not that of the fits.
         """
-        if not path.is_dir():
+        if not path.is_dir() or looks_like_model(path):
             if model is not None:
                 raise InputError(f"{path} is not a folder of fits; leave --model out, or give the folder.")
             if path.exists() and not looks_like_model(path):

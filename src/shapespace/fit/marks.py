@@ -1,0 +1,90 @@
+"""Landmarks that somebody placed on the scan, as a soft constraint on every step of the robust fit.
+
+Each pulls its vertex of the model with its standard deviation. Matches count far more often than they know something
+new, which the posterior mends by a temperature; so that a landmark weighs what it is worth beside them, they are taken
+for as many observations as there are patches, and landmarks are weighed up by the same factor. While the matches still
+lie far apart landmarks lead the fit, and in the end, where matches are told to a fraction of a millimetre, they yield.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.fit.moving_model import MovingSurface
+from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Similarity
+
+SHARE = 0.03
+"""Standard deviation of a landmark as a share of the model's size (RMS distance from its centre), if none is given."""
+_PATCHES = 300.0
+_WIDTH, _MAD, _FAR = 3.0, 1.48, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Landmarks of a scan that the model has too.
+
+    Args:
+        names: of them, (L,).
+        vertex: (L,) of the model.
+        points_mm: (L, 3) in the scan's mm frame.
+        stddev_mm: of each coordinate, mm of the scan.
+    """
+
+    names: Sequence[str]
+    vertex: IntArray
+    points_mm: FloatArray
+    stddev_mm: float
+
+    @staticmethod
+    def of(model: ShapeModel, landmarks_mm: Mapping[str, FloatArray], stddev_mm: float) -> Marks | None:
+        """Return those of `landmarks_mm` (name -> (3,)) that `model` has too; None where there are none."""
+        names = [name for name in model.landmarks if name in landmarks_mm]
+        if not names or not np.isfinite(stddev_mm):
+            return None
+        vertex = np.array([model.landmarks[name] for name in names], dtype=np.int32)
+        return Marks(names, vertex, np.stack([landmarks_mm[name] for name in names]), stddev_mm)
+
+    def off_mm(self, surface: MovingSurface, T_scan_model: Similarity) -> FloatArray:
+        """Return (L,) how far each vertex lies from its landmark, mm of the scan."""
+        return np.linalg.norm(T_scan_model.apply(surface.vertices[self.vertex]) - self.points_mm, axis=1)
+
+    def equations(self, surface: MovingSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
+        """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.
+
+        Args:
+            surface: as it is now.
+            T_scan_model: where it is now, in the scan's mm frame.
+            modes: k, how many are free.
+        """
+        x = surface.vertices[self.vertex]
+        off = x - T_scan_model.inverse().apply(self.points_mm)
+        distance = np.linalg.norm(off, axis=1)
+        stddev = self.stddev_mm / T_scan_model.scale
+        # A wrong landmark lies far off beside the others, however far these are off on the way.
+        width = _WIDTH * max(stddev, _MAD * float(np.median(distance)))
+        weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
+        pose = small_poses(x).reshape(len(x), 3, POSE)
+        rows = np.concatenate([pose, surface.modes[self.vertex][:, :, :modes]], axis=2)
+        every = rows.reshape(3 * len(x), -1)
+        heavy = np.repeat(weight, 3)[:, None] * every
+        return heavy.T @ every, heavy.T @ off.ravel()
+
+    def notes(self, surface: MovingSurface, T_scan_model: Similarity) -> list[str]:
+        """Return a sentence on each landmark that lies where the fit does not have it."""
+        off_mm = self.off_mm(surface, T_scan_model)
+        far = off_mm > _FAR * max(self.stddev_mm, _MAD * float(np.median(off_mm)))
+        return [
+            f"Landmark {name!r} lies {off:.1f} mm from where the fit has it; check its place and its name."
+            for name, off, is_far in zip(self.names, off_mm, far, strict=True)
+            if is_far
+        ]
+
+
+def worth(matches: float) -> float:
+    """Return how many matches stand for one observation, by which landmarks are weighed up; `matches` is their sum."""
+    return max(1.0, matches / _PATCHES)

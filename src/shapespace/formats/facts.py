@@ -1,0 +1,90 @@
+"""What a model says beside its numbers, as JSON for formats that leave room for what others bring along."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final, cast
+
+from shapespace.formats.parts import LinearModel
+
+KEY: Final = "shapespace"
+"""Under which the facts stand."""
+_LONGEST_WORDS = 20_000
+_MOST_LANDMARKS = 10_000
+
+
+def facts_of(model: LinearModel) -> dict[str, Any]:
+    """Return what `with_facts` takes, with lengths in mm."""
+    mm = model.mm or 1.0
+    total = total_variance(model)
+    facts: dict[str, Any] = {
+        "vertices": len(model.mean),
+        "n_training": model.n_training,
+        "held_out": model.held_out,
+        "total_variance_mm2": None if total is None else float(total * mm**2),
+        "landmarks": dict(model.landmarks),
+        "provenance": model.provenance,
+        "licence": model.licence,
+    }
+    if model.expression is not None:
+        facts["n_identity"] = model.shape.moved.shape[1]
+    return facts
+
+
+def with_facts(model: LinearModel, facts: object) -> LinearModel:
+    """Return `model` with what `facts` of `facts_of` tells; what is not as that writes it is passed over.
+
+    Landmarks are vertices, so they are taken only where the number of vertices is still the same.
+    """
+    known = json_object(facts)
+    if not known:
+        return model
+    n = len(model.mean)
+    landmarks, notes = dict(model.landmarks), model.notes
+    marks = json_object(known.get("landmarks"))
+    if marks and known.get("vertices") != n:
+        notes = (*notes, "Its landmarks are left out: the number of vertices has changed since they were set.")
+    elif len(marks) <= _MOST_LANDMARKS:
+        found = {name: _count(value) for name, value in marks.items()}
+        landmarks |= {name: vertex for name, vertex in found.items() if vertex is not None and vertex < n}
+    training, total = _count(known.get("n_training")), known.get("total_variance_mm2")
+    shape = model.shape
+    if isinstance(total, float) and math.isfinite(total) and total > 0:
+        # Held by the shape alone, so that with expressions it is that of both.
+        shape = replace(shape, total_variance=total / (model.mm or 1.0) ** 2)
+    expression = model.expression
+    if shape is not model.shape and expression is not None:
+        expression = replace(expression, total_variance=0.0)
+    return replace(
+        model,
+        shape=shape,
+        expression=expression,
+        landmarks=landmarks,
+        n_training=training if training is not None and training > 1 else model.n_training,
+        held_out=known.get("held_out") is True,
+        provenance=_words(known.get("provenance")) or model.provenance,
+        licence=_words(known.get("licence")) or model.licence,
+        notes=notes,
+    )
+
+
+def total_variance(model: LinearModel) -> float | None:
+    """Return the variance of all modes, in the unit of the model squared; None where it is not told."""
+    told = [block.total_variance for block in (model.shape, model.expression) if block is not None]
+    known = [one for one in told if one is not None]
+    return sum(known) if known else None
+
+
+def json_object(value: object) -> Mapping[str, Any]:
+    """Return `value` where it is an object of JSON, and an empty one otherwise."""
+    return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else {}
+
+
+def _count(value: object) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31 else None
+
+
+def _words(value: object) -> str:
+    return value[:_LONGEST_WORDS] if isinstance(value, str) else ""

@@ -1,0 +1,35 @@
+"""Folders written whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from shapespace.errors import InputError
+from shapespace.io.files import write_error
+
+
+def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
+    """Make the folder `path` with `files`, by their names.
+
+    Raises:
+        InputError: there is such a folder, and something in it.
+        FileError: it cannot be made, or the disk is full.
+    """
+    try:
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise InputError(f"{path} is there already; give the name of a new folder.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Beside it, so that one step puts it there.
+        with tempfile.TemporaryDirectory(prefix=".shapespace-", dir=path.parent) as temporary:
+            whole = Path(temporary) / "whole"
+            whole.mkdir()
+            for name, data in files.items():
+                (whole / name).write_bytes(data)
+            if path.exists():
+                path.rmdir()
+            shutil.move(whole, path)
+    except OSError as error:
+        raise write_error(path, error) from error

@@ -1,0 +1,124 @@
+"""GIAS2: principal components in `NAME.pc.npz`, and the mean surface in `NAME_mean.*` beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.parts import LinearModel, Modes, scaled
+from shapespace.io.archives import LARGEST_BYTES, npy_array, zip_members
+from shapespace.io.files import open_file
+from shapespace.io.json_files import check_file
+from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.types import FloatArray, IntArray
+
+_AGAIN = "save the principal components again"
+_NEEDED = ("mean", "weights", "modes")
+_FIRST_MEMBERS = (b"mean.npy", b"weights.npy", b"modes.npy")
+_SAME = 1e-4
+
+
+class Gias:
+    """`PrincipalComponents` of GIAS2, interleaved as `gias-trainpcashapemodel` has them, or all x first."""
+
+    name = "gias"
+    title = "GIAS2 .pc.npz"
+    suffixes: Sequence[str] = (".pc.npz",)
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it is an `.npz` that is called so, or begins with the mean as GIAS2 saves it."""
+        if not path.name.lower().endswith(".npz") or head[:2] != b"PK":
+            return False
+        named = head[30 : 30 + int.from_bytes(head[26:28], "little")]
+        return path.name.lower().endswith(".pc.npz") and named in _FIRST_MEMBERS
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, LARGEST_BYTES, _AGAIN)
+        try:
+            with open_file(path) as stream:
+                members = zip_members(stream, path.stat().st_size)
+            mean, variance, modes = (_numbers(members[f"{name}.npy"]) for name in _NEEDED)
+        except (KeyError, ValueError, OSError) as error:
+            what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            raise ModelFileError(f"{path} holds no principal components of GIAS2 ({what}); {_AGAIN}.") from error
+        mean, variance = mean.ravel(), variance.ravel()
+        if modes.ndim != 2 or mean.size % 3 or len(modes) != mean.size or modes.shape[1] > variance.size:
+            raise ModelFileError(
+                f"{path} has parts that do not belong together: mean {mean.shape}, modes {modes.shape}, weights "
+                f"{variance.shape}; {_AGAIN}."
+            )
+        variance = variance[: modes.shape[1]]
+        moved = scaled(modes, np.sqrt(np.maximum(variance, 0.0)))
+        notes: list[str] = []
+        each = _optional(members, "SD")
+        if each is not None and each.size == mean.size:
+            moved = moved * each.reshape(-1, 1)
+            notes.append("Each coordinate was divided by its standard deviation, which is undone.")
+        scores = _optional(members, "projectedWeights")
+        surface = _surface(path)
+        faces: IntArray | None = None
+        if surface is None:
+            notes.append("There is no surface of its mean beside it (NAME_mean.ply), so it is a point model.")
+        else:
+            points, faces, blocked = _fitting(surface, mean, path)
+            if blocked:
+                mean = points.ravel()
+                moved = moved.reshape(3, len(points), -1).transpose(1, 0, 2).reshape(mean.size, -1)
+                notes.append("Its coordinates stood one after another, all x first.")
+        return LinearModel(
+            mean=mean.reshape(-1, 3),
+            shape=Modes(moved),
+            faces=faces,
+            n_training=scores.shape[1] if scores is not None and scores.ndim == 2 and scores.shape[1] > 1 else None,
+            provenance=f"GIAS2 principal components {path.name}",
+            notes=tuple(notes),
+        )
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`; it is only read."""
+        raise InputError(f"{path} cannot be written: models of GIAS2 are only read; choose another format.")
+
+
+def _numbers(data: bytes) -> FloatArray:
+    array = npy_array(data)
+    if array.dtype.kind not in "fiu":
+        raise ValueError("it holds other things than numbers")
+    return array.astype(np.float64)
+
+
+def _optional(members: dict[str, bytes], name: str) -> FloatArray | None:
+    """Return an array that GIAS2 saves as a pickled None where it has none."""
+    try:
+        return _numbers(members[f"{name}.npy"])
+    except (KeyError, ValueError):
+        return None
+
+
+def _surface(path: Path) -> Path | None:
+    stem = path.name[: -len(".pc.npz")] if path.name.lower().endswith(".pc.npz") else path.stem
+    beside = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
+    return next((one for one in beside if one.is_file()), None)
+
+
+def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, IntArray | None, bool]:
+    """Return vertices and triangles, and whether `mean` has all x before all y."""
+    mesh = read_mesh(surface)
+    if not np.isfinite(mean).all() or not np.isfinite(mesh.vertices).all():
+        raise ModelFileError(f"{path} has a mean that is not finite; {_AGAIN}.")
+    size = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+    layouts: list[tuple[npt.NDArray[np.float64], bool]] = [(mean.reshape(-1, 3), False), (mean.reshape(3, -1).T, True)]
+    for points, blocked in layouts:
+        if points.shape == mesh.vertices.shape and np.abs(points - mesh.vertices).max() <= _SAME * size:
+            return points, mesh.faces, blocked
+    for points, blocked in layouts:
+        # STL has no order of vertices, only their places.
+        nearest = np.asarray(cKDTree(points).query(mesh.vertices)[1], dtype=np.int32)
+        if mesh.faces is not None and np.abs(points[nearest] - mesh.vertices).max() <= _SAME * size:
+            return points, nearest[mesh.faces], blocked
+    raise ModelFileError(f"{path} has another mean than {surface.name} beside it; remove or rename that surface.")

@@ -1,0 +1,150 @@
+"""Face models in MATLAB files: the Basel Face Model of 2009, LSFM, LYHM; of version 7.3 too, which is HDF5."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError, ModelFileError
+from shapespace.formats.parts import LinearModel, Modes, scaled
+from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
+from shapespace.io.files import open_file
+from shapespace.io.json_files import check_file
+from shapespace.types import FloatArray
+
+_AGAIN = "give the file as it was downloaded"
+_LARGEST_BYTES = 2**31
+_HDF5_AT = 512
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where a kind of file has its parts, and what they mean.
+
+    Args:
+        title: of the model, for provenance.
+        licence: of it.
+        mean, basis, spread, faces: paths.
+        is_stddev: whether `spread` is standard deviations and not variances.
+        is_clockwise: whether triangles are seen from inside.
+        first_vertex: the number of the first vertex.
+        mm: how many mm one unit is, or None.
+        n_training: how many shapes it was made of, or None; a path in the file, or a number.
+        textured: where its colour is.
+    """
+
+    title: str
+    licence: str
+    mean: str
+    basis: str
+    spread: str
+    faces: str
+    is_stddev: bool = False
+    is_clockwise: bool = True
+    first_vertex: int = 1
+    mm: float | None = None
+    n_training: int | str | None = None
+    textured: str = ""
+
+
+_LAYOUTS: Final = (
+    _Layout(
+        "Basel Face Model 2009", "Basel Face Model 2009: non-commercial research only, see its licence",
+        "/shapeMU", "/shapePC", "/shapeEV", "/tl", is_stddev=True, mm=1e-3, n_training=200, textured="/texMU",
+    ),
+    _Layout(
+        "LYHM", "Liverpool-York Head Model: for research only, see its licence",
+        "/shp/mu", "/shp/eigVec", "/shp/eigVal", "/tri/faces", textured="/tex",
+    ),
+    _Layout(
+        "LSFM", "Large Scale Facial Model: non-commercial research only, see its licence",
+        "/mean", "/components", "/eigenvalues", "/trilist", is_clockwise=False, first_vertex=0,
+        n_training="/n_training_samples",
+    ),
+)  # fmt: skip
+_WANTED = ("shapeMU", "shapePC", "shapeEV", "tl", "shp", "tri", "mean", "components", "eigenvalues",
+           "trilist", "n_training_samples")  # fmt: skip
+
+
+class Matlab:
+    """`.mat` files of face models."""
+
+    name = "mat"
+    title = "BFM 2009, LSFM and LYHM .mat"
+    suffixes: Sequence[str] = (".mat",)
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it is named as a file of MATLAB."""
+        return path.suffix.lower() == ".mat" and bool(head)
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, _LARGEST_BYTES, _AGAIN)
+        try:
+            tree = _tree(path)
+            layout = next((one for one in _LAYOUTS if {one.mean, one.basis, one.spread} <= tree.arrays.keys()), None)
+            if layout is None:
+                known = ", ".join(one.title for one in _LAYOUTS)
+                raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
+            return _model(tree, layout)
+        except ApartError as error:
+            raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`: it is only read."""
+        raise InputError(f"Cannot write {path}: {self.title} is only read; choose another format.")
+
+
+def _tree(path: Path) -> Tree:
+    with open_file(path) as stream:
+        head = stream.read(_HDF5_AT + len(HDF5_SIGNATURE))
+    if not (head.startswith(HDF5_SIGNATURE) or head[_HDF5_AT:] == HDF5_SIGNATURE):
+        return read_matlab_apart(path, _WANTED)
+    tree = read_hdf5_apart(path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#"))
+    # MATLAB has the last axis first.
+    return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
+
+
+def _model(tree: Tree, layout: _Layout) -> LinearModel:
+    mean, basis, spread = (_floats(tree.arrays[name]) for name in (layout.mean, layout.basis, layout.spread))
+    mean, spread = mean.ravel(), spread.ravel()
+    if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
+        basis = basis.T
+    if len(mean) % 3 or basis.shape != (len(mean), len(spread)) or not (spread >= 0).all():
+        raise ApartError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
+    n_training = layout.n_training
+    if isinstance(n_training, str):
+        told = tree.arrays.get(n_training)
+        n_training = (
+            int(told.reshape(-1)[0]) if told is not None and told.size == 1 and told.reshape(-1)[0] > 1 else None
+        )
+    return LinearModel(
+        mean=mean.reshape(-1, 3),
+        shape=Modes(scaled(basis, spread if layout.is_stddev else np.sqrt(spread))),
+        faces=_faces(tree.arrays.get(layout.faces), layout, len(mean) // 3),
+        mm=layout.mm,
+        n_training=n_training,
+        provenance=layout.title,
+        licence=layout.licence,
+        notes=("Its model of colour is left out.",) if layout.textured in tree.groups else (),
+    )
+
+
+def _floats(array: npt.NDArray[Any]) -> FloatArray:
+    return np.asarray(array, dtype=np.float64)
+
+
+def _faces(found: npt.NDArray[Any] | None, layout: _Layout, n: int) -> npt.NDArray[np.int32] | None:
+    if found is None or not found.size:
+        return None
+    faces = found.T if found.ndim == 2 and found.shape[0] == 3 != found.shape[1] else found
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.isfinite(faces).all() or np.abs(faces).max() > n:
+        raise ApartError(f"its triangles have the shape {found.shape}, or name vertices that it does not have")
+    # Those of menpo count from 0, those of MATLAB's own from 1.
+    faces = faces.astype(np.int32) - (layout.first_vertex or int(faces.min() > 0 and faces.max() == n))
+    return faces[:, [0, 2, 1]] if layout.is_clockwise else faces

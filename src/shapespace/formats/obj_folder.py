@@ -1,0 +1,154 @@
+"""Folders of OBJ files, one for each shape, as ICT-FaceKit is published: a neutral mesh, identities and expressions."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from shapespace.errors import ModelFileError, ShapespaceError
+from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
+from shapespace.formats.folder import write_folder
+from shapespace.formats.parts import LinearModel, Modes
+from shapespace.io.files import read_bytes
+from shapespace.io.json_files import read_json
+from shapespace.io.meshes import read_mesh
+from shapespace.io.obj import write_obj
+from shapespace.types import FloatArray, IntArray, Mesh
+
+_ICT: Final = "generic_neutral_mesh"
+_ICT_MM = 10.0
+"""ICT-FaceKit is in cm."""
+_NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
+_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
+_FACTS = f"{KEY}.json"
+_LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
+_MOST_LICENCE_BYTES = 2**16
+_LOOKED_AT_BYTES = 2**26
+_MOST_SHAPES = 4096
+_AGAIN = "export all of them again with the same vertices and triangles"
+
+
+class ObjFolder:
+    """A folder with a neutral mesh, `identity000.obj` and so on, and `<expression>.obj`, all of one topology."""
+
+    name = "obj-folder"
+    title = "folder of OBJ blendshapes"
+    suffixes: Sequence[str] = ()
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether one OBJ file there is called neutral and another has as many vertices and faces."""
+        try:
+            neutral, others = _files(path)
+            if neutral is None or not others:
+                return False
+            return _counts(neutral) == _counts(others[0]) != (0, 0)
+        except (OSError, ShapespaceError):
+            return False
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        neutral, others = _files(path)
+        if neutral is None or not others or len(others) > _MOST_SHAPES:
+            raise ModelFileError(
+                f"{path} is no folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
+                f"{_MOST_SHAPES} others."
+            )
+        rest = read_mesh(neutral)
+        steps: list[FloatArray] = []
+        for file in others:
+            shape = read_mesh(file)
+            same = len(shape.vertices) == len(rest.vertices) and _same(shape.faces, rest.faces)
+            if not same:
+                raise ModelFileError(
+                    f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
+                    f"{_AGAIN}."
+                )
+            steps.append((shape.vertices - rest.vertices).ravel())
+        names = [file.stem for file in others]
+        shape, expression = _parted(np.stack(steps), names)
+        facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
+        notes: list[str] = []
+        if not facts:
+            notes.append("Each shape is taken as one standard deviation of its mode.")
+        ict = neutral.stem.lower() == _ICT
+        return with_facts(
+            LinearModel(
+                mean=rest.vertices,
+                shape=shape,
+                expression=expression,
+                faces=rest.faces,
+                mm=1.0 if facts else _ICT_MM if ict else None,
+                provenance=f"{len(others)} blendshapes of {path.name}",
+                licence=_licence(path),
+                notes=tuple(notes),
+            ),
+            facts,
+        )
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`; a new folder, in mm."""
+        mm = model.mm or 1.0
+        rest = model.mean * mm
+        files = {f"{_ICT}.obj": write_obj(Mesh(rest, model.faces))}
+        said = ["Each shape is the mean and one standard deviation of a mode, in mm."]
+        for word, block in (("identity", model.shape), ("expression", model.expression)):
+            if block is None:
+                continue
+            names = block.names if word == "expression" and _are_file_names(block.names) else ()
+            for number, step in enumerate(block.moved.T):
+                name = names[number] if names else f"{word}{number:03d}"
+                files[f"{name}.obj"] = write_obj(Mesh(rest + step.reshape(-1, 3) * mm, model.faces))
+        files[_FACTS] = json.dumps(facts_of(model), indent=1).encode()
+        write_folder(path, files)
+        return said
+
+
+def _files(folder: Path) -> tuple[Path | None, list[Path]]:
+    """Return the neutral mesh, if there is exactly one, and the other OBJ files, sorted."""
+    if not folder.is_dir():
+        return None, []
+    found = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".obj" and not p.name.startswith("."))
+    neutral = [p for p in found if p.stem.lower() in _NEUTRALS]
+    if len(neutral) != 1:
+        return None, found
+    return neutral[0], [p for p in found if p != neutral[0]]
+
+
+def _counts(path: Path) -> tuple[int, int]:
+    """Return about how many vertices and faces an OBJ file has, without reading its numbers."""
+    content = b"\n" + read_bytes(path, _LOOKED_AT_BYTES)
+    return content.count(b"\nv "), content.count(b"\nf ")
+
+
+def _same(first: IntArray | None, second: IntArray | None) -> bool:
+    return first is second if first is None or second is None else np.array_equal(first, second)
+
+
+def _parted(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
+    identity = np.array([bool(_IDENTITY.fullmatch(name)) for name in names])
+    if not 0 < identity.sum() < len(names):
+        return Modes(steps.T, tuple(names)), None
+    parts = [
+        Modes(steps[chosen].T, tuple(name for name, one in zip(names, chosen, strict=True) if one))
+        for chosen in (identity, ~identity)
+    ]
+    return parts[0], parts[1]
+
+
+def _licence(folder: Path) -> str:
+    file = next((folder / name for name in _LICENCES if (folder / name).is_file()), None)
+    if file is None:
+        return ""
+    lines = read_bytes(file, _MOST_LICENCE_BYTES).decode(errors="replace").split("\n")
+    return next((line.strip() for line in lines if line.strip()), "")
+
+
+def _are_file_names(names: Sequence[str]) -> bool:
+    plain = all(re.fullmatch(r"\w[\w .-]{0,80}", name) and not _IDENTITY.fullmatch(name) for name in names)
+    lowered = {name.lower() for name in names}
+    return bool(names) and plain and len(lowered) == len(names) and not lowered & set(_NEUTRALS)

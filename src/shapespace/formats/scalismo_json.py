@@ -1,0 +1,245 @@
+"""scalismo's `.h5.json`: the tree of a statismo file as text, in HDF5/JSON of The HDF Group."""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from collections.abc import Generator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, cast
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import ModelFileError
+from shapespace.formats.parts import LinearModel
+from shapespace.formats.statismo import model_of
+from shapespace.formats.statismo_tree import tree_of
+from shapespace.io.apart import ApartError, Tree
+from shapespace.io.files import atomic_path, read_bytes
+from shapespace.io.json_files import check_file
+
+_AGAIN = "export it again from where it was made"
+_LARGEST_BYTES = 2**31
+_MOST_NODES = 4096
+_DEEPEST = 16
+_LONGEST_NAME = 1024
+_MARKS = (b'"apiVersion"', b"H5T_", b"H5S_", b"H5L_")
+_FLOAT: Final = {"class": "H5T_FLOAT", "base": "H5T_IEEE_F32LE"}
+_INTEGER: Final = {"class": "H5T_INTEGER", "base": "H5T_STD_I32LE"}
+_TEXT: Final = {
+    "class": "H5T_STRING",
+    "charSet": "H5T_CSET_UTF8",
+    "strPad": "H5T_STR_NULLTERM",
+    "length": "H5T_VARIABLE",
+}
+_SCALAR: Final = {"class": "H5S_SCALAR"}
+
+
+class ScalismoJson:
+    """HDF5/JSON, the one format that scalismo writes from 0.92 on, whether the file is named `.json` or `.h5`."""
+
+    name = "scalismo-json"
+    title = "scalismo .h5.json"
+    suffixes: Sequence[str] = (".h5.json",)
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
+        start = head.lstrip()
+        if not start.startswith(b"{"):
+            return False
+        return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, _LARGEST_BYTES, _AGAIN)
+        try:
+            tree = _tree(read_bytes(path))
+        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+            told = " ".join(str(error).split())[:120].rstrip(".")
+            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {told}; {_AGAIN}.") from error
+        return model_of(tree, path)
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`."""
+        tree, said = tree_of(model)
+        with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
+            out.writelines(_text_of(tree))
+        return said
+
+
+class _Link(msgspec.Struct):
+    title: str
+    id: str
+    collection: str = ""
+    kind: str = msgspec.field(default="H5L_TYPE_HARD", name="class")
+
+
+class _Attribute(msgspec.Struct):
+    name: str
+    value: Any = None
+
+
+class _Group(msgspec.Struct):
+    links: list[_Link] = []
+    attributes: list[_Attribute] = []
+
+
+class _Dataset(msgspec.Struct):
+    type: Any = None
+    shape: Any = None
+    value: msgspec.Raw = msgspec.Raw(b"null")
+    attributes: list[_Attribute] = []
+
+
+class _File(msgspec.Struct):
+    root: str
+    groups: dict[str, _Group]
+    datasets: dict[str, _Dataset] = {}
+
+
+def _tree(text: bytes) -> Tree:
+    """Return the tree by the links from its root; what nothing links to is not looked at.
+
+    Raises:
+        ValueError: it is no such file, as a clause.
+    """
+    file = msgspec.json.decode(text, type=_File)
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    texts: dict[str, str] = {}
+    attributes: dict[str, Mapping[str, Any]] = {}
+    groups: list[str] = []
+    left, waiting = len(text), [("", file.root)]
+    while waiting:
+        path, known_as = waiting.pop()
+        if known_as not in file.groups:
+            raise ApartError(f"there is no group {path or '/'} in it")
+        if len(groups) + len(arrays) + len(waiting) > _MOST_NODES or path.count("/") > _DEEPEST:
+            raise ApartError("it has more groups than a model")
+        group = file.groups[known_as]
+        groups.append(path or "/")
+        attributes[path or "/"] = _attributes(group.attributes)
+        for link in group.links:
+            inner = f"{path}/{link.title}"
+            if link.kind != "H5L_TYPE_HARD" or len(link.title) > _LONGEST_NAME:
+                raise ApartError(f"{inner[:_LONGEST_NAME]} is a link to elsewhere")
+            if link.collection == "groups":
+                waiting.append((inner, link.id))
+            elif link.id in file.datasets:
+                dataset = file.datasets[link.id]
+                left -= len(bytes(dataset.value))
+                if left < 0:
+                    raise ApartError("it links to the same values again and again")
+                attributes[inner] = _attributes(dataset.attributes)
+                value = _value(dataset, inner)
+                if isinstance(value, str):
+                    texts[inner] = value
+                elif value is not None:
+                    arrays[inner] = value
+    return Tree(arrays, texts, attributes, tuple(groups))
+
+
+def _attributes(found: Sequence[_Attribute]) -> dict[str, Any]:
+    """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
+    told: dict[str, Any] = {}
+    for one in found:
+        value = one.value
+        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
+            value = cast(list[Any], value)[0]
+        if isinstance(value, str | int | float):
+            told[one.name] = value.rstrip("\0") if isinstance(value, str) else value
+    return told
+
+
+def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
+    """Return what a data set holds: numbers, a text, or None for anything else."""
+    kind = str(_of(dataset.type, "class"))
+    base = str(_of(dataset.type, "base"))
+    if kind == "H5T_STRING":
+        value = msgspec.json.decode(dataset.value)
+        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
+            value = cast(list[Any], value)[0]
+        return value.rstrip("\0") if isinstance(value, str) else None
+    if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
+        return None
+    one: Any = int if kind == "H5T_INTEGER" else float
+    dims = _of(dataset.shape, "dims")
+    shape = cast(list[Any], dims) if isinstance(dims, list) else []
+    if len(shape) > 2 or not all(isinstance(size, int) and size >= 0 for size in shape):
+        return None
+    if shape and math.prod(shape) == 0:
+        return np.empty(shape)
+    typed = one if not shape else list[one] if len(shape) == 1 else list[list[one]]
+    array = np.array(msgspec.json.decode(dataset.value, type=typed, strict=True))
+    if array.shape != tuple(shape) or array.dtype.kind not in "iuf":
+        raise ApartError(f"{path} is cut short, or not of the shape {shape} that it says")
+    # Characters of legacy VTK files are such numbers.
+    return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
+
+
+def _of(value: Any, key: str) -> Any:
+    return cast(dict[str, Any], value).get(key) if isinstance(value, dict) else None
+
+
+def _text_of(tree: Tree) -> Generator[str]:
+    """Yield the file in pieces; attributes and texts are scalars, since scalismo reads no lists of one."""
+    known_as = {path: _id(path) for path in (*tree.groups, *tree.arrays, *tree.texts)}
+    inside: dict[str, list[str]] = {path: [] for path in tree.groups}
+    for path in known_as:
+        if path != "/":
+            inside[path.rpartition("/")[0] or "/"].append(path)
+    groups: dict[str, Any] = {}
+    for path, children in inside.items():
+        links = [
+            {
+                "title": child.rpartition("/")[2],
+                "collection": "groups" if child in inside else "datasets",
+                "id": known_as[child],
+                "class": "H5L_TYPE_HARD",
+            }
+            for child in children
+        ]
+        told = [
+            {"name": name, "type": _TEXT, "shape": _SCALAR, "value": str(value)}
+            for name, value in tree.attributes.get(path, {}).items()
+        ]
+        groups[known_as[path]] = {"alias": [path], "attributes": told, "links": links}
+    yield f'{{"apiVersion":"1.0.0","root":"{known_as["/"]}","groups":{_json(groups)},"datasets":{{'
+    comma = ""
+    for path, text in tree.texts.items():
+        yield f'{comma}"{known_as[path]}":{_json({**_head(path, _TEXT, ()), "value": text})}'
+        comma = ","
+    for path, array in tree.arrays.items():
+        kind = _INTEGER if array.dtype.kind in "iu" else _FLOAT
+        yield f'{comma}"{known_as[path]}":{_json(_head(path, kind, array.shape))[:-1]},"value":'
+        yield from _numbers(array)
+        yield "}"
+        comma = ","
+    yield "}}\n"
+
+
+def _head(path: str, kind: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Any]:
+    space = {"class": "H5S_SIMPLE", "dims": list(shape)} if shape else _SCALAR
+    return {"alias": [path], "creationProperties": {}, "type": kind, "shape": space}
+
+
+def _numbers(array: npt.NDArray[Any]) -> Generator[str]:
+    """Yield rows as JSON, each number as short as its single precision allows."""
+    if array.ndim < 2:
+        values = array.reshape(-1).astype(str).tolist()
+        yield ",".join(values) if not array.ndim else f"[{','.join(values)}]"
+        return
+    yield "["
+    for number, row in enumerate(array):
+        yield from ("," if number else "", *_numbers(row))
+    yield "]"
+
+
+def _id(path: str) -> str:
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, f"shapespace:{path}"))
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"))

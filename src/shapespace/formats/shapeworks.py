@@ -1,0 +1,346 @@
+"""ShapeWorks: a project (`.swproj` or `.xlsx`) whose subjects have corresponding particles, and meshes perhaps.
+
+Keys and columns as ShapeWorks 6 writes them (Libs/Project): `world_particles_D` and `local_particles_D` of each domain
+D, text files of `x y z` rows, and `groomed_D`, the surface on which the local particles lie.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+from scipy.fft import dct
+from scipy.interpolate import RBFInterpolator
+
+from shapespace.errors import FileError, InputError, ModelFileError, ShapespaceError
+from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
+from shapespace.formats.folder import write_folder
+from shapespace.formats.parts import LinearModel, Modes
+from shapespace.geometry.procrustes import align_in_place
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.archives import zip_members
+from shapespace.io.files import read_bytes, write_text
+from shapespace.io.json_files import check_file, json_of
+from shapespace.io.limits import LARGEST_MESH_FILE_BYTES, Allowance
+from shapespace.io.meshes import MESH_ENDINGS, read_mesh
+from shapespace.io.parsing import floats_of, number_lines, xml_root
+from shapespace.io.vtk import write_vtk
+from shapespace.types import FloatArray, IntArray, Mesh
+
+_AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
+_LARGEST_PROJECT_BYTES = 2**26
+_PARTICLES = re.compile(r"(world|local)_particles_(.+)")
+_SURFACES = ("groomed", "shape", "mesh")
+_CELL = re.compile(r"([A-Z]{1,3})\d+")
+_ON_PARTICLES = 1e-6
+_MOST_APART = 0.02
+"""Of the size of a shape: further from its mesh, the particles are those of another."""
+_IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
+_RELATIONS = "xl/_rels/workbook.xml.rels"
+
+Row = Mapping[str, str]
+
+
+class ShapeWorks:
+    """The particles of all subjects as a model, on the mesh of the most average one where there are meshes."""
+
+    name = "shapeworks"
+    title = "ShapeWorks project"
+    suffixes: Sequence[str] = (".swproj", ".xlsx")
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it is called a project and begins as JSON or as a workbook does."""
+        begin = {".swproj": b"{", ".xlsx": b"PK"}.get(path.suffix.lower())
+        return begin is not None and head.lstrip()[: len(begin)] == begin
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, _LARGEST_PROJECT_BYTES, _AGAIN)
+        content = read_bytes(path)
+        facts: Mapping[str, Any] = {}
+        if path.suffix.lower() == ".xlsx":
+            rows = _sheet(content, path)
+        else:
+            tree = json_object(json_of(content, path, _AGAIN))
+            rows = _rows(tree.get("data"))
+            facts = json_object(tree.get(KEY))
+        return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`; vertices become particles, and the model as many shapes as have its mean and covariance.
+
+        K modes take K + 1 shapes, none further than 1.42 standard deviations in any mode: the rows of a cosine
+        transform, which sum to zero and are orthogonal.
+        """
+        if path.suffix.lower() == ".xlsx":
+            raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
+        blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
+        moved = np.concatenate([block.moved for block in blocks], axis=1) * (model.mm or 1.0)
+        mean = model.mean * (model.mm or 1.0)
+        count = moved.shape[1] + 1
+        z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)
+        folder = path.with_name(f"{path.stem}_particles")
+        files: dict[str, bytes] = {}
+        rows: list[dict[str, str]] = []
+        for number in range(count):
+            vertices = mean + (moved @ z[:, number]).reshape(-1, 3)
+            name = f"shape_{number:03d}"
+            particles, surface = f"{name}.particles", f"{name}.vtk"
+            files[particles] = number_lines(vertices, "%.17g %.17g %.17g").encode()
+            row = {"name": name}
+            if model.faces is not None:
+                files[surface] = write_vtk(Mesh(vertices, model.faces))
+                row |= {f"{key}_1": f"{folder.name}/{surface}" for key in ("shape", "groomed")}
+            row |= {f"{key}_particles_1": f"{folder.name}/{particles}" for key in ("local", "world")}
+            rows.append({**row, "alignment_1": _IDENTITY, "procrustes_1": _IDENTITY})
+        write_folder(folder, files)
+        tree = {"data": rows, "optimize": {"number_of_particles": str(len(mean))}, KEY: facts_of(model)}
+        write_text(path, json.dumps(tree, indent=1) + "\n")
+        said = [
+            f"The model is {count} shapes in {folder.name}, whose mean and covariance (n - 1) are its own; they are no "
+            "subjects.",
+            f"Each of the {len(mean)} vertices is a particle, in mm.",
+        ]
+        if model.expression is not None:
+            said.append("Identity and expression are no longer apart.")
+        return said
+
+
+@dataclass
+class _Project:
+    path: Path
+    rows: Sequence[Row]
+    allowance: Allowance
+    read: dict[Path, FloatArray] = field(default_factory=lambda: dict[Path, FloatArray]())
+    known: set[Path] = field(default_factory=lambda: set[Path]())
+
+    def file(self, name: str) -> Path:
+        """Return the file of that name beside the project or in a folder there, counted the first time."""
+        folder = self.path.parent.resolve()
+        try:
+            target = (folder / PurePosixPath(name.strip().replace("\\", "/"))).resolve()
+            is_there = target.is_file()
+        except (OSError, ValueError) as error:  # a name too long for the system, or one with zeros
+            raise ModelFileError(f"{self.path} names a file that cannot be ({name[:80]!r}); {_AGAIN}.") from error
+        if not target.is_relative_to(folder):
+            raise ModelFileError(
+                f"{self.path} names a file outside its own folder ({name[:80]!r}), which is not read; move it there."
+            )
+        if not is_there:
+            raise ModelFileError(f"{self.path} names a file that is not there ({name[:80]!r}); {_AGAIN}.")
+        if target not in self.known:
+            self.known.add(target)
+            self.allowance.more_file(target.stat().st_size)
+        return target
+
+    def particles(self, name: str) -> FloatArray:
+        """Return the (P, 3) particles in a file."""
+        file = self.file(name)
+        self.allowance.part()
+        if file not in self.read:
+            values = floats_of(read_bytes(file, LARGEST_MESH_FILE_BYTES), file)
+            if not len(values) or len(values) % 3 or not np.isfinite(values).all():
+                raise ModelFileError(f"{file} does not hold rows of three finite numbers; {_AGAIN}.")
+            self.read[file] = values.reshape(-1, 3)
+        # Many subjects may name one file, and each becomes a row of its own.
+        self.allowance.take(self.read[file].size, 8)
+        return self.read[file]
+
+
+def _model(project: _Project) -> LinearModel:
+    kind, domains = _domains(project)
+    rows = [row for row in project.rows if all(row.get(f"{kind}_particles_{domain}") for domain in domains)]
+    if len(rows) < 2:
+        raise ModelFileError(f"{project.path} has particles of {len(rows)} subjects, and a model needs two; {_AGAIN}.")
+    parts = [[project.particles(row[f"{kind}_particles_{domain}"]) for domain in domains] for row in rows]
+    counts = [len(part) for part in parts[0]]
+    if any([len(part) for part in subject] != counts for subject in parts):
+        raise ModelFileError(f"{project.path} has subjects with different numbers of particles; {_AGAIN}.")
+    shapes = np.stack([np.concatenate(subject) for subject in parts])
+    notes: list[str] = []
+    if len(rows) < len(project.rows):
+        notes.append(f"{len(project.rows) - len(rows)} subjects without particles are left out.")
+    if len(domains) > 1:
+        notes.append(f"Its {len(domains)} domains vary together in one model.")
+    if kind == "local":
+        align_in_place(shapes, "form")
+        notes.append("It has local particles only, which were aligned rigidly.")
+    flat = shapes.reshape(len(shapes), -1)
+    mean = flat.mean(axis=0)
+    _, stddev, directions = np.linalg.svd((flat - mean) / np.sqrt(len(flat) - 1), full_matrices=False)
+    modes = directions.T * stddev
+    # One less than there are subjects; the last is rounding.
+    moved = modes[:, : len(flat) - 1]
+    surface = _surface(project, rows, domains, shapes, mean.reshape(-1, 3), counts)
+    points: FloatArray = mean.reshape(-1, 3)
+    faces: IntArray | None = None
+    if isinstance(surface, str):
+        notes.append(f"It is a point model of {len(points)} particles: {surface}.")
+    elif surface.carry is None:
+        faces = surface.faces
+    else:
+        points, moved = surface.carried(points, moved)
+        faces = surface.faces
+        notes.append(
+            f"Its surface is the mesh of {surface.subject}, the most average subject, carried by the particles with "
+            "biharmonic splines."
+        )
+    return LinearModel(
+        mean=points,
+        shape=Modes(moved),
+        faces=faces,
+        n_training=len(rows),
+        provenance=f"ShapeWorks project {project.path.name}: {len(rows)} subjects, {sum(counts)} particles",
+        notes=tuple(notes),
+    )
+
+
+def _domains(project: _Project) -> tuple[str, list[str]]:
+    """Return whether particles are `world` or `local`, and the names of the domains."""
+    found: dict[str, list[str]] = {"world": [], "local": []}
+    for key, value in project.rows[0].items() if project.rows else ():
+        match = _PARTICLES.fullmatch(key)
+        if match and value:
+            found[match[1]].append(match[2])
+    for kind, domains in found.items():
+        if domains:
+            return kind, domains
+    raise ModelFileError(f"{project.path} names no particles; {_AGAIN}.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """The mesh of a subject.
+
+    Args:
+        subject: its name.
+        faces: (M, 3).
+        carry: for each domain the particles of that subject (P, 3) and its mesh (V, 3), or None where the particles are
+            the vertices.
+    """
+
+    subject: str
+    faces: IntArray
+    carry: Sequence[tuple[FloatArray, FloatArray]] | None
+
+    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry."""
+        steps = moved.reshape(len(mean), -1)
+        at, vertices, modes = 0, list[FloatArray](), list[FloatArray]()
+        for particles, mesh in self.carry or ():
+            rows = slice(at, at + len(particles))
+            at += len(particles)
+            # Splines are linear in what the particles do, so that the model stays a linear one.
+            what = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
+            spline = RBFInterpolator(particles, what, kernel="linear", degree=1)
+            found = np.asarray(spline(mesh), dtype=np.float64)
+            vertices.append(mesh + found[:, :3])
+            modes.append(found[:, 3:].reshape(3 * len(mesh), -1))
+        return np.concatenate(vertices), np.concatenate(modes)
+
+
+def _surface(
+    project: _Project,
+    rows: Sequence[Row],
+    domains: Sequence[str],
+    shapes: FloatArray,
+    mean: FloatArray,
+    counts: Sequence[int],
+) -> _Surface | str:
+    """Return the mesh of the subject nearest to the mean, or why there is none, as a clause."""
+    number = int(((shapes - mean) ** 2).sum(axis=(1, 2)).argmin())
+    row, points = rows[number], shapes[number]
+    bounds = np.cumsum([0, *counts])
+    found: list[tuple[FloatArray, FloatArray]] = []
+    faces: list[IntArray] = []
+    before, exact = 0, True
+    for k, domain in enumerate(domains):
+        name = next((row[f"{key}_{domain}"] for key in _SURFACES if row.get(f"{key}_{domain}")), "")
+        if not name.lower().endswith(tuple(MESH_ENDINGS)):
+            return "the project names no mesh"
+        world = points[bounds[k] : bounds[k + 1]]
+        try:
+            mesh = read_mesh(project.file(name))
+            local = row.get(f"local_particles_{domain}")
+            vertices = mesh.vertices
+            if local:
+                source = project.particles(local)
+                T = fit_similarity(source, world)
+                apart = float(np.sqrt(((T.apply(source) - world) ** 2).sum(axis=1).mean()))
+                vertices = vertices if np.array_equal(source, world) else T.apply(vertices)
+            else:
+                apart = 0.0
+        except ShapespaceError as error:
+            # A project without its meshes is a model still.
+            return f"the mesh of the most average subject cannot be used ({str(error).rstrip('.')[:160]})"
+        size = float(np.ptp(world, axis=0).max())
+        if mesh.faces is None:
+            return "the mesh of the most average subject has no triangles"
+        beside = np.maximum(vertices.min(axis=0) - world.min(axis=0), world.max(axis=0) - vertices.max(axis=0))
+        if apart > _MOST_APART * size or float(beside.max()) > _MOST_APART * size:
+            return "the mesh of the most average subject does not lie where its particles are"
+        is_vertices = vertices.shape == world.shape and np.abs(vertices - world).max() <= _ON_PARTICLES * size
+        exact = exact and bool(is_vertices)
+        found.append((world, vertices))
+        faces.append(mesh.faces + before)
+        before += len(vertices)
+    subject = row.get("name") or Path(row.get(f"world_particles_{domains[0]}", "")).stem
+    joined = np.concatenate(faces)
+    if exact:
+        return _Surface(subject, joined, None)
+    if any(len(np.unique(world, axis=0)) < len(world) or len(world) < 5 for world, _ in found):
+        return "particles coincide or are too few to carry a mesh"
+    return _Surface(subject, joined, found)
+
+
+def _rows(data: object) -> list[Row]:
+    found = cast(list[object], data) if isinstance(data, list) else []
+    return [{key: value for key, value in json_object(row).items() if isinstance(value, str)} for row in found]
+
+
+def _sheet(content: bytes, path: Path) -> list[Row]:
+    """Return the rows of the sheet `data` of a workbook, by their headings."""
+    try:
+        members = zip_members(io.BytesIO(content), len(content))
+    except (ValueError, OSError) as error:
+        raise ModelFileError(f"{path} is no workbook, or it is cut short ({error}); {_AGAIN}.") from error
+    strings = [
+        "".join(part.text or "" for part in one.iter() if part.tag.endswith("}t"))
+        for one in _elements(members, "xl/sharedStrings.xml", "si", path)
+    ]
+    sheets = {sheet.get("name"): sheet for sheet in _elements(members, "xl/workbook.xml", "sheet", path)}
+    if "data" not in sheets:
+        raise ModelFileError(f"{path} has no sheet called data, so it is no project of ShapeWorks; {_AGAIN}.")
+    key = next((value for name, value in sheets["data"].items() if name.endswith("}id")), "")
+    targets = {one.get("Id"): one.get("Target", "") for one in _elements(members, _RELATIONS, "Relationship", path)}
+    target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
+    table: list[dict[str, str]] = []
+    for row in _elements(members, f"xl/{target}", "row", path):
+        cells: dict[str, str] = {}
+        for cell in row:
+            at = _CELL.fullmatch(cell.get("r", ""))
+            text = "".join(part.text or "" for part in cell.iter() if part.tag.endswith(("}v", "}t")))
+            if at is None:
+                continue
+            if cell.get("t") == "s":
+                text = strings[int(text)] if text.isdecimal() and int(text) < len(strings) else ""
+            cells[at[1]] = text
+        table.append(cells)
+    if not table:
+        return []
+    heads = table[0]
+    return [{heads[at]: text for at, text in cells.items() if at in heads} for cells in table[1:]]
+
+
+def _elements(members: Mapping[str, bytes], name: str, tag: str, path: Path) -> list[Any]:
+    try:
+        root = xml_root(members.get(name, b"<none/>"), path)
+    except FileError as error:
+        raise ModelFileError(f"{path} is a damaged workbook; {_AGAIN}.") from error
+    return [one for one in root.iter() if one.tag.rpartition("}")[2] == tag]

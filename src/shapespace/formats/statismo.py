@@ -1,0 +1,316 @@
+"""statismo and scalismo models: HDF5 files, and one tree of groups that their other container shares.
+
+Dialects differ in how texts, attributes and sizes are stored, in whether a column of the basis is of length 1, and in
+where the points are; all are told apart by what the tree holds. A Morphable Model (Basel Face Model, scalismo-faces) is
+three such models in one: shape, colour, expression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import ModelFileError, ShapespaceError
+from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, scaled
+from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
+from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
+from shapespace.io.files import write_bytes
+from shapespace.io.json_files import check_file
+from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.vtk import read_vtk
+from shapespace.types import FloatArray, IntArray
+
+_AGAIN = "export it again from where it was made"
+_LARGEST_BYTES = 2**31
+_POINTS_AT = 1e-3
+"""Of the extent of the model; landmarks farther from every vertex are at none."""
+_UNIT_LENGTH = 1e-2
+_BFM_MODES = 199
+_BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
+_LEGACY_POINTS = "representer/reference-mesh/vertex-coordinates"
+_LEGACY_CELLS = "representer/reference-mesh/triangle-list"
+_OUTER: Final = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
+"""Sides of a tetrahedron, counter-clockwise from outside where its volume is positive."""
+
+
+class Statismo:
+    """HDF5 as statismo, scalismo up to 0.91, gravis and the Basel Face Model write it."""
+
+    name = "statismo"
+    title = "statismo/scalismo HDF5"
+    suffixes: Sequence[str] = (".statismo.h5",)
+
+    def recognises(self, path: Path, head: bytes) -> bool:
+        """Whether it begins as HDF5."""
+        return head.startswith(HDF5_SIGNATURE)
+
+    def read(self, path: Path) -> LinearModel:
+        """As `Format.read`."""
+        check_file(path, _LARGEST_BYTES, _AGAIN)
+        try:
+            return model_of(read_hdf5_apart(path, leave=("/color",)), path)
+        except ApartError as error:
+            raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
+
+    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
+        """As `Format.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
+        tree, said = tree_of(model)
+        write_bytes(path, hdf5_of(tree))
+        return said
+
+
+def model_of(tree: Tree, path: Path) -> LinearModel:
+    """Return the model in `tree`.
+
+    Args:
+        tree: of the file.
+        path: of the file, for messages.
+
+    Raises:
+        ModelFileError: it holds none, or one of images, or parts that do not belong together.
+    """
+    try:
+        return _model(tree, path)
+    except (ValueError, KeyError, OverflowError) as error:
+        if isinstance(error, ShapespaceError):
+            raise
+        raise ModelFileError(f"{path} is no usable statismo model: {error}; {_AGAIN}.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One model of a tree: mean (D,), moved (D, K), and variance that no mode holds."""
+
+    mean: FloatArray
+    moved: FloatArray
+    left: float
+
+    def modes(self) -> Modes:
+        total = float((self.moved**2).sum()) + self.left if self.left > 0 else None
+        return Modes(self.moved, total_variance=total)
+
+
+def _model(tree: Tree, path: Path) -> LinearModel:
+    root = _root(tree, path)
+    part = _part(tree, root)
+    mean, expression, notes = part.mean, None, list[str]()
+    if root == "/shape" and "/expression/model/mean" in tree.arrays:
+        added = _part(tree, "/expression")
+        if len(added.mean) != len(mean):
+            raise ValueError("its expressions have another number of vertices than its shape")
+        mean, expression = mean + added.mean, added.modes()
+    if "/color" in tree.groups:
+        notes.append("Its model of colour is left out.")
+    told = _parameters(tree, root)
+    points, faces, kept = _surface(tree, root, mean.reshape(-1, 3), notes)
+    shape = part.modes()
+    if kept is not None:
+        rows = (3 * kept[:, None] + np.arange(3)).ravel()
+        mean, points, shape = mean[rows], points[kept], Modes(shape.moved[rows])
+    representer = str(tree.attributes.get(f"{root}/representer", {}).get("name", ""))
+    is_bfm = root == "/shape" and part.moved.shape[1] == _BFM_MODES
+    return LinearModel(
+        mean=mean.reshape(-1, 3),
+        shape=shape,
+        expression=expression,
+        faces=faces,
+        mm=_mm(tree, root, told),
+        landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), notes, path),
+        n_training=_n_training(tree, root, part, told),
+        # Not so of Gaussian processes: fits that took their variances as they stand were too sure of themselves.
+        held_out=told.get("held_out") == "yes",
+        provenance=told.get("provenance") or " ".join(f"statismo model {representer}".split()),
+        licence=told.get("licence") or (_BFM_LICENCE if is_bfm else ""),
+        notes=tuple(notes),
+    )
+
+
+def _roots(tree: Tree) -> list[str]:
+    """Return where the catalogue says that models are, without doubled slashes."""
+    found = [text for path, text in tree.texts.items() if path.startswith("/catalog/") and path.endswith("/modelPath")]
+    return ["/" + "/".join(part for part in text.split("/") if part) for text in found]
+
+
+def _root(tree: Tree, path: Path) -> str:
+    for root in ("/shape", "", *_roots(tree)):
+        if f"{root}/model/mean" in tree.arrays:
+            return root
+    if tree.attributes.get("/", {}).get("format") == "shapespace model":
+        raise ValueError("it is one of shapespace, but has no checksum")
+    raise ModelFileError(f"{path} is not a shapespace model, nor one of statismo: there is no /model/mean in it.")
+
+
+def _version(tree: Tree, root: str) -> tuple[int, int] | None:
+    for where in (root, ""):
+        found = [tree.arrays.get(f"{where}/version/{name}") for name in ("majorVersion", "minorVersion")]
+        if all(one is not None and one.size == 1 for one in found):
+            major, minor = (int(one.reshape(-1)[0]) for one in found if one is not None)
+            return major, minor
+    return None
+
+
+def _part(tree: Tree, root: str) -> _Part:
+    mean, variance = _array(tree, f"{root}/model/mean").ravel(), _array(tree, f"{root}/model/pcaVariance").ravel()
+    basis = _array(tree, f"{root}/model/pcaBasis")
+    if basis.shape == (len(variance), len(mean)) != (len(mean), len(variance)):
+        basis = basis.T
+    if len(mean) % 3 or basis.shape != (len(mean), len(variance)) or not len(variance):
+        raise ValueError(f"its mean, basis and variances have the shapes {mean.shape}, {basis.shape}, {variance.shape}")
+    if not (np.isfinite(variance).all() and (variance >= 0).all() and np.isfinite(basis).all()):
+        raise ValueError("its variances or modes are not finite, or below 0")
+    noise_at = f"{root}/model/noiseVariance"
+    noise = float(_array(tree, noise_at).reshape(-1)[:1].sum()) if noise_at in tree.arrays else 0.0
+    if not 0 <= noise < np.inf:
+        raise ValueError("its noise is not finite, or below 0")
+    version = _version(tree, root)
+    length = np.linalg.norm(basis, axis=0)
+    if version is None:
+        # 0.8 had no number either; a file of others without one may have columns of length 1.
+        is_scaled = bool(np.abs(length - 1).max() > _UNIT_LENGTH)
+    elif version == (0, 8):
+        is_scaled = True
+    elif version[0] == 1 or version in ((0, 9), (0, 91)):
+        is_scaled = False
+    else:
+        raise ValueError(f"it is of version {version[0]}.{version[1]}, and 0.8, 0.9 and 1 are known")
+    unit = basis / np.where(is_scaled & (length > 0), length, 1.0)
+    there = length > 0
+    skew = np.abs(unit[:, there].T @ unit[:, there] - np.eye(int(there.sum()))).max(initial=0.0)
+    # The file has variances less the noise, which every direction has.
+    within = len(variance) if skew <= ORTHOGONAL else 0
+    moved = scaled(unit, np.sqrt(variance + (noise if within else 0.0)))
+    return _Part(mean, moved, noise * (len(mean) - within))
+
+
+def _array(tree: Tree, path: str) -> FloatArray:
+    if path not in tree.arrays:
+        raise ValueError(f"there is no {path} in it")
+    return np.asarray(tree.arrays[path], dtype=np.float64)
+
+
+def _surface(
+    tree: Tree, root: str, mean: FloatArray, notes: list[str]
+) -> tuple[FloatArray, IntArray | None, npt.NDArray[np.int64] | None]:
+    """Return the reference's points (V, 3), triangles or None, and of a solid the vertices of its surface or None."""
+    n = len(mean)
+    told = tree.attributes.get(f"{root}/representer", {})
+    kind = str(told.get("datasetType", "")).upper()
+    if kind.startswith("IMAGE") or kind == "VECTOR":
+        raise ValueError(f"it is a model of {kind.lower()}s and not of surfaces")
+    points, is_by_column = _points(tree, root, mean)
+    reference = tree.arrays.get(f"{root}/representer/reference")
+    if reference is not None and reference.dtype.itemsize == 1:
+        mesh = read_vtk(reference.tobytes(), Path(f"{root}/representer/reference"))
+        return mesh.vertices if len(mesh.vertices) == n else points, mesh.faces, None
+    cells = tree.arrays.get(f"{root}/{_LEGACY_CELLS}", tree.arrays.get(f"{root}/representer/cells"))
+    if cells is None or not cells.size or kind == "POINT_SET":
+        return points, None, None
+    if cells.ndim != 2 or cells.dtype.kind not in "iu":
+        raise ValueError(f"its cells have the shape {cells.shape} and the type {cells.dtype}")
+    if 3 in cells.shape and 4 not in cells.shape:
+        is_by_column = cells.shape[0] == 3 if cells.shape[0] != cells.shape[1] else is_by_column
+    cells = cells.T if is_by_column else cells
+    if cells.min() < 0 or cells.max() >= n:
+        raise ValueError("its cells name points that it does not have")
+    if cells.shape[1] == 4:
+        faces = _outside(cells.astype(np.int64), mean)
+        kept = np.unique(faces)
+        notes.append(f"Of its tetrahedra the surface is read, {len(faces)} triangles; {n - len(kept)} points within "
+                     "are left out.")  # fmt: skip
+        return points, np.searchsorted(kept, faces).astype(np.int32), kept
+    if cells.shape[1] != 3:
+        notes.append(f"Its cells of {cells.shape[1]} points are left out.")
+        return points, None, None
+    return points, cells.astype(np.int32), None
+
+
+def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
+    """Return the points of the reference (V, 3), the mean where there are none, and whether they stand in columns."""
+    found = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
+    if found is not None and found.shape == mean.shape:
+        return found.astype(np.float64), False
+    found = tree.arrays.get(f"{root}/representer/points")
+    if found is None:
+        return mean, True
+    if found.shape == mean.shape[::-1]:
+        return found.T.astype(np.float64), True
+    if found.shape != mean.shape:
+        raise ValueError(f"its mean has {len(mean)} vertices and its points the shape {found.shape}")
+    return found.astype(np.float64), False
+
+
+def _outside(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDArray[np.int64]:
+    """Return the triangles (M, 3) of tetrahedra (C, 4) that belong to one of them alone, turned outward."""
+    a, b, c, d = (mean[cells[:, corner]] for corner in range(4))
+    volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
+    cells = np.where((volume < 0)[:, None], cells[:, [0, 2, 1, 3]], cells)
+    sides = cells[:, list(_OUTER)].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
+    return sides[np.sort(first[count == 1])]
+
+
+def _mm(tree: Tree, root: str, told: Mapping[str, str]) -> float | None:
+    length = tree.arrays.get(f"{root}/representer/length-unit")
+    if length is not None and length.size == 1 and 0 < float(length.reshape(-1)[0]) < np.inf:
+        return round(1000 * float(length.reshape(-1)[0]), 9)
+    return 1.0 if told.get("unit") == "mm" or root == "/shape" else None
+
+
+def _parameters(tree: Tree, root: str) -> dict[str, str]:
+    """Return what our writer left for us."""
+    start = f"{root}/{PARAMETERS}/"
+    return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
+
+
+def _n_training(tree: Tree, root: str, part: _Part, told: Mapping[str, str]) -> int | None:
+    if told.get("n_training", "").isdecimal():
+        return int(told["n_training"][:9])
+    scores = tree.arrays.get(f"{root}/modelinfo/scores")
+    if scores is not None and scores.ndim == 2 and len(scores) == part.moved.shape[1] and scores.shape[1] > 1:
+        return scores.shape[1]
+    return None
+
+
+def _landmarks(tree: Tree, surfaces: Sequence[FloatArray], notes: list[str], path: Path) -> dict[str, int]:
+    """Return the vertices that the file's landmarks, which are points, lie at, on the surface that they are nearest."""
+    found = _landmark_points(tree, path)
+    if not found:
+        return {}
+    places = np.stack(list(found.values()))
+    best: tuple[FloatArray, npt.NDArray[np.int64]] | None = None
+    for surface in surfaces:
+        away2 = np.stack([((surface - place) ** 2).sum(axis=1) for place in places])
+        nearest = away2.argmin(axis=1)
+        away = np.sqrt(away2[np.arange(len(places)), nearest])
+        if best is None or away.sum() < best[0].sum():
+            best = away, nearest
+    assert best is not None
+    limit = _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
+    at = {name: int(vertex) for name, away, vertex in zip(found, *best, strict=True) if away <= limit}
+    if len(at) < len(found):
+        notes.append(f"{len(found) - len(at)} of {len(found)} landmarks lie at no vertex and are left out.")
+    return at
+
+
+def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:
+    for kind in ("json", "text"):
+        text = tree.texts.get(f"/metadata/landmarks/{kind}", "")
+        if not text.strip():
+            continue
+        try:
+            pairs = LANDMARK_FORMATS[".json"].read(text.encode(), path) if kind == "json" else _tlms(text)
+        except (ShapespaceError, ValueError, IndexError) as error:
+            raise ValueError("its landmarks cannot be read") from error
+        return {name: point for name, point in pairs if np.isfinite(point).all()}
+    return {}
+
+
+def _tlms(text: str) -> list[tuple[str, FloatArray]]:
+    """Return the landmarks of lines `name visible x y z`, those that are visible."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    return [(row[0], np.array(row[2:5], dtype=np.float64).reshape(3)) for row in rows if row[1] != "0"]

@@ -1,0 +1,69 @@
+"""Landmarks that a fit found, with their standard deviations, as the files that it writes beside its surface."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from shapespace.io.landmarks import LANDMARK_FORMATS
+
+FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
+"""Of the files that hold the landmarks of a fit, after NAME."""
+
+_FCSV = """# Markups fiducial file version = 4.11
+# CoordinateSystem = LPS
+# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
+"""
+_AXES = "xyz"
+
+Found = Mapping[str, Mapping[str, Any]]
+"""Name -> `at` (x, y, z) in the scan's frame and unit, and `stddev_mm` along its axes, None where it is not known."""
+
+
+def fiducial_texts(found: Found) -> dict[str, str]:
+    """Return ending -> text of each file: a table, and 3D Slicer's two formats, all in the scan's frame and unit.
+
+    Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
+    """
+    texts = _table(found), _markups(found), _fcsv(found)
+    return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
+
+
+def _table(found: Found) -> str:
+    header = ["name", *_AXES, *(f"stddev_{axis}_mm" for axis in _AXES)]
+    return _csv([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
+
+
+def _markups(found: Found) -> str:
+    points = {name: np.array(one["at"], dtype=np.float64) for name, one in found.items()}
+    content = json.loads(LANDMARK_FORMATS[".mrk.json"].write(points))
+    for point in content["markups"][0]["controlPoints"]:
+        point["description"] = _described(found[point["label"]]["stddev_mm"])
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _fcsv(found: Found) -> str:
+    rows = [
+        [str(number), *_told(one["at"]), "0", "0", "0", "1", "1", "1", "0", name, _described(one["stddev_mm"]), ""]
+        for number, (name, one) in enumerate(found.items(), 1)
+    ]
+    return _FCSV + _csv(rows)
+
+
+def _told(numbers: Sequence[float] | None) -> list[str]:
+    return [""] * len(_AXES) if numbers is None else [repr(float(number)) for number in numbers]
+
+
+def _described(stddev_mm: Sequence[float] | None) -> str:
+    return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"
+
+
+def _csv(rows: Sequence[Sequence[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()

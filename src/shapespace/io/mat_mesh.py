@@ -1,0 +1,64 @@
+"""A mesh in a MATLAB file, as MeshMonk and others keep templates: a structure with `Vertices` and `Faces`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_matlab_apart
+from shapespace.io.parsing import CUT_SHORT, damaged, mesh_of
+from shapespace.types import Mesh
+
+_HDF5_AT = 512
+_MOST_VARIABLES = 64
+_SAVE = (
+    "save it in MATLAB by s = struct('Vertices', T.Vertices, 'Faces', T.Faces); save('t.mat', '-struct', 's', '-v7')"
+)
+
+
+def read_mat_mesh(data: bytes, path: Path) -> Mesh:
+    """Read the mesh of a MATLAB file of version 4 to 7: vertices in rows or columns, triangles that count from 1.
+
+    Args:
+        data: the whole file.
+        path: the file, which is read by MATLAB's readers in a process apart.
+
+    Raises:
+        FileFormatError: it holds no such structure, as those with objects of MATLAB do, is damaged, or is of version
+            7.3.
+        MeshError: faces that point past the end of the vertices.
+    """
+    if HDF5_SIGNATURE in (data[: len(HDF5_SIGNATURE)], data[_HDF5_AT : _HDF5_AT + len(HDF5_SIGNATURE)]):
+        raise damaged(path, f"it is of MATLAB 7.3; {_SAVE}")
+    try:
+        # What it holds is not known before: once for the names, once for what they stand for.
+        names = [name.removeprefix("/") for name in read_matlab_apart(path, ()).groups]
+        tree = read_matlab_apart(path, names[:_MOST_VARIABLES])
+    except ApartError as error:
+        raise damaged(path, f"{error}; {CUT_SHORT}") from error
+    found = _mesh(tree)
+    if found is None:
+        raise damaged(path, f"it has no structure with Vertices and Faces; {_SAVE}")
+    vertices, faces = (np.asarray(array, dtype=np.float64) for array in found)
+    points = vertices if vertices.shape[1] == 3 else vertices.T
+    corners = faces if faces.shape[1] == 3 else faces.T
+    if points.shape[1] != 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+        raise damaged(path, f"its Vertices are of the shape {vertices.shape} and its Faces of {faces.shape}; {_SAVE}")
+    with np.errstate(invalid="ignore"):
+        return mesh_of(points, corners.astype(np.int64) - 1, path)
+
+
+def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
+    """Return the vertices and faces that stand in one place, if there are such."""
+    places: dict[str, dict[str, npt.NDArray[Any]]] = {}
+    arrays: Mapping[str, npt.NDArray[Any]] = tree.arrays
+    for name, array in arrays.items():
+        place, _, last = name.rpartition("/")
+        if array.ndim == 2:
+            places.setdefault(place, {})[last.lower()] = array
+    whole = (place for place in places.values() if {"vertices", "faces"} <= place.keys())
+    return next(((place["vertices"], place["faces"]) for place in whole), None)

@@ -1,0 +1,107 @@
+"""A model of a part of its surface: what a fit that is held to a region is made with.
+
+The region's vertices vary as the whole model has them vary: the modes of the part are the principal components of the
+model's own modes there, and each coefficient vector of one stands for one of the other. So nothing beyond the region
+has a say in the fit, and what comes of it is told in the coefficients of the whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.geometry.surface import without_vertices
+from shapespace.model.shape_model import ShapeModel, region_vertices
+from shapespace.types import BoolArray, FloatArray
+
+_FAINTEST = 1e-7
+"""Share of the first standard deviation below which a mode of the part is rounding."""
+_KEPT = 4
+
+_parts: WeakKeyDictionary[ShapeModel, dict[str | tuple[int, ...], Part]] = WeakKeyDictionary()
+"""Of each model in use: the fits of a batch share one part, and what is prepared for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of a model.
+
+    Args:
+        model: of the part alone, K' modes.
+        inside: (V,) which vertices of the whole it has.
+        lift: (K, K') from z of the part to z of the whole; its columns are orthonormal.
+    """
+
+    model: ShapeModel
+    inside: BoolArray
+    lift: FloatArray
+
+    @staticmethod
+    def of(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
+        """Return the part of `whole` in `region`, one of its regions by name or vertices.
+
+        Raises:
+            InputError: there is no such region, or no triangle lies in it.
+        """
+        parts = _parts.setdefault(whole, {})
+        if region not in parts:
+            while len(parts) >= _KEPT:
+                parts.pop(next(iter(parts)))
+            parts[region] = _part(whole, region)
+        return parts[region]
+
+    def to_b(self, b: FloatArray, whole: ShapeModel) -> FloatArray:
+        """Return the coefficients (K,) mm of the whole that `b` (k,) mm of the part stands for."""
+        return whole.stddev * (self.lift[:, : len(b)] @ (b / self.model.stddev[: len(b)]))
+
+    def to_covariance(self, b_covariance: FloatArray, whole: ShapeModel, variance: FloatArray) -> FloatArray:
+        """Return the covariance (K, K) mm^2 of the whole's coefficients, of that (K', K') of the part's.
+
+        Args:
+            b_covariance: of all the part's coefficients.
+            whole: the model that this is a part of.
+            variance: (K,) mm^2 of the whole's where nothing is seen, as of what no vertex of the part shows.
+        """
+        to = whole.stddev[:, None] * self.lift / self.model.stddev
+        unseen = np.eye(len(self.lift)) - self.lift @ self.lift.T
+        stddev = np.sqrt(variance)
+        return to @ b_covariance @ to.T + stddev[:, None] * unseen * stddev
+
+
+def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
+    if isinstance(region, str):
+        if region not in whole.regions:
+            there = f"it has {', '.join(whole.regions)}" if whole.regions else "it has none"
+            raise InputError(
+                f"The model has no region {region!r} ({there}); give one of them, or a CSV file of vertices, or build "
+                "the model with --region NAME=FILE."
+            )
+        vertices = whole.regions[region]
+    else:
+        vertices = region_vertices(region, whole.n_vertices, "given")
+    inside = np.zeros(whole.n_vertices, dtype=np.bool_)
+    inside[vertices] = True
+    mean, faces = whole.mean_vertices[inside], whole.faces
+    if faces is not None:
+        mean, faces = without_vertices(whole.mean_vertices, faces, inside)
+        if not len(faces):
+            raise InputError("No triangle of the model lies in the region; give one with whole triangles.")
+    rows = whole.vertex_basis.reshape(whole.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
+    basis, stddev, lift = np.linalg.svd(rows * whole.stddev, full_matrices=False)
+    kept = stddev > _FAINTEST * stddev[0]
+    number = np.cumsum(inside) - 1
+    model = ShapeModel(
+        mean=mean.ravel(),
+        basis=basis[:, kept],
+        stddev=stddev[kept],
+        total_variance=float((stddev**2).sum() * whole.total_variance / (whole.stddev**2).sum()),
+        n_training=whole.n_training,
+        faces=faces,
+        gauge=whole.gauge,
+        landmarks={name: int(number[at]) for name, at in whole.landmarks.items() if inside[at]},
+        held_out=whole.held_out,
+    )
+    return Part(model, inside, lift[kept].T)

@@ -1,0 +1,38 @@
+"""That code is compiled is said once by a command, whichever of its processes meets it first."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shapespace.batch import workers
+from shapespace.batch.warm import COMPILING, tell_compiling
+
+
+def told_by_another(mark: Path) -> str:
+    code = "from shapespace.batch.warm import tell_compiling; tell_compiling(); tell_compiling()"
+    env = {**os.environ, workers.SAID: str(mark)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=env, check=True)
+    return done.stderr
+
+
+@pytest.mark.parametrize("first", ["server", "command"])
+def test_the_command_and_its_server_say_it_once(
+    first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mark = tmp_path / "said"
+    monkeypatch.setattr(workers._Said, "mark", str(mark))
+    other = told_by_another(mark) if first == "server" else ""
+    tell_compiling()
+    other += told_by_another(mark) if first == "command" else ""
+    assert (other + capsys.readouterr().err).count(COMPILING) == 1
+
+
+def test_without_a_server_it_is_always_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(workers._Said, "mark", None)
+    tell_compiling()
+    assert capsys.readouterr().err == COMPILING + "\n"
