@@ -3,8 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
+READY_TO_LINT = $(VENV)/.ready-to-lint
+# What shows in a minute or two whether other versions of the dependencies do.
+QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_meshes.py tests/model/test_pca.py \
+  tests/model/test_shape_model.py tests/recognise/test_saved_classifier.py tests/schemas tests/store tests/fit/test_robust.py
 
-.PHONY: demo test test-all lint types contracts check bench docs clean
+.PHONY: demo test test-all test-oldest test-newest lint types contracts check bench docs dist clean
 
 demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
@@ -15,14 +19,24 @@ test: $(READY)
 test-all: $(READY)
 	$(BIN)/python -m pytest -n auto --max-worker-restart 0 $(PYTEST)
 
-lint: $(READY)
+# Each has an environment of its own, beside the usual one; old packages warn of one another.
+test-oldest: WHICH = oldest
+test-newest: WHICH = newest
+test-oldest test-newest:
+	$(PYTHON) -m venv $(VENV)-$(WHICH)
+	$(VENV)-$(WHICH)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-$(WHICH)/bin/python -m pip install --quiet --editable '.[all]' --group test --constraint constraints/$(WHICH).txt
+	$(VENV)-$(WHICH)/bin/python -m pip check
+	$(VENV)-$(WHICH)/bin/python -m pytest -n auto -m "not long" -W default $(or $(PYTEST),$(QUICK))
+
+lint: $(READY_TO_LINT)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(READY)
+types: $(READY_TO_LINT)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-contracts: $(READY)
+contracts: $(READY_TO_LINT)
 	$(BIN)/lint-imports
 
 check: lint types contracts test
@@ -43,8 +57,18 @@ $(VENV)/.docs: $(READY)
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[all]'
+	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test
 	touch $@
 
+# Apart, since pyright brings Node, which nothing else needs.
+$(READY_TO_LINT): $(READY)
+	$(BIN)/python -m pip install --quiet --group lint
+	touch $@
+
+dist: $(READY)
+	rm -rf build dist
+	$(BIN)/python -m pip install --quiet build
+	$(BIN)/python -m build --outdir dist
+
 clean:
-	rm -rf $(VENV) build demo-out bench-out screenshots-out .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-newest build dist demo-out bench-out screenshots-out .pytest_cache .ruff_cache

@@ -29,7 +29,14 @@ NAVIGATION = {
         "docs/tutorial-recognition",
         "docs/scale",
     ],
-    "How to": ["docs/howto-*"],
+    "How to": [
+        "docs/howto-hair",
+        "docs/landmarks",
+        "docs/howto-partial",
+        "docs/howto-own-model",
+        "docs/beside",
+        "docs/howto-*",
+    ],
     "Understand": [
         "docs/how-it-works",
         "docs/robust",
@@ -48,6 +55,9 @@ NAVIGATION = {
     "Look up": [
         "docs/cli",
         "docs/api",
+        "docs/api-stability",
+        "docs/model-formats",
+        "docs/mesh-formats",
         "docs/report",
         "docs/viewer",
         "docs/volumes",
@@ -61,6 +71,7 @@ NAVIGATION = {
         "docs/architecture",
         "docs/extending",
         "docs/dependencies",
+        "docs/releasing",
         "benchmarks/README",
         "studies/README",
         "CONTRIBUTING",

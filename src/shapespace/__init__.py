@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from shapespace.fit.robust_method import Robust
     from shapespace.geometry.distance import surface_distances
     from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
+    from shapespace.io.beside import as_mesh
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
     from shapespace.io.volumes import read_volume
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
 __all__ = [
@@ -38,6 +40,7 @@ __all__ = [
     "ModelQuality",
     "Paper",
     "QualitySettings",
+    "Results",
     "Robust",
     "ShapeModel",
     "ShapeSpace",
@@ -45,6 +48,7 @@ __all__ = [
     "Similarity",
     "VolumeSurface",
     "__version__",
+    "as_mesh",
     "correspond",
     "fit_scan",
     "load_faces",
@@ -70,11 +74,13 @@ _HOMES = {
     "ModelQuality": "model.quality",
     "Paper": "fit.paper_method",
     "QualitySettings": "model.quality",
+    "Results": "store.results",
     "Robust": "fit.robust_method",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
     "Similarity": "types",
+    "as_mesh": "io.beside",
     "correspond": "correspondence.rounds",
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
@@ -96,3 +102,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'shapespace' has no attribute {name!r}")
     return getattr(import_module(f"shapespace.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

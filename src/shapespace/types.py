@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, MeshError
+from shapespace.late import late
+from shapespace.reprs import short_repr
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int32]
@@ -54,6 +56,8 @@ class Mesh:
     landmarks: Mapping[str, FloatArray] = field(default_factory=lambda: dict[str, FloatArray]())
     name: str = "mesh"
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         vertices = read_only(self.vertices)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -80,9 +84,58 @@ class Mesh:
                 raise MeshError(f"{self.name}: landmark {key!r} must be 3 numbers, not {point.shape}.")
         object.__setattr__(self, "landmarks", MappingProxyType(landmarks))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # For copies, other processes and skops, none of which takes read-only mappings.
+        return {"vertices": self.vertices, "faces": self.faces, "landmarks": dict(self.landmarks), "name": self.name}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
         """Return the same triangles on other `vertices` (V, 3); landmarks are dropped unless given."""
         return Mesh(np.asarray(vertices, dtype=np.float64), self.faces, landmarks or {}, self.name)
+
+    def to_trimesh(self) -> Any:
+        """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.
+
+        Landmarks are left out, here as in the next four; `as_mesh` leads back.
+
+        Raises:
+            ShapespaceError: trimesh is not installed.
+        """
+        return late("to_trimesh")(self)
+
+    def to_pyvista(self) -> Any:
+        """Return a `pyvista.PolyData`.
+
+        Raises:
+            ShapespaceError: PyVista is not installed.
+        """
+        return late("to_pyvista")(self)
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` where there are no triangles.
+
+        Raises:
+            ShapespaceError: Open3D is not installed.
+        """
+        return late("to_open3d")(self)
+
+    def to_meshio(self) -> Any:
+        """Return a `meshio.Mesh` of triangles, or of vertices where there are none.
+
+        Raises:
+            ShapespaceError: meshio is not installed.
+        """
+        return late("to_meshio")(self)
+
+    def to_menpo(self) -> Any:
+        """Return a `menpo.shape.TriMesh`, or a `PointCloud` where there are no triangles.
+
+        Raises:
+            ShapespaceError: menpo is not installed.
+        """
+        return late("to_menpo")(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +154,8 @@ class Similarity:
     scale: float
     rotation: FloatArray
     translation: FloatArray
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         rotation, translation = read_only(self.rotation), read_only(self.translation)
@@ -158,6 +213,8 @@ class LabelVolume:
     affine: FloatArray
     name: str = "volume"
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         labels, affine = np.asarray(self.labels).view(), read_only(self.affine)

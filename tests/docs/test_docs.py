@@ -397,10 +397,9 @@ def test_the_layers_are_those_that_are_enforced() -> None:
 
 def test_every_dependency_has_its_line_and_every_line_its_dependency() -> None:
     declared = project()["project"]
-    extras = declared["optional-dependencies"]
-    for heading, wanted in (("Needed to run", declared["dependencies"]), *((f"Extra {e}", extras[e]) for e in extras)):
-        if heading == "Extra all":
-            continue
+    extras = {f"Extra {name}": of for name, of in declared["optional-dependencies"].items() if name != "all"}
+    groups = {f"Group {name}": of for name, of in project()["dependency-groups"].items() if name in ("test", "lint")}
+    for heading, wanted in {"Needed to run": declared["dependencies"], **extras, **groups}.items():
         names = sorted(re.split(r"[<>=~\[;]", requirement)[0].strip() for requirement in wanted)
         table = rows(ROOT / "docs" / "dependencies.md", heading)
         assert sorted(code_in(row[0])[0] for row in table) == names

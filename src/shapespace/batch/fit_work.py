@@ -24,6 +24,7 @@ from shapespace.batch.results import (
 )
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.fit.fit import OPTIONS, FitConfig, fit_scan
+from shapespace.fit.result import FitResult
 from shapespace.fit.state import IcpState
 from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
 from shapespace.io.files import sha256_of_file, write_text, write_together
@@ -124,21 +125,32 @@ def fit_file(
         failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
         return _write_failed(failed, job, folder)
     record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
-    files = _Files.of(job, folder)
-    writes: dict[Path, Callable[[Path], None]] = {}
-    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if config.dense else [])):
-        writes[surface] = partial(write_fitted_mesh, result=result, model=model, stage=stage, identity=record["id"])
-    if stages:
-        writes[files.stages] = partial(write_stages, result=result, model=model)
-    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
-    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
-    writes[files.record] = partial(write_record, record=record)
-    write_together(writes, files.stale(dense=not config.dense, stages=not stages, landmarks=not texts))
+    publish(result, record, job.name, folder, stages=stages)
     return record
 
 
+def publish(result: FitResult, record: Mapping[str, Any], name: str, folder: Path, *, stages: bool) -> None:
+    """Write the record and the surfaces of a fit together, and remove what an earlier one of that name left.
+
+    Raises:
+        FileError: they cannot be written.
+    """
+    files, dense = _Files.of(name, folder), "dense" in result.stages
+    writes: dict[Path, Callable[[Path], None]] = {}
+    for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if dense else [])):
+        writes[surface] = partial(
+            write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record["id"]
+        )
+    if stages:
+        writes[files.stages] = partial(write_stages, result=result, model=result.model)
+    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
+    writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
+    writes[files.record] = partial(write_record, record=record)
+    write_together(writes, files.stale(dense=not dense, stages=not stages, landmarks=not texts))
+
+
 def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     # An earlier run's surface would contradict the record.
     stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
     write_together({files.record: partial(write_record, record=record)}, stale)
@@ -156,10 +168,10 @@ class _Files:
     landmarks: Mapping[str, Path]
 
     @staticmethod
-    def of(job: Job, folder: Path) -> _Files:
+    def of(name: str, folder: Path) -> _Files:
         endings = (RECORD, ".fitted.ply", ".dense.ply", ".stages.npz")
-        landmarks = {ending: folder / f"{job.name}{ending}" for ending in FIDUCIAL_ENDINGS}
-        record, fitted, dense, stages = (folder / f"{job.name}{ending}" for ending in endings)
+        landmarks = {ending: folder / f"{name}{ending}" for ending in FIDUCIAL_ENDINGS}
+        record, fitted, dense, stages = (folder / f"{name}{ending}" for ending in endings)
         return _Files(record, fitted, dense, stages, landmarks)
 
     def stale(self, *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
@@ -263,7 +275,7 @@ _models: dict[str, ShapeModel] = {}
 
 def has_surface(job: Job, folder: Path) -> bool:
     """Return whether `folder` holds the surface of an earlier fit of the scan."""
-    files = _Files.of(job, folder)
+    files = _Files.of(job.name, folder)
     return files.fitted.is_file() and files.record.is_file()
 
 
@@ -273,7 +285,7 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
     A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
     is tried again by another run, not by `run` itself.
     """
-    files = _Files.of(task.job, folder)
+    files = _Files.of(task.job.name, folder)
     if not files.record.is_file():
         return task, None
     try:

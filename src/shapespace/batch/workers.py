@@ -28,6 +28,8 @@ WARM_UP = "SHAPESPACE_WARM_UP"
 """Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
 SAID = "SHAPESPACE_SAID"
 """Set for the server alone: a folder that whoever says first that code is compiled makes, so that it is said once."""
+COPIED = sys.platform == "linux"
+"""Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -38,10 +40,7 @@ def cores() -> int:
 
 def context() -> ForkServerContext | SpawnContext:
     """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
-    # Apple's BLAS does not survive a fork, and Windows has none.
-    if sys.platform == "linux":
-        return multiprocessing.get_context("forkserver")
-    return multiprocessing.get_context("spawn")
+    return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
 def start_loading(*, tell: bool) -> None:
@@ -51,7 +50,7 @@ def start_loading(*, tell: bool) -> None:
         tell: whether a line on standard error may say that the code is being compiled.
     """
     _Said.mark = (_Said.mark or str(_scratch() / "said")) if tell else None
-    if sys.platform != "linux":
+    if not COPIED:
         from shapespace.batch.warm import warm_up
 
         warm_up(tell=tell)
@@ -105,7 +104,7 @@ def wait_until_loaded() -> None:
     Raises:
         FitError: no process can be started.
     """
-    if sys.platform != "linux":
+    if not COPIED:
         return
     try:
         first = context().Process(target=_nothing)

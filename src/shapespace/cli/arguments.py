@@ -316,7 +316,8 @@ def _add_export(commands: Any) -> None:
     sub.add_argument("-o", "--output", type=Path, default=Path("exported"), metavar="DIR",
                      help="where to write (default exported)")  # fmt: skip
     sub.add_argument("--all", action="store_true", help="all fits")
-    sub.add_argument("--table", type=Path, metavar="FILE.csv", help="the coefficients of all fits, as CSV")
+    sub.add_argument("--table", type=Path, metavar="FILE",
+                     help="the coefficients of all fits: FILE.csv, or FILE.mat for MATLAB")  # fmt: skip
     sub.set_defaults(run=run.export)
 
 

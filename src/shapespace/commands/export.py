@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import io
+import re
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from shapespace.batch.progress import progress
 from shapespace.errors import InputError, ShapespaceError
@@ -13,7 +18,10 @@ from shapespace.io.files import atomic_path, make_folder, write_bytes, write_err
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import CHECKSUM, write_checked
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
-from shapespace.store.rows import META, coefficient_columns, safe_cells
+from shapespace.store.rows import META, coefficient_columns, kind_of, safe_cells
+
+_MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 116
+_LONGEST_IN_MATLAB = 63
 
 
 def export(
@@ -35,7 +43,7 @@ def export(
         names: of the fits.
         output: folder to write them to.
         every: all fits instead.
-        table: a CSV file for the coefficients of all fits; None for none.
+        table: a file for the coefficients of all fits: CSV, or MATLAB's where its name ends in .mat; None for none.
         quiet: no progress.
         say: told of what cannot be read; the rest is written.
 
@@ -64,7 +72,10 @@ def export(
                 say(str(error))
             bar.update()
     if table is not None:
-        write_table(results, table)
+        if table.suffix.lower() == ".mat":
+            write_mat(results, table)
+        else:
+            write_table(results, table)
     for problem in results.problems:
         say(problem)
     return [name for name in wanted if name not in failed], failed
@@ -104,6 +115,56 @@ def write_table(results: Results, path: Path) -> None:
                 write_checked(stream, columns, cells)
         except OSError as error:
             raise write_error(path, error) from error
+
+
+def write_mat(results: Results, path: Path) -> None:
+    """Write the coefficients of all fits for MATLAB and Octave, as the struct `fits` of a MAT-file of level 5.
+
+    `b`, `z` and `b_stddev` are (N, K); other columns of coefficients.csv are (N, 1), texts as cells; what is not known
+    is NaN, and what a name of MATLAB cannot hold is an underscore.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    from scipy.io import savemat
+
+    known = [column for column in results.column_names() if column.startswith(META)]
+    modes = modes_of(results)
+    columns = [column for column in coefficient_columns(modes, known) if column != CHECKSUM]
+    rows = list(_rows(results, columns))
+    fits: dict[str, npt.NDArray[Any]] = {
+        name: _numbers(rows, [form.format(k) for k in range(1, modes + 1)])
+        for name, form in (("b", "b{}"), ("z", "z{}"), ("b_stddev", "b{}_stddev"))
+    }
+    of_modes = {form.format(k) for form in ("b{}", "z{}", "b{}_stddev") for k in range(1, modes + 1)}
+    for column in (column for column in columns if column not in of_modes):
+        text = kind_of(column) == "text"
+        fits[_name_in_matlab(column, fits)] = _texts(rows, column) if text else _numbers(rows, [column])
+    stream = io.BytesIO()
+    savemat(stream, {"fits": fits}, long_field_names=True, do_compression=True)
+    # Without the time of writing, so that the same fits are the same file.
+    content = _MAT_HEADER.ljust(_MAT_HEADER_BYTES) + stream.getvalue()[_MAT_HEADER_BYTES:]
+    make_folder(path.absolute().parent)
+    write_bytes(path, content)
+
+
+def _numbers(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> npt.NDArray[np.float64]:
+    return np.array([[row.get(column) for column in columns] for row in rows], dtype=np.float64)
+
+
+def _texts(rows: Sequence[Mapping[str, Any]], column: str) -> npt.NDArray[Any]:
+    cells = np.empty((len(rows), 1), dtype=object)
+    cells[:, 0] = [str(row.get(column) or "") for row in rows]
+    return cells
+
+
+def _name_in_matlab(column: str, taken: Container[str]) -> str:
+    name = re.sub(r"[^A-Za-z0-9_]", "_", column)[:_LONGEST_IN_MATLAB]
+    number = 2
+    while name in taken:
+        name = f"{name[: _LONGEST_IN_MATLAB - 4]}_{number}"
+        number += 1
+    return name
 
 
 def _rows(results: Results, columns: Sequence[str]) -> Iterator[dict[str, Any]]:

@@ -27,6 +27,7 @@ from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, Mesh, Similarity
 
 SIZE = 100.0
@@ -108,6 +109,8 @@ class Corresponding:
     seconds: tuple[float, ...] = ()
     landmarks: float = np.nan
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
@@ -124,6 +127,8 @@ class Correspondence:
     scans: tuple[Corresponding, ...]
     why: str
     moved: tuple[float, ...]
+
+    __repr__ = short_repr
 
     def meshes(self) -> list[Mesh]:
         """Return the surfaces of those that are not set aside, in their scans' own frames."""

@@ -24,6 +24,7 @@ from shapespace.datasets.loop import loop_operator
 from shapespace.datasets.warp import Warp
 from shapespace.errors import DataError, InputError
 from shapespace.geometry.surface import faces_of
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 LICENSE = "CC0-1.0"
@@ -87,6 +88,8 @@ class Person:
     name: str = "person"
     warp_mm: FloatArray | None = None
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", _checked_weights(self.weights, "person"))
         if self.warp_mm is not None:
@@ -106,6 +109,8 @@ class Expression:
     weights: FloatArray
     name: str = "mixed"
     intensity: float = 1.0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", _checked_weights(self.weights, "expression"))
@@ -143,6 +148,8 @@ class FaceGenerator:
     _units: npt.NDArray[np.float32] = field(repr=False)
     _generic: FloatArray = field(repr=False)
     _loop: Any = field(repr=False)
+
+    __repr__ = short_repr
 
     def draw_person(self, rng: np.random.Generator, name: str = "person", *, wide: bool = False) -> Person:
         """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.

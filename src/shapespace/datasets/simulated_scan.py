@@ -18,6 +18,7 @@ from shapespace.datasets.hair_and_collar import Collar, Hair, LongArray, collar_
 from shapespace.errors import InputError
 from shapespace.geometry import remesh
 from shapespace.geometry.surface import faces_of, vertex_normals
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
 
 PLAIN_TRIANGLES = 20_000
@@ -67,6 +68,8 @@ class SimulatedScan:
     truth_landmarks: Mapping[str, FloatArray]
     T_scan_model: Similarity
     on_surface: BoolArray
+
+    __repr__ = short_repr
 
 
 def random_similarity(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -27,9 +29,14 @@ from shapespace.fit.verdict import verdict
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
+from shapespace.io.beside import MeshLike, as_mesh
+from shapespace.io.landmarks import read_landmarks
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
 from shapespace.version import __version__
+
+if TYPE_CHECKING:
+    from shapespace.model.additive import AdditiveModel
 
 _FAR_OUT = 3.0
 _FAR_OUT_BY_CHANCE = 0.01
@@ -41,6 +48,7 @@ OPTIONS = ("landmark_stddev_mm", "crop", "region")
 """Settings that a record tells only where they are given."""
 
 OnState: TypeAlias = Callable[[IcpState], None]
+PathTo: TypeAlias = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
@@ -136,31 +144,38 @@ class FitConfig:
 
 
 def fit_scan(
-    model: ShapeModel,
-    scan: Mesh,
+    model: ShapeModel | AdditiveModel | PathTo,
+    scan: MeshLike,
     config: FitConfig | None = None,
     *,
-    landmarks: Mapping[str, FloatArray] | None = None,
+    landmarks: Mapping[str, FloatArray] | PathTo | None = None,
     T_scan_model: Similarity | None = None,
     on_state: OnState | None = None,
 ) -> FitResult:
     """Fit `model` to a raw scan of any topology, pose and unit, and return its coefficients and how far to trust them.
 
     Args:
-        model: the shape space.
-        scan: a mesh or point cloud, in its own frame and unit.
+        model: the shape space, or the path of its file.
+        scan: a mesh or point cloud, in its own frame and unit; its path; or whatever else `as_mesh` takes.
         config: settings; None for the defaults.
-        landmarks: name -> (3,) in the scan's frame and unit, to start from and, by the robust method, to be held to
-            (`FitConfig.landmark_stddev_mm`); None to use none.
+        landmarks: name -> (3,) in the scan's frame and unit, or the path of their file, to start from and, by the
+            robust method, to be held to (`FitConfig.landmark_stddev_mm`); None to use none.
         T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
         on_state: called with each state of the loop, for progress bars and viewers.
 
     Raises:
         MeshError: the scan cannot be used at all.
         FitError: no start can be found, or the fit diverged.
-        InputError: the search needs triangles that the scan lacks.
+        InputError: the search needs triangles that the scan lacks; or `model` or `scan` is something else.
+        FileError: a file cannot be read.
     """
     config = config or FitConfig()
+    given = {"model": model, "scan": scan, "landmarks": landmarks}
+    files = {what: Path(path).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)}
+    model, scan = _as_model(model), as_mesh(scan)
+    if "landmarks" in files:
+        landmarks = read_landmarks(files["landmarks"])
+    landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
     # Products this small go slower by several threads, and many fits at a time share the cores anyway.
     with threadpool_limits(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
@@ -228,7 +243,19 @@ def fit_scan(
         scan=placed.scan,
         find_regions=fitted.regions,
         landmark_stddev_mm=_landmark_stddev_mm(model, fitted, held, dense=config.dense),
+        files=files,
     )
+
+
+def _as_model(model: ShapeModel | AdditiveModel | PathTo) -> ShapeModel:
+    if isinstance(model, str | os.PathLike):
+        return ShapeModel.load(Path(model))
+    if isinstance(model, ShapeModel):
+        return model
+    shape = getattr(model, "shape", None)  # of an additive model
+    if not isinstance(shape, ShapeModel):
+        raise InputError(f"A scan is fitted by a ShapeModel or by the file of one, not by {type(model).__name__}.")
+    return shape
 
 
 @dataclass(frozen=True, eq=False)

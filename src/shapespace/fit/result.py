@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -13,8 +15,13 @@ from shapespace.errors import InputError
 from shapespace.fit.regions import SHOWN
 from shapespace.fit.state import IcpState
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
+from shapespace.late import OpenViewer, late
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import short_repr, told_briefly
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,8 @@ class Stage:
     seen: BoolArray | None = None
     moved_mm: float = 0.0
 
+    __repr__ = short_repr
+
     @cached_property
     def distances(self) -> SurfaceDistances:
         """Distances to the scan and back, mm of the model's frame, measured when first asked for."""
@@ -103,6 +112,7 @@ class FitResult:
         landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
             scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
             the region that the fit was held to.
+        files: of `model`, `scan` and `landmarks`, as far as they were read from files.
     """
 
     scan_name: str
@@ -128,6 +138,14 @@ class FitResult:
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
     landmark_stddev_mm: Mapping[str, FloatArray] | None = field(default=None, repr=False)
+    files: Mapping[str, Path] = field(default_factory=dict[str, Path])
+
+    def __repr__(self) -> str:
+        far = int(np.abs(self.z).argmax())
+        return (
+            f"<FitResult of {told_briefly(self.scan_name)}: {self.status}. {self.reason} {len(self.z)} coefficients, "
+            f"the largest {self.z[far]:+.1f} sd (mode {far + 1}); {self.method}, {sum(self.seconds.values()):.2f} s>"
+        )
 
     @cached_property
     def regions(self) -> IntArray:
@@ -203,3 +221,51 @@ class FitResult:
         vertices = at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
         landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
         return Mesh(vertices, self.model.faces, landmarks, name=self.scan_name)
+
+    def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
+        """Write what `shapespace fit` writes of a scan, and return the path of the record, NAME.fit.json.
+
+        Record and surfaces are published together, and the row of coefficients.csv is put in; `report`, `view` and
+        `recognise` then take the folder. Of a scan or a model that was not read from a file the record tells no path,
+        so that these need `--model`, and show the raw scan only with `stages`.
+
+        Args:
+            folder: made if absent.
+            name: NAME of the files; empty for that of the scan, with a part of its hash where another scan has it.
+            stages: whether to write NAME.stages.npz too, for figures.
+
+        Raises:
+            FileError: the folder cannot be written, or another run writes into it.
+            InputError: a name that no file can have.
+        """
+        return late("save_fit")(self, Path(folder), name, stages=stages)
+
+    def plot(self, what: str = "distances", **options: Any) -> Figure:
+        """Return a matplotlib figure of the fit.
+
+        Args:
+            what: `distances` from the fitted surface to the scan, `stages` of the fit, `overlay` of scan and model,
+                `histograms` of the distances, `coefficients`, `history` of the iterations, or `regions` of the model.
+            options: of that figure's function in `shapespace.report.figures`.
+
+        Raises:
+            InputError: there is no such plot.
+            ShapespaceError: the extra `report` is not installed.
+        """
+        return late("plot_fit")(self, what, **options)
+
+    def view(self, *, height_px: int = 720) -> OpenViewer:
+        """Open the viewer on this fit, in a notebook in the cell's own frame.
+
+        It is served to this machine alone, by a thread, until `close()` of what is returned or the end of the process.
+
+        Args:
+            height_px: of the frame.
+
+        Raises:
+            ShapespaceError: the extra `view` is not installed.
+        """
+        return late("view_fit")(self, height_px=height_px)
+
+    def _repr_html_(self) -> str:
+        return late("html_of_fit")(self)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Similarity
 
 
@@ -33,6 +34,8 @@ class IcpState:
     rms_mm: float
     motion_mm: float
     stopped: str | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)

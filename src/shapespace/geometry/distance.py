@@ -12,6 +12,7 @@ import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
 from shapespace.geometry.surface import boundary_vertices, vertex_normals, without_vertices
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 
@@ -73,6 +74,8 @@ class SurfaceDistances:
     outside_of_model: BoolArray
     scan_outside: BoolArray
     model_counted: BoolArray | None = None
+
+    __repr__ = short_repr
 
     @property
     def model_to_scan_signed_mm(self) -> FloatArray:

@@ -19,6 +19,7 @@ from scipy import ndimage
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume, Mesh
 
 SMOOTH = 1.3
@@ -71,6 +72,8 @@ class VolumeSurface:
     at_border: int
     volume_mm3: float
     notes: tuple[str, ...]
+
+    __repr__ = short_repr
 
 
 def surface_of_volume(

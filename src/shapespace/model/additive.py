@@ -28,6 +28,7 @@ from shapespace.model.local_modes import local_modes
 from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, principal_components
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
 
 _STILL_ROUNDS = 3
@@ -68,6 +69,8 @@ class AdditiveModel:
     shape: ShapeModel
     rotation: FloatArray
     n_identity: int
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         rotation, k = read_only(self.rotation), self.shape.n_modes

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -23,10 +23,15 @@ from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_bou
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, without_vertices
+from shapespace.late import late
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _FEWEST = 3
 _FEWEST_TO_CHOOSE = 4
@@ -70,6 +75,8 @@ class Curve:
     low: FloatArray
     high: FloatArray
     each: FloatArray | None = None
+
+    __repr__ = short_repr
 
     @staticmethod
     def over(each: FloatArray, at: Sequence[int] | IntArray, seed: int) -> Curve:
@@ -117,6 +124,26 @@ class ModelQuality:
     seed: int = 0
     missing_share: float = 0.0
     left_out_vertices: int = 0
+
+    def __repr__(self) -> str:
+        told = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
+        for name, curve in (("generalisation", self.generalisation), ("specificity", self.specificity)):
+            told += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
+        return f"<ModelQuality of {self.shapes} shapes: {', '.join(told)}>"
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a matplotlib figure of all measures that there are, over the number of modes.
+
+        Args:
+            options: of `shapespace.report.figures.quality_figure`.
+
+        Raises:
+            ShapespaceError: the extra `report` is not installed.
+        """
+        return late("plot_quality")(self, **options)
+
+    def _repr_html_(self) -> str:
+        return late("html_of_quality")(self)
 
     def sentences(self) -> tuple[str, ...]:
         """Return how many modes the shapes support, and whether more shapes would help."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.late import OpenViewer, late
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
@@ -38,13 +39,17 @@ from shapespace.model.streamed import (
     refuse_without_extent,
     too_large,
 )
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
 _TOLD = 300
-_IN_FILES: weakref.WeakSet[ShapeModel] = weakref.WeakSet()
+_FILES: weakref.WeakKeyDictionary[ShapeModel, Path] = weakref.WeakKeyDictionary()
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
 """Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
@@ -97,6 +102,8 @@ class ShapeModel:
     left_out: int = 0
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         mean, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
         d, k = len(mean), len(stddev)
@@ -135,6 +142,13 @@ class ShapeModel:
         _refuse_far_landmarks(self.landmarks, len(checked.vertices))
         regions = {str(name): region_vertices(at, len(checked.vertices), name) for name, at in self.regions.items()}
         object.__setattr__(self, "regions", MappingProxyType(regions))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # For copies, other processes and skops, none of which takes read-only mappings.
+        return {**self.fields(), "landmarks": dict(self.landmarks), "coding": dict(self.coding)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
     @classmethod
     def fit(
@@ -435,7 +449,12 @@ class ShapeModel:
     @property
     def in_file(self) -> bool:
         """Whether it was read from a file or saved to one: later runs will need what was made of it again."""
-        return self in _IN_FILES
+        return self in _FILES
+
+    @property
+    def file(self) -> Path | None:
+        """The file that it was read from or saved to last, in shapespace's own format; None where there is none."""
+        return _FILES.get(self)
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
@@ -537,7 +556,7 @@ class ShapeModel:
             FileError: the folder cannot be written, or the disk is full.
         """
         model_file.save(self.fields(), Path(path))
-        _IN_FILES.add(self)
+        _FILES[self] = Path(path).absolute()
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
@@ -558,7 +577,7 @@ class ShapeModel:
         except InputError as error:
             said = str(error)[:_TOLD]
             raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {said}") from error
-        _IN_FILES.add(model)
+        _FILES[model] = Path(path).absolute()
         return model
 
     @classmethod
@@ -572,6 +591,34 @@ class ShapeModel:
             return cls(**foreign.fields)
         except InputError as error:
             raise ModelFileError(f"{path} ({foreign.format}) is no usable model: {str(error)[:_TOLD]}") from error
+
+    def plot(self, what: str = "modes", **options: Any) -> Figure:
+        """Return a matplotlib figure of the model.
+
+        Args:
+            what: `modes`, the first ones at minus and plus 3 standard deviations; `mean`, from three sides; or
+                `spectrum`, the share of the variance by the number of modes.
+            options: of that figure's function in `shapespace.report.figures`, such as `modes=8`.
+
+        Raises:
+            InputError: there is no such plot.
+            ShapespaceError: the extra `report` is not installed.
+        """
+        return late("plot_model")(self, what, **options)
+
+    def view(self, *, height_px: int = 720) -> OpenViewer:
+        """Open the viewer on the model, in a notebook in the cell's own frame; see `FitResult.view`.
+
+        Args:
+            height_px: of the frame.
+
+        Raises:
+            ShapespaceError: the extra `view` is not installed.
+        """
+        return late("view_model")(self, height_px=height_px)
+
+    def _repr_html_(self) -> str:
+        return late("html_of_model")(self)
 
     def as_linear(self) -> LinearModel:
         """Return what formats of other tools can hold of the model."""

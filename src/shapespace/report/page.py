@@ -187,8 +187,13 @@ def rendered(blocks: Sequence[Block]) -> str:
     """Return blocks as HTML."""
     from markupsafe import Markup
 
-    macros: Any = _environment().get_template("blocks.html").module
+    macros: Any = template("blocks.html").module
     return Markup("").join(getattr(macros, type(block).__name__)(block) for block in blocks)
+
+
+def template(name: str) -> Any:
+    """Return a template of ours, which escapes all that it is given."""
+    return _environment().get_template(name)
 
 
 @cache

@@ -20,9 +20,11 @@ from shapespace.io.archives import arrays_in, read_arrays
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.json_files import LARGEST_BYTES, json_of, read_json
 from shapespace.io.meshes import read_mesh
+from shapespace.io.tables import CHECKSUM
+from shapespace.late import other_package
 from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
-from shapespace.store.rows import FLAGS, store_row
+from shapespace.store.rows import FLAGS, META, coefficient_columns, kind_of, store_row
 from shapespace.store.shard import ROW, Shard
 from shapespace.types import Mesh
 
@@ -153,7 +155,7 @@ class Results:
         ShapespaceError: there is a store, and the extra `store` is not installed.
     """
 
-    def __init__(self, folder: Path, store: Store | None = None) -> None:
+    def __init__(self, folder: Path | str, store: Store | None = None) -> None:
         self.folder = Path(folder)
         manifest = None if store is not None else read_manifest(self.folder)
         self.store = store if manifest is None else Store(self.folder, manifest)
@@ -313,6 +315,52 @@ class Results:
             except ShapespaceError as error:
                 self._tell(str(error))
         return found.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
+
+    def to_dataframe(self, columns: Sequence[str] | None = None) -> Any:
+        """Return the fits as a `pandas.DataFrame`, a row each, by their names in the order of these.
+
+        Args:
+            columns: some of `column_names`; None for those of coefficients.csv.
+
+        Raises:
+            InputError: no fit has such a column.
+            ShapespaceError: pandas is not installed.
+        """
+        pandas = other_package("pandas", "Results.to_dataframe")
+        there = self.column_names()
+        if columns is None:
+            known = sorted(column for column in there if column.startswith(META))
+            columns = [one for one in coefficient_columns(modes_of(self), known) if one != CHECKSUM]
+        elif unknown := [one for one in columns if one not in there]:
+            raise InputError(
+                f"{self.folder}: no fit has a column {unknown[0]!r}; column_names() lists those there are."
+            )
+        wanted = list(dict.fromkeys(["scan", *columns]))
+        found: dict[str, list[Any]] = {column: [] for column in wanted}
+        for rows in self.iter_rows(wanted):
+            for column in wanted:
+                found[column] += rows[column]
+        frame = pandas.DataFrame(found).set_index("scan").sort_index()
+        numbers = [one for one in frame.columns if kind_of(one) in ("number", "count")]
+        # Of scans that could not be fitted nothing is known, which pandas would keep as objects.
+        frame[numbers] = frame[numbers].astype("float64")
+        return frame
+
+    def to_xarray(self) -> Any:
+        """Return the fits as an `xarray.Dataset`: `b` and `b_stddev` in mm and `z` by scan and mode, the rest by scan.
+
+        Raises:
+            ShapespaceError: xarray or pandas is not installed.
+        """
+        xarray = other_package("xarray", "Results.to_xarray")
+        frame, modes = self.to_dataframe(), range(1, modes_of(self) + 1)
+        of_modes = {
+            "b": [f"b{k}" for k in modes], "z": [f"z{k}" for k in modes], "b_stddev": [f"b{k}_stddev" for k in modes]
+        }  # fmt: skip
+        rest = frame.drop(columns=[column for columns in of_modes.values() for column in columns])
+        by_mode = {name: (("scan", "mode"), frame[columns].to_numpy()) for name, columns in of_modes.items()}
+        by_scan = {name: ("scan", rest[name].to_numpy()) for name in rest.columns}
+        return xarray.Dataset({**by_mode, **by_scan}, coords={"scan": list(frame.index), "mode": list(modes)})
 
     def _row(self, name: str) -> dict[str, Any] | None:
         try:

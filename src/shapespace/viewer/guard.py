@@ -32,6 +32,16 @@ SECURITY_HEADERS: Mapping[str, str] = MappingProxyType(
         "Cache-Control": "no-store",
     }
 )
+_HERE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"
+FRAMED_HEADERS: Mapping[str, str] = MappingProxyType(
+    {
+        **{name: value for name, value in SECURITY_HEADERS.items() if name != "X-Frame-Options"},
+        "Content-Security-Policy": SECURITY_HEADERS["Content-Security-Policy"].replace(
+            "frame-ancestors 'none'", f"frame-ancestors {_HERE}"
+        ),
+    }
+)
+"""The same where notebooks that this machine serves may hold the page in a frame."""
 _CHANGING = ("PUT", "POST", "DELETE", "PATCH")
 _SECRET_BYTES = 32
 _UNHEARD = (b"range", b"if-range")
@@ -93,13 +103,15 @@ class Guard:
         access: what a visitor must show, in the address once and in a cookie from then on.
         cookie: name of that cookie.
         local: whether the viewer is for this machine alone, and answers under its names only.
+        framed: whether notebooks on this machine may hold the page in a frame.
     """
 
-    def __init__(self, app: ASGIApp, *, access: Access, cookie: str, local: bool) -> None:
+    def __init__(self, app: ASGIApp, *, access: Access, cookie: str, local: bool, framed: bool = False) -> None:
         self._app = app
         self._access = access
         self._cookie = cookie
         self._local = local
+        self._framed = framed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -113,7 +125,7 @@ class Guard:
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                for name, value in SECURITY_HEADERS.items():
+                for name, value in (FRAMED_HEADERS if self._framed else SECURITY_HEADERS).items():
                     headers[name] = value
             await send(message)
 
@@ -130,7 +142,7 @@ class Guard:
         entering = request.scope["path"] == "/" and request.method == "GET" and "token" in request.query_params
         if not known and not entering:
             return refusal(401, _NO_TOKEN)
-        if not _from_own_page(headers, request.method):
+        if not _from_own_page(headers, request.method, framed=self._framed):
             return refusal(403, "This request came from another page; use the viewer's own page.")
         if not entering:
             return None
@@ -162,7 +174,7 @@ def refusal(status: int, sentence: str) -> JSONResponse:
     return JSONResponse({"error": sentence}, status)
 
 
-def _from_own_page(headers: Headers, method: str) -> bool:
+def _from_own_page(headers: Headers, method: str, *, framed: bool) -> bool:
     origin = headers.get("origin")
     # Compared as it stands: a parser would have to make something of every nonsense.
     if origin is not None and origin.partition("://")[2] != headers.get("host", ""):
@@ -171,7 +183,9 @@ def _from_own_page(headers: Headers, method: str) -> bool:
     if method in _CHANGING:
         return site in (None, "same-origin")
     # A link to the page may stand anywhere, but no other page may load parts of it or hold it in a frame.
-    return site in (None, "same-origin", "none") or headers.get("sec-fetch-dest") == "document"
+    dest = headers.get("sec-fetch-dest")
+    # Whose frame it may be, the browser asks of the answer's headers.
+    return site in (None, "same-origin", "none") or dest == "document" or (framed and dest == "iframe")
 
 
 def _host_name(host: str) -> str:

@@ -28,6 +28,19 @@ _PORTS_TRIED = 50
 _EVERYWHERE = ("0.0.0.0", "::", "")
 
 
+def require_view_extra() -> None:
+    """Raise unless the packages that serve pages are installed.
+
+    Raises:
+        ShapespaceError: they are not; the sentence says how to install them.
+    """
+    for needed in ("starlette", "uvicorn"):
+        if importlib.util.find_spec(needed) is None:
+            raise ShapespaceError(
+                f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
+            )
+
+
 def serve(
     path: Path,
     *,
@@ -56,11 +69,7 @@ def serve(
         FileError: the model or the folder cannot be read.
         InputError: the port is taken, the host is none of this machine's, or a model is given with surfaces.
     """
-    for needed in ("starlette", "uvicorn"):
-        if importlib.util.find_spec(needed) is None:
-            raise ShapespaceError(
-                f"The viewer needs the package {needed}; install it with: pip install 'shapespace[view]'."
-            )
+    require_view_extra()
     from shapespace.viewer.guard import LOOPBACK, Access
     from shapespace.viewer.limits import Limits
 

@@ -55,6 +55,7 @@ def make_app(
     local: bool = True,
     cookie_name: str = "shapespace",
     worker: Worker = fit_upload,
+    framed: bool = False,
 ) -> tuple[ASGIApp, Sessions]:
     """Return the application and its sessions.
 
@@ -65,6 +66,7 @@ def make_app(
         local: whether it is for this machine alone.
         cookie_name: of its cookies; browsers share cookies between ports, so it should name the port.
         worker: what fits a dropped scan, in a process of its own.
+        framed: whether notebooks on this machine may hold the page in a frame.
     """
     root, remove_root = new_folder()
     model_file = root / "model.h5"
@@ -100,7 +102,7 @@ def make_app(
             sessions.close()
 
     app = application(viewer.routes(), lifespan, shown.told)
-    return Guard(app, access=access, cookie=f"{cookie_name}_token", local=local), sessions
+    return Guard(app, access=access, cookie=f"{cookie_name}_token", local=local, framed=framed), sessions
 
 
 class _Viewer:

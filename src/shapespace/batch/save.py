@@ -1,0 +1,73 @@
+"""A fit that was made in Python, written as the command line writes one."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+from shapespace.batch.fit_work import publish
+from shapespace.batch.folder import RECORD, CoefficientTable, names_for
+from shapespace.batch.lock import only_writer
+from shapespace.batch.results import Source, fit_record
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.fit.result import FitResult
+from shapespace.io.files import make_folder, sha256_of_file
+from shapespace.store.results import Results
+from shapespace.types import Mesh
+
+_NO_FILE = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
+"""What the names of files cannot hold, on one system or another."""
+_TOLD_APART = 12
+
+
+def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:
+    """Do what `FitResult.save` says."""
+    if name and (_NO_FILE.search(name) or name in (".", "..")):
+        raise InputError(f"{name!r} cannot be the name of files; leave out slashes, colons and the like.")
+    make_folder(folder)
+    with only_writer(folder):
+        scan = _scan(result, folder)
+        if not name and "scan" in result.files:
+            [name] = names_for([result.files["scan"]], folder)
+        name = name or _free_name(scan, folder)
+        record = fit_record(result, scan, _model(result, folder), _landmarks(result))
+        publish(result, record, name, folder, stages=stages)
+        table = CoefficientTable(folder, [name], result.model.n_modes)
+        table.add(name, record)
+        table.save()
+    return folder / f"{name}{RECORD}"
+
+
+def _scan(result: FitResult, folder: Path) -> Source:
+    if "scan" in result.files:
+        return Source.hashed(result.files["scan"], folder)
+    return Source(result.scan_name, _hash_of(result.scan))
+
+
+def _hash_of(mesh: Mesh) -> str:
+    content = hashlib.sha256(mesh.vertices.astype("<f8").tobytes())
+    if mesh.faces is not None:
+        content.update(mesh.faces.astype("<i4").tobytes())
+    return content.hexdigest()
+
+
+def _model(result: FitResult, folder: Path) -> Source:
+    file = result.files.get("model") or result.model.file
+    return Source.at(file, result.model_hash, folder) if file else Source("", result.model_hash)
+
+
+def _landmarks(result: FitResult) -> Source | None:
+    file = result.files.get("landmarks")
+    return Source(file.name, sha256_of_file(file)) if file else None
+
+
+def _free_name(scan: Source, folder: Path) -> str:
+    """Return NAME of a scan that is in no file: its own, unless another scan has results of that name."""
+    stem = _NO_FILE.sub("_", Path(scan.name).stem).strip(". ") or "scan"
+    results = Results(folder)
+    try:
+        free = stem not in results or results.record(stem)["scan"]["hash"] == scan.content_hash
+    except (ShapespaceError, KeyError):
+        free = False
+    return stem if free else f"{stem}_{scan.content_hash[:_TOLD_APART]}"

@@ -1,0 +1,148 @@
+"""Meshes of other tools, to and from: by what their objects have, so that none of these tools is required."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+
+from shapespace.errors import InputError, MeshError
+from shapespace.io.meshes import read_mesh
+from shapespace.late import other_package
+from shapespace.types import IntArray, Mesh
+
+MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
+"""What `as_mesh` takes: a mesh, a path, or a mesh of another tool."""
+
+
+def as_mesh(x: MeshLike, name: str = "") -> Mesh:
+    """Return `x` as a mesh, its vertices in their order and own unit, its polygons in triangles.
+
+    Colours, textures and what else other tools keep are left out; landmarks are those of a `Mesh` alone.
+
+    Args:
+        x: a `Mesh`, which is returned as it is; the path of a mesh file; an object of trimesh, PyVista, Open3D, meshio
+            or menpo; an array (V, 3) of points; or vertices (V, 3) and triangles (F, 3) as a pair.
+        name: what messages and result files call it; empty for what `x` says, or `mesh`.
+
+    Raises:
+        FileError: the file cannot be read.
+        InputError: `x` is none of these, or has cells that are no surface.
+        MeshError: arrays of the wrong shape.
+    """
+    if isinstance(x, Mesh):
+        return x
+    if isinstance(x, str | os.PathLike):
+        return read_mesh(Path(cast("str | os.PathLike[str]", x)))
+    called = name or _name_of(x)
+    vertices, faces = _parts(x, called)
+    try:
+        return Mesh(np.array(vertices, dtype=np.float64), faces, name=called)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, MeshError):
+            raise
+        raise InputError(f"{called}: its vertices are no numbers of the shape (V, 3).") from error
+
+
+def _parts(x: Any, called: str) -> tuple[Any, Any]:
+    """Return vertices, and triangles or None."""
+    if isinstance(x, np.ndarray):
+        return cast(Any, x), None
+    if isinstance(x, Sequence) and len(cast(Sequence[Any], x)) == 2:
+        return tuple(cast(Sequence[Any], x))
+    if hasattr(x, "to_legacy"):  # Open3D's tensors
+        x = x.to_legacy()
+    if hasattr(x, "geometry") and hasattr(x, "to_mesh"):  # a scene of trimesh
+        x = x.to_mesh()
+    if hasattr(x, "points") and hasattr(x, "cells") and hasattr(x, "cells_dict"):  # meshio
+        return x.points, _of_cells(x.cells_dict, called)
+    if hasattr(x, "points") and hasattr(x, "trilist"):  # menpo
+        return x.points, x.trilist
+    if hasattr(x, "points") and hasattr(x, "n_points"):  # PyVista, and menpo's clouds
+        return _of_pyvista(x, called)
+    if hasattr(x, "vertices"):  # trimesh and Open3D
+        faces = getattr(x, "faces", getattr(x, "triangles", None))
+        return x.vertices, None if faces is None or not len(faces) else np.asarray(faces)
+    if hasattr(x, "points"):  # Open3D's clouds
+        return x.points, None
+    raise InputError(
+        f"{type(x).__module__}.{type(x).__qualname__} is no mesh that shapespace knows; give a shapespace.Mesh, a "
+        "path, a mesh of trimesh, PyVista, Open3D, meshio or menpo, or vertices and triangles as a pair of arrays."
+    )
+
+
+def _of_cells(cells: Mapping[str, Any], called: str) -> IntArray | None:
+    found = [np.asarray(cells["triangle"])] if "triangle" in cells else []
+    if "quad" in cells:
+        quads = np.asarray(cells["quad"])
+        found += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+    others = sorted(set(cells) - {"triangle", "quad", "vertex", "line"})
+    if others:
+        raise InputError(f"{called}: it has cells of the kind {others[0]}, which are no surface; extract that first.")
+    return np.concatenate(found).astype(np.int32) if found else None
+
+
+def _of_pyvista(x: Any, called: str) -> tuple[Any, Any]:
+    if not hasattr(x, "faces"):
+        if hasattr(x, "extract_surface"):
+            raise InputError(f"{called}: a grid is no surface; give what its extract_surface() returns.")
+        return x.points, None
+    if not len(x.faces):
+        return x.points, None
+    if not x.is_all_triangles:
+        x = x.triangulate()
+    # Each triangle stands there after the number 3.
+    return x.points, np.asarray(x.faces).reshape(-1, 4)[:, 1:]
+
+
+def _name_of(x: Any) -> str:
+    told: Any = getattr(x, "path", None) or getattr(getattr(x, "source", None), "file_name", None)
+    metadata: Any = getattr(x, "metadata", None)
+    if not told and isinstance(metadata, Mapping):
+        told = cast(Mapping[str, Any], metadata).get("file_name") or cast(Mapping[str, Any], metadata).get("name")
+    return Path(told).name if isinstance(told, str | os.PathLike) and str(told) else "mesh"
+
+
+def to_trimesh(mesh: Mesh) -> Any:
+    """Return a `trimesh.Trimesh`, or a `trimesh.PointCloud` without triangles; vertices keep their order."""
+    trimesh = other_package("trimesh", "Mesh.to_trimesh")
+    told = {"name": mesh.name}
+    if mesh.faces is None:
+        return trimesh.PointCloud(mesh.vertices.copy(), metadata=told)
+    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False, metadata=told)
+
+
+def to_pyvista(mesh: Mesh) -> Any:
+    """Return a `pyvista.PolyData`."""
+    pyvista = other_package("pyvista", "Mesh.to_pyvista")
+    if mesh.faces is None:
+        return pyvista.PolyData(mesh.vertices.copy())
+    counted = np.insert(mesh.faces.astype(np.int64), 0, 3, axis=1)
+    return pyvista.PolyData(mesh.vertices.copy(), counted.ravel())
+
+
+def to_open3d(mesh: Mesh) -> Any:
+    """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` without triangles."""
+    open3d = other_package("open3d", "Mesh.to_open3d")
+    points = open3d.utility.Vector3dVector(mesh.vertices.copy())
+    if mesh.faces is None:
+        return open3d.geometry.PointCloud(points)
+    return open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(mesh.faces.copy()))
+
+
+def to_meshio(mesh: Mesh) -> Any:
+    """Return a `meshio.Mesh`."""
+    meshio = other_package("meshio", "Mesh.to_meshio")
+    cells = np.arange(len(mesh.vertices))[:, None] if mesh.faces is None else mesh.faces.copy()
+    return meshio.Mesh(mesh.vertices.copy(), [("vertex" if mesh.faces is None else "triangle", cells)])
+
+
+def to_menpo(mesh: Mesh) -> Any:
+    """Return a `menpo.shape.TriMesh`, or a `PointCloud` without triangles."""
+    shape = other_package("menpo.shape", "Mesh.to_menpo")
+    if mesh.faces is None:
+        return shape.PointCloud(mesh.vertices.copy())
+    return shape.TriMesh(mesh.vertices.copy(), trilist=mesh.faces.copy())

@@ -1,0 +1,74 @@
+"""What lower layers hand on to higher ones, and to packages that are not required, when somebody asks for it.
+
+Imports point down only. A model can be plotted and a result saved all the same, since their methods look up here who
+does it: this list is all there is of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any, Protocol
+
+from shapespace.errors import ShapespaceError
+
+LATE: Mapping[str, str] = MappingProxyType(
+    {
+        "html_of_fit": "report.notebook",
+        "html_of_model": "report.notebook",
+        "html_of_quality": "report.notebook",
+        "plot_fit": "report.notebook",
+        "plot_model": "report.notebook",
+        "plot_quality": "report.notebook",
+        "save_fit": "batch.save",
+        "to_menpo": "io.beside",
+        "to_meshio": "io.beside",
+        "to_open3d": "io.beside",
+        "to_pyvista": "io.beside",
+        "to_trimesh": "io.beside",
+        "view_fit": "viewer.notebook",
+        "view_model": "viewer.notebook",
+    }
+)
+"""Function -> its module, which is imported when the function is first asked for."""
+
+
+class OpenViewer(Protocol):
+    """A viewer in a notebook, or beside a prompt; it runs until `close`, or until the process ends."""
+
+    @property
+    def address(self) -> str:
+        """The address with the token, for a tab of a browser on this machine."""
+        ...
+
+    def close(self) -> None:
+        """End the viewer, and remove its files; it may be called twice."""
+        ...
+
+
+def late(name: str) -> Callable[..., Any]:
+    """Return the function `name` of `LATE`."""
+    return getattr(import_module(f"shapespace.{LATE[name]}"), name)
+
+
+def other_package(module: str, what: str, install: str = "") -> Any:
+    """Return a module of a package that shapespace does not require.
+
+    Args:
+        module: its name.
+        what: needs it, at the beginning of a sentence.
+        install: what pip is to install, where that is not called as the module.
+
+    Raises:
+        ShapespaceError: it is not installed, or cannot be imported.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        if isinstance(error, ModuleNotFoundError) and error.name == package:
+            why = f"which is not installed; run pip install {install or package}."
+        else:
+            why = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
+        raise ShapespaceError(f"{what} needs {package}, {why}") from error

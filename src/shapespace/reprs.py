@@ -1,0 +1,51 @@
+"""What a prompt shows of an object that holds arrays: one short line, whatever their size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+_SMALL = 9
+_MOST_NAMES = 4
+_LONGEST = 80
+
+
+def short_repr(of: Any) -> str:
+    """Return the fields of a dataclass in one line: arrays by their shape and type, long things by how many they hold.
+
+    It stands in a class as `__repr__ = short_repr`.
+    """
+    told = (f"{one.name}={told_briefly(getattr(of, one.name))}" for one in fields(of) if one.repr)
+    return f"{type(of).__name__}({', '.join(told)})"
+
+
+def told_briefly(value: object) -> str:
+    """Return a few words on `value`, of which nothing is measured or read for that."""
+    if isinstance(value, np.ndarray):
+        return _of_array(cast(npt.NDArray[Any], value))
+    if isinstance(value, Mapping):
+        names = [str(name) for name in cast(Mapping[object, object], value)]
+        more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+        return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + more + "}"
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        items = cast(Sequence[object], value)
+        if len(items) > _MOST_NAMES or any(not isinstance(item, str | int | float) for item in items):
+            return f"<{len(items)} items>"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    told = repr(value)
+    return f"{type(value).__name__}(…)" if is_dataclass(value) and len(told) > _LONGEST else _clipped(told)
+
+
+def _of_array(array: npt.NDArray[Any]) -> str:
+    if array.size <= _SMALL and array.dtype.kind in "iufb":
+        return " ".join(np.array2string(array, precision=4, separator=", ").split())
+    return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
+
+
+def _clipped(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 2]} …"

@@ -1,0 +1,48 @@
+"""`__all__` is a promise: what changes in it is told in the changelog."""
+
+import re
+import runpy
+from pathlib import Path
+
+import shapespace as ss
+
+ROOT = Path(__file__).resolve().parents[2]
+API = runpy.run_path(str(ROOT / "tools" / "public_api.py"))
+CHANGELOG = (ROOT / "CHANGELOG.md").read_text("utf-8")
+
+
+def test_a_change_of_a_public_signature_is_named_in_the_changelog() -> None:
+    released = API["RELEASED"].read_text("utf-8").splitlines()
+    unnamed = API["unnamed"](released, API["lines"](), CHANGELOG)
+    assert not unnamed, f"name these in CHANGELOG.md, below Unreleased: {', '.join(unnamed)}"
+
+
+def test_the_check_finds_what_is_new_gone_and_different_and_is_content_with_names() -> None:
+    released = ["Model(a)", "Model.load(path)", "Gone(x)", "Gone.member()", "fit(a)"]
+    now = ["Model(a)", "Model.load(path, strict=True)", "New()", "New.member()", "fit(a)"]
+    said = "# Changelog\n\n## Unreleased\n\n- {}\n\n## 1.0.0\n\n- Model.load, Gone, New\n"
+    assert API["unnamed"](released, now, said.format("nothing")) == ["Gone", "Model.load", "New"]
+    assert (
+        API["unnamed"](released, now, said.format("`Model.load(strict=...)`, `Gone` went, `New`; `Model.loader`")) == []
+    )
+    assert API["unnamed"](released, now, said.format("`Model.loader`, Goner, News")) == ["Gone", "Model.load", "New"]
+    assert API["unnamed"](now, now, said.format("nothing")) == []
+
+
+def test_the_snapshot_sees_constructors_methods_properties_and_tables() -> None:
+    lines = "\n".join(API["lines"]())
+    for part in (
+        r"^fit_scan\(model: ", r"^Mesh\(vertices: ", r"^FitResult\.save\(self, folder", r"^FitResult\.shown -> ",
+        r"^ShapeModel\.load\(cls, path", r"^CLASSIFIERS knn, ", r"^ShapeSpace\.transform\(self, X",
+    ):  # fmt: skip
+        assert re.search(part, lines, re.MULTILINE), part
+    assert " at 0x" not in lines and "._" not in lines.replace("...", "")
+
+
+def test_every_public_name_has_a_docstring_and_a_line_in_the_architecture() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    named = set(re.findall(r"`(\w+)`", text.partition("## Public names")[2].partition("\n## ")[0]))
+    assert set(ss.__all__) <= named
+    for name in ss.__all__:
+        of = getattr(ss, name)
+        assert not (callable(of) and not (of.__doc__ or "").strip()), name
