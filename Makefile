@@ -4,11 +4,12 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 READY_TO_LINT = $(VENV)/.ready-to-lint
+READY_FOR_DOCS = $(VENV)/.ready-for-docs
 # What shows in a minute or two whether other versions of the dependencies do.
 QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_meshes.py tests/model/test_pca.py \
   tests/model/test_shape_model.py tests/recognise/test_saved_classifier.py tests/schemas tests/store tests/fit/test_robust.py
 
-.PHONY: demo test test-all test-oldest test-newest lint types contracts check bench dist clean
+.PHONY: demo test test-all test-oldest test-newest lint types contracts check bench docs dist clean
 
 demo: $(READY)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
@@ -44,6 +45,12 @@ check: lint types contracts test
 bench: $(READY)
 	set -e; for name in pca accuracy speed memory throughput; do $(BIN)/python benchmarks/$$name.py; done
 
+# Strict: a link that leads nowhere fails the build. Everything is read anew, or the second build would pass.
+docs: $(READY_FOR_DOCS)
+	rm -rf build/site
+	$(BIN)/python -m sphinx -q -W --keep-going --fresh-env -c docs/site -d build/site-trees . build/site
+	@echo "The documentation is build/site/index.html; open it in a browser, it needs no server."
+
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -53,6 +60,10 @@ $(READY): pyproject.toml
 # Apart, since pyright brings Node, which nothing else needs.
 $(READY_TO_LINT): $(READY)
 	$(BIN)/python -m pip install --quiet --group lint
+	touch $@
+
+$(READY_FOR_DOCS): $(READY)
+	$(BIN)/python -m pip install --quiet --group docs
 	touch $@
 
 dist: $(READY)
