@@ -72,7 +72,8 @@ class Marks:
         rows = np.concatenate([pose, surface.modes[self.vertex][:, :, :modes]], axis=2)
         every = rows.reshape(3 * len(x), -1)
         heavy = np.repeat(weight, 3)[:, None] * every
-        return heavy.T @ every, heavy.T @ off.ravel()
+        hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)
+        return hessian, np.asarray(heavy.T @ off.ravel(), dtype=np.float64)
 
     def notes(self, surface: MovingSurface, T_scan_model: Similarity) -> list[str]:
         """Return a sentence on each landmark that lies where the fit does not have it."""
