@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from shapespace.batch import workers
+from shapespace.batch import said
 from shapespace.batch.warm import COMPILING, tell_compiling
 
 
 def told_by_another(mark: Path) -> str:
     code = "from shapespace.batch.warm import tell_compiling; tell_compiling(); tell_compiling()"
-    env = {**os.environ, workers.SAID: str(mark)}
+    env = {**os.environ, said.SAID: str(mark)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=env, check=True)
     return done.stderr
 
@@ -23,7 +23,7 @@ def test_the_command_and_its_server_say_it_once(
     first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mark = tmp_path / "said"
-    monkeypatch.setattr(workers._Said, "mark", str(mark))
+    monkeypatch.setattr(said._Mark, "path", str(mark))
     other = told_by_another(mark) if first == "server" else ""
     tell_compiling()
     other += told_by_another(mark) if first == "command" else ""
@@ -33,6 +33,6 @@ def test_the_command_and_its_server_say_it_once(
 def test_without_a_server_it_is_always_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(workers._Said, "mark", None)
+    monkeypatch.setattr(said._Mark, "path", "")
     tell_compiling()
     assert capsys.readouterr().err == COMPILING + "\n"

@@ -1,6 +1,7 @@
 import csv
 import importlib.resources
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -322,3 +323,21 @@ def test_a_damaged_bundle_is_reported_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(module.importlib.resources, "files", lambda _: tmp_path)
     with pytest.raises(DataError, match=r"faces\.npz"):
         load_faces.__wrapped__()
+
+
+def test_weak_expressions_are_written_with_their_intensity_and_full_ones_as_before(tmp_path: Path) -> None:
+    asked = {"subjects": 3, "expressions": ("neutral", "smile"), "seed": 5, "face_only": True}
+    full = write_faces(tmp_path / "full", **asked)
+    weak = write_faces(tmp_path / "weak", **asked, intensities=(0.25, 0.5))
+    with (weak / "labels.csv").open(newline="") as stream:
+        told = {row["file"]: float(row["intensity"]) for row in csv.DictReader(stream)}
+    assert {told[f"subject_00{k}_smile.ply"] for k in range(3)} <= {0.25, 0.5}
+    for k in range(3):
+        rest, smile, weakly = (
+            read_mesh(folder / f"subject_00{k}_{name}.ply").vertices
+            for folder, name in ((full, "neutral"), (full, "smile"), (weak, "smile"))
+        )
+        # Units add up, so a weak smile is the share of the full one that its label says.
+        np.testing.assert_allclose(weakly - rest, told[f"subject_00{k}_smile.ply"] * (smile - rest), atol=0.05)
+    with pytest.raises(InputError, match="above 0 and at most at 1"):
+        write_faces(tmp_path / "none", **asked, intensities=(0.0,))

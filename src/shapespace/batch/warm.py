@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from shapespace.batch.workers import is_first_to_say
+from shapespace.batch.said import is_first_to_say
 from shapespace.compiled import on_compiling
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan

@@ -5,19 +5,16 @@ This module imports nothing heavy, so that the server can start before the rest 
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import multiprocessing
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Generator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from shapespace.batch import said
 from shapespace.errors import FitError
 
 if TYPE_CHECKING:
@@ -26,8 +23,6 @@ if TYPE_CHECKING:
 
 WARM_UP = "SHAPESPACE_WARM_UP"
 """Set for the server alone: `tell` if it may say on standard error that it compiles, else `quiet`."""
-SAID = "SHAPESPACE_SAID"
-"""Set for the server alone: a folder that whoever says first that code is compiled makes, so that it is said once."""
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -49,7 +44,7 @@ def start_loading(*, tell: bool) -> None:
     Args:
         tell: whether a line on standard error may say that the code is being compiled.
     """
-    _Said.mark = (_Said.mark or str(_scratch() / "said")) if tell else None
+    mark = said.shared() if tell else said.alone()
     if not COPIED:
         from shapespace.batch.warm import warm_up
 
@@ -58,7 +53,7 @@ def start_loading(*, tell: bool) -> None:
     from multiprocessing import forkserver  # not on Windows
 
     # One worker is one core: threads of BLAS would spread it over all.
-    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", SAID: _Said.mark or ""}
+    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", said.SAID: mark}
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
@@ -71,31 +66,6 @@ def start_loading(*, tell: bool) -> None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-class _Said:
-    """Where this process, or the one that started it, marks that compiling was said; None where nobody else says it."""
-
-    mark: str | None = os.environ.get(SAID) or None
-
-
-def _scratch() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-def is_first_to_say() -> bool:
-    """Return whether neither this process nor the server of the workers has said that code is compiled."""
-    if _Said.mark is None:
-        return True
-    try:
-        Path(_Said.mark).mkdir()
-    except FileExistsError:
-        return False
-    except OSError:  # the folder is gone, or cannot be written: better twice than never
-        return True
-    return True
 
 
 def wait_until_loaded() -> None:

@@ -91,8 +91,8 @@ def _add_data(commands: Any) -> None:
                        help="raw scans: other triangles, any pose, noise, holes; not in correspondence")  # fmt: skip
     faces.add_argument("--wide", action="store_true",
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
-    faces.add_argument("--intensity", type=_intensities, default=(1.0, 1.0), metavar="LOW[-HIGH]",
-                       help="of the bundled expressions, drawn between the two (default 1: full)")  # fmt: skip
+    faces.add_argument("--intensity", type=_intensities, default=(1.0,), metavar="LIST",
+                       help="of bundled expressions, with commas between them: one is drawn for each")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
     organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
                   "shapespace data organs -o organs --count 40")  # fmt: skip
@@ -473,9 +473,8 @@ def _control_points(text: str) -> tuple[int, int]:
     return int(counts[0]), int(counts[1])
 
 
-def _intensities(text: str) -> tuple[float, float]:
-    low, dash, high = text.partition("-")
-    return _share(low), _share(high if dash else low)
+def _intensities(text: str) -> tuple[float, ...]:
+    return tuple(_share(one) for one in text.split(","))
 
 
 def _named_file(text: str) -> tuple[str, Path]:

@@ -97,7 +97,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         quiet=arguments.quiet,
         raw=arguments.raw,
         wide=arguments.wide,
-        intensity=arguments.intensity,
+        intensities=arguments.intensity,
     )
     if arguments.json:
         show_json({"folder": str(arguments.output), "faces": count})

@@ -40,7 +40,7 @@ def write_simulated_faces(
     quiet: bool,
     raw: bool = False,
     wide: bool = False,
-    intensity: tuple[float, float] = (1.0, 1.0),
+    intensities: Sequence[float] = (1.0,),
 ) -> int:
     """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
 
@@ -57,7 +57,7 @@ def write_simulated_faces(
         raise InputError(f"The area must be face or face_and_head, not {area!r}.")
     if wide and source == "ict-facekit":
         raise InputError("People of ICT-FaceKit vary as widely as real ones already; leave --wide out.")
-    if intensity != (1.0, 1.0) and source == "ict-facekit":
+    if tuple(intensities) != (1.0,) and source == "ict-facekit":
         raise InputError("Expressions of ICT-FaceKit are written at full intensity; leave --intensity out.")
     make_folder(folder)
     total = subjects * len(expressions)
@@ -75,7 +75,7 @@ def write_simulated_faces(
         else:
             face_files.write_faces(
                 folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
-                face_only=area == "face", intensity=intensity, progress=step,
+                face_only=area == "face", intensities=intensities, progress=step,
             )  # fmt: skip
     licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
     who = "people who vary widely" if wide else "people"

@@ -25,7 +25,7 @@ def write_faces(
     raw: bool = False,
     wide: bool = False,
     face_only: bool = False,
-    intensity: tuple[float, float] = (1.0, 1.0),
+    intensities: Sequence[float] = (1.0,),
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Write simulated faces in correspondence: subject_000_neutral.ply and so on, labels.csv and landmarks.csv.
@@ -40,7 +40,7 @@ def write_faces(
         raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
         wide: whether people vary as widely as real ones; see `FaceGenerator.draw_person`.
         face_only: whether to leave out ears, crown, nape and neck; see `FaceGenerator.cut_to_face`.
-        intensity: least and greatest of the expressions, drawn evenly between them; 1 is full.
+        intensities: of the expressions, of which one is drawn for each; 1 is full.
         progress: called with (files written, files in all).
 
     Returns:
@@ -60,23 +60,22 @@ def write_faces(
     for name in expressions:
         if name not in known:
             raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
-    low, high = intensity
-    if not 0 < low <= high <= 1:
-        raise InputError(f"Intensities must lie above 0 and at most at 1, in order, not {low:g} to {high:g}.")
+    if not intensities or not all(0 < intensity <= 1 for intensity in intensities):
+        raise InputError("Intensities must lie above 0 and at most at 1, and there must be one.")
     folder = make_folder(Path(folder))
     faces = load_faces()
     labels: list[tuple[str, str, str, str]] = []
     for k in range(subjects):
         person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}", wide=wide)
         for name in expressions:
-            shown = np.random.default_rng([seed, k, 1 + known.index(name), 2]).uniform(low, high) if low < 1 else 1.0
+            shown = float(np.random.default_rng([seed, k, 1 + known.index(name), 2]).choice(list(intensities)))
             expression = faces.draw_expression(name, shown, np.random.default_rng([seed, k, 1 + known.index(name)]))
             file = f"{person.name}_{name}.ply"
             face = faces.face(person, expression)
             face = faces.cut_to_face(face) if face_only else face
             rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
             write_mesh(folder / file, plain_scan(face, rng) if raw else face)
-            labels.append((file, person.name, name, "0" if name == "neutral" else f"{shown:.3g}"))
+            labels.append((file, person.name, name, "0" if name == "neutral" else f"{shown:g}"))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))
     write_rows(folder / "labels.csv", ("file", "subject", "expression", "intensity"), labels)

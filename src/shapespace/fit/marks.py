@@ -15,6 +15,7 @@ import numpy as np
 
 from shapespace.fit.moving_model import MovingSurface
 from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -33,12 +34,14 @@ class Marks:
         vertex: (L,) of the model.
         points_mm: (L, 3) in the scan's mm frame.
         stddev_mm: of each coordinate, mm of the scan.
+        far_mm: beyond three times this, mm of the model's frame, a landmark has no say, however far off all are.
     """
 
     names: Sequence[str]
     vertex: IntArray
     points_mm: FloatArray
     stddev_mm: float
+    far_mm: float
 
     @staticmethod
     def of(model: ShapeModel, landmarks_mm: Mapping[str, FloatArray], stddev_mm: float) -> Marks | None:
@@ -47,7 +50,13 @@ class Marks:
         if not names or not np.isfinite(stddev_mm):
             return None
         vertex = np.array([model.landmarks[name] for name in names], dtype=np.int32)
-        return Marks(names, vertex, np.stack([landmarks_mm[name] for name in names]), stddev_mm)
+        return Marks(
+            names,
+            vertex,
+            np.stack([landmarks_mm[name] for name in names]),
+            stddev_mm,
+            SHARE * rms_size(model.mean_vertices),
+        )
 
     def off_mm(self, surface: MovingSurface, T_scan_model: Similarity) -> FloatArray:
         """Return (L,) how far each vertex lies from its landmark, mm of the scan."""
@@ -66,13 +75,14 @@ class Marks:
         distance = np.linalg.norm(off, axis=1)
         stddev = self.stddev_mm / T_scan_model.scale
         # A wrong landmark lies far off beside the others, however far these are off on the way.
-        width = _WIDTH * max(stddev, _MAD * float(np.median(distance)))
+        width = _WIDTH * max(stddev, min(_MAD * float(np.median(distance)), self.far_mm))
         weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
         pose = small_poses(x).reshape(len(x), 3, POSE)
         rows = np.concatenate([pose, surface.modes[self.vertex][:, :, :modes]], axis=2)
         every = rows.reshape(3 * len(x), -1)
         heavy = np.repeat(weight, 3)[:, None] * every
-        return heavy.T @ every, heavy.T @ off.ravel()
+        hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)
+        return hessian, np.asarray(heavy.T @ off.ravel(), dtype=np.float64)
 
     def notes(self, surface: MovingSurface, T_scan_model: Similarity) -> list[str]:
         """Return a sentence on each landmark that lies where the fit does not have it."""
