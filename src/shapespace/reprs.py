@@ -33,7 +33,7 @@ def told_briefly(value: Any) -> str:
         items = cast(Sequence[object], value)
         if len(items) > _MOST_NAMES or any(not isinstance(item, str | int | float) for item in items):
             return f"<{len(items)} items>"
-    return f"{value:.6g}" if isinstance(value, float) else _of_other(value)
+    return f"{value:.6g}" if isinstance(value, float) else _of_other(cast(object, value))
 
 
 def _of_mapping(value: Mapping[object, object]) -> str:
