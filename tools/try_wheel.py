@@ -29,14 +29,14 @@ PREPARE = (
 TRIES = {
     "cluster": ["fit model.h5 scans -o with-dask --executor dask --jobs 1"],
     "recognise": ["recognise train out --labels labels.csv -o people.skops"],
-    "remote": ["fit model.h5 zip://person_000.ply::scans.zip -o from-zip"],
+    "remote": ["fit model.h5 zip://subject_000_neutral.ply::scans.zip -o from-zip"],
     "report": ["report out"],
     "store": ["fit model.h5 scans -o with-store --store"],
-    "view": ["view model.h5 --port 1"],
+    "view": ["view model.h5 --port 99999"],
     "volumes": ["data organs -o masks --count 1 --volumes", "surface masks -o surfaces"],
 }
 """By extra, what needs it; without it each first command ends in a sentence with the command of pip."""
-ENDS_OTHERWISE = {"view": "Port 1 cannot be used"}
+ENDS_OTHERWISE = {"view": "Port 99999 cannot be used"}
 """What a command says that cannot succeed here, once its packages are there."""
 
 
@@ -77,7 +77,7 @@ def main(dist: Path) -> None:
         print(f"wheel {wheel.stat().st_size / 1e6:.2f} MB; core install {size:.0f} MB", flush=True)
         for command in PREPARE:
             core.run("-m", "shapespace", *shlex.split(command), at=work)
-        rows = [f"{file.name},{'ab'[number % 2]}" for number, file in enumerate(sorted((work / "scans").iterdir()))]
+        rows = [f"{file.name},{'ab'[number % 2]}" for number, file in enumerate(sorted((work / "scans").glob("*.ply")))]
         (work / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n", encoding="utf-8")
         shutil.make_archive(str(work / "scans"), "zip", work / "scans")
         for extra, commands in TRIES.items():

@@ -14,29 +14,35 @@ _MOST_NAMES = 4
 _LONGEST = 80
 
 
-def short_repr(of: Any) -> str:
+def short_repr(self: Any) -> str:
     """Return the fields of a dataclass in one line: arrays by their shape and type, long things by how many they hold.
 
     It stands in a class as `__repr__ = short_repr`.
     """
-    told = (f"{one.name}={told_briefly(getattr(of, one.name))}" for one in fields(of) if one.repr)
-    return f"{type(of).__name__}({', '.join(told)})"
+    told = (f"{one.name}={told_briefly(getattr(self, one.name))}" for one in fields(self) if one.repr)
+    return f"{type(self).__name__}({', '.join(told)})"
 
 
-def told_briefly(value: object) -> str:
+def told_briefly(value: Any) -> str:
     """Return a few words on `value`, of which nothing is measured or read for that."""
     if isinstance(value, np.ndarray):
         return _of_array(cast(npt.NDArray[Any], value))
     if isinstance(value, Mapping):
-        names = [str(name) for name in cast(Mapping[object, object], value)]
-        more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + more + "}"
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return _of_mapping(cast(Mapping[object, object], value))
+    if isinstance(value, list | tuple):
         items = cast(Sequence[object], value)
         if len(items) > _MOST_NAMES or any(not isinstance(item, str | int | float) for item in items):
             return f"<{len(items)} items>"
-    if isinstance(value, float):
-        return f"{value:.6g}"
+    return f"{value:.6g}" if isinstance(value, float) else _of_other(cast(object, value))
+
+
+def _of_mapping(value: Mapping[object, object]) -> str:
+    names = [str(name) for name in value]
+    more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return "{" + ", ".join(_clipped(name) for name in names[:_MOST_NAMES]) + more + "}"
+
+
+def _of_other(value: object) -> str:
     told = repr(value)
     return f"{type(value).__name__}(…)" if is_dataclass(value) and len(told) > _LONGEST else _clipped(told)
 

@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -141,7 +141,7 @@ def write_mat(results: Results, path: Path) -> None:
         text = kind_of(column) == "text"
         fits[_name_in_matlab(column, fits)] = _texts(rows, column) if text else _numbers(rows, [column])
     stream = io.BytesIO()
-    savemat(stream, {"fits": fits}, long_field_names=True, do_compression=True)
+    cast(Any, savemat)(stream, {"fits": fits}, long_field_names=True, do_compression=True)
     # Without the time of writing, so that the same fits are the same file.
     content = _MAT_HEADER.ljust(_MAT_HEADER_BYTES) + stream.getvalue()[_MAT_HEADER_BYTES:]
     make_folder(path.absolute().parent)

@@ -171,7 +171,9 @@ def fit_scan(
     """
     config = config or FitConfig()
     given = {"model": model, "scan": scan, "landmarks": landmarks}
-    files = {what: Path(path).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)}
+    files = {
+        what: Path(cast(PathTo, path)).absolute() for what, path in given.items() if isinstance(path, str | os.PathLike)
+    }
     model, scan = _as_model(model), as_mesh(scan)
     if "landmarks" in files:
         landmarks = read_landmarks(files["landmarks"])

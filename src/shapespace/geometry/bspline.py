@@ -13,6 +13,9 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
+_SINGULAR = 1e-7
+"""Share of the largest pivot below which a matrix is singular but for rounding."""
+
 DEGREE = 3
 FEWEST, MOST = 4, 64
 """Control points along each side: a cubic needs four, and beyond 64 the normal equations outgrow memory."""
@@ -77,9 +80,14 @@ class SplineSquare:
         B = self.matrix if weights is None else self.matrix.multiply(weights[:, None]).tocsr()
         normal = np.asarray((B.T @ self.matrix).todense()) + self._penalty
         try:
-            return cast(Any, cho_factor)(normal, lower=True)
+            factored = cast(Any, cho_factor)(normal, lower=True)
+            pivots = np.diag(factored[0])
+            # What is singular but for rounding is factored by some versions of LAPACK, and by others not.
+            if pivots.min() > _SINGULAR * pivots.max():
+                return factored
         except np.linalg.LinAlgError:
-            raise InputError("Too few vertices are there to fit a B-spline surface to them.") from None
+            pass
+        raise InputError("Too few vertices are there to fit a B-spline surface to them.")
 
 
 def _knots(count: int) -> FloatArray:

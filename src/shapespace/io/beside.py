@@ -51,8 +51,18 @@ def _parts(x: Any, called: str) -> tuple[Any, Any]:
     """Return vertices, and triangles or None."""
     if isinstance(x, np.ndarray):
         return cast(Any, x), None
-    if isinstance(x, Sequence) and len(cast(Sequence[Any], x)) == 2:
-        return tuple(cast(Sequence[Any], x))
+    if isinstance(x, list | tuple):
+        return _pair(cast(Sequence[Any], x), called)
+    return _parts_of_object(x, called)
+
+
+def _pair(x: Sequence[Any], called: str) -> tuple[Any, Any]:
+    if len(x) != 2:
+        raise InputError(f"{called}: give vertices and triangles as a pair of arrays, not {len(x)} things.")
+    return x[0], x[1]
+
+
+def _parts_of_object(x: Any, called: str) -> tuple[Any, Any]:
     if hasattr(x, "to_legacy"):  # Open3D's tensors
         x = x.to_legacy()
     if hasattr(x, "geometry") and hasattr(x, "to_mesh"):  # a scene of trimesh
@@ -103,7 +113,9 @@ def _name_of(x: Any) -> str:
     metadata: Any = getattr(x, "metadata", None)
     if not told and isinstance(metadata, Mapping):
         told = cast(Mapping[str, Any], metadata).get("file_name") or cast(Mapping[str, Any], metadata).get("name")
-    return Path(told).name if isinstance(told, str | os.PathLike) and str(told) else "mesh"
+    if not isinstance(told, str | os.PathLike):
+        return "mesh"
+    return Path(cast("str | os.PathLike[str]", told)).name or "mesh"
 
 
 def to_trimesh(mesh: Mesh) -> Any:
