@@ -24,6 +24,9 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0})
 """Millimetres in one of each unit a scan may come in."""
 
+GREY = 128
+"""Red, green and blue of vertices without a colour, where others of their surface have one."""
+
 
 def read_only(array: npt.ArrayLike) -> FloatArray:
     """Return `array` as a C-ordered float64 array that refuses writing; a view where no copy is needed.

@@ -20,6 +20,7 @@ from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.verdict import verdict
+from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
@@ -180,6 +181,7 @@ def fit_scan(
         model=model,
         scan=placed.scan,
         find_regions=fitted.regions,
+        find_closest=partial(_closest, placed.target, placed.T_scan_mm.inverse()),
     )
 
 
@@ -225,7 +227,7 @@ def _place(
         start = start_from_landmarks(model, marks_mm, scan.name, with_scale=with_scale)
     else:
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
-    said = [f"{finding.what} {finding.action}".strip() for finding in findings]
+    said = [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
 
 
@@ -325,6 +327,10 @@ def _dense_stage(
         seen=dense.seen,
         moved_mm=dense.moved_mm,
     )
+
+
+def _closest(target: ScanTarget, T_mm_scan: Similarity, points: FloatArray) -> ClosestPoints:
+    return target.engine.query(T_mm_scan.apply(points))
 
 
 def _distances(

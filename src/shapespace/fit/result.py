@@ -10,11 +10,13 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.regions import SHOWN
+from shapespace.fit.colours import carried_colours
+from shapespace.fit.regions import MATCHED, SHOWN
 from shapespace.fit.state import IcpState
+from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class FitResult:
         model: the model that was fitted.
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
+        find_closest: finds the closest points of the scan to vertices (V, 3) in its own frame and unit.
     """
 
     scan_name: str
@@ -124,6 +127,7 @@ class FitResult:
     model: ShapeModel = field(repr=False)
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
+    find_closest: Callable[[FloatArray], ClosestPoints] = field(repr=False)
 
     @cached_property
     def regions(self) -> IntArray:
@@ -132,6 +136,23 @@ class FitResult:
         The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
         """
         return self.find_regions()
+
+    @cached_property
+    def colours(self) -> Mapping[str, ByteArray]:
+        """(V, 3) uint8 of the surface at `final`, and at `dense` where there is one; empty of a scan without colours.
+
+        A vertex takes the colour of the closest point of the scan. Where the surface does not follow the scan, or the
+        scan shows nothing, it is grey.
+        """
+        colours = self.scan.colours
+        if colours is None:
+            return {}
+        found: dict[str, ByteArray] = {}
+        for name in ("final", *(("dense",) if "dense" in self.stages else ())):
+            followed = self.stages[name].seen
+            seen = np.isin(self.regions, MATCHED) if followed is None else followed
+            found[name] = carried_colours(colours, self.scan, self.find_closest(self._vertices(name)), seen)
+        return found
 
     @property
     def iterations(self) -> dict[str, int]:
@@ -170,6 +191,8 @@ class FitResult:
     def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:
         """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order.
 
+        At `final` and `dense` it has the colours of the scan, see `colours`.
+
         Args:
             model: the model that was fitted, which the result knows; it may be left out.
             stage: a name of `stages`.
@@ -182,7 +205,10 @@ class FitResult:
                 f"{self.scan_name} was fitted with another model than the one given, whose surface would be wrong; "
                 "leave the model out, as the result knows its own."
             )
-        at = self.stages[stage]
-        vertices = at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
+        vertices = self._vertices(stage)
         landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
-        return Mesh(vertices, self.model.faces, landmarks, name=self.scan_name)
+        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
+
+    def _vertices(self, stage: str) -> FloatArray:
+        at = self.stages[stage]
+        return at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices

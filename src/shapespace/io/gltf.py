@@ -30,8 +30,8 @@ from shapespace.io.parsing import (
     mesh_of,
     strip_triangles,
 )
-from shapespace.io.textures import GREY, Pictures, TextureError, beside
-from shapespace.types import ByteArray, FloatArray, Mesh
+from shapespace.io.textures import Pictures, TextureError, beside
+from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

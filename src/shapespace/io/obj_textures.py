@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.io.parsing import line_blocks, plain_text
-from shapespace.io.textures import GREY, Pictures, TextureError, beside
-from shapespace.types import ByteArray
+from shapespace.io.textures import Pictures, TextureError, beside
+from shapespace.types import GREY, ByteArray
 
 _LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _LARGEST_LIBRARY = 2**22

@@ -22,9 +22,6 @@ LARGEST_FILE_BYTES = 2**28
 MOST_PIXELS = 2**26
 """Pictures with more are not unpacked (8192 times 8192)."""
 
-GREY = 128
-"""Red, green and blue of what has no colour beside what has some."""
-
 MOST_PIXELS_IN_ALL = 2**28
 """All pictures of one surface have no more than these."""
 
