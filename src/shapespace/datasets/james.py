@@ -23,7 +23,7 @@ def james_available() -> bool:
 
 
 def load_james(folder: Path | None = None) -> Mesh:
-    """Return James in millimetres, 6,393 vertices in colours and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
+    """Return James in mm, 6,393 vertices in colours and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
 
     Args:
         folder: holds `james.obj` and `james.ljson`; None takes the mirror or the cache, verified, and never downloads.
