@@ -135,6 +135,7 @@ def test_each_material_has_its_own_picture(tmp_path: Path) -> None:
     ("mtl", "png", "said"),
     [
         ("newmtl skin of face\nmap_Kd gone.png\n", None, "not beside it"),
+        ("newmtl skin of face\nmap_Kd \x1b[31m.png\n", None, "'?[31m.png' is not beside it"),
         ("newmtl skin of face\nmap_Kd ../p.png\n", None, "outside of its folder"),
         ("newmtl skin of face\nmap_Kd /etc/passwd\n", None, "outside of its folder"),
         ("newmtl skin of face\nmap_Kd p.png\n", b"no picture", "damaged or of a kind"),
@@ -142,7 +143,7 @@ def test_each_material_has_its_own_picture(tmp_path: Path) -> None:
         ("newmtl skin of face\nmap_Kd p.png\n", bomb(8193, 8192), "pixels, too many"),
         ("newmtl skin of face\nmap_Kd p.png\n", bomb(2**30, 2**30), "damaged or of a kind"),
     ],
-    ids=["absent", "above", "absolute", "no picture", "cut short", "too large", "bomb"],
+    ids=["absent", "not printable", "above", "absolute", "no picture", "cut short", "too large", "bomb"],
 )
 def test_a_picture_that_cannot_be_read_is_a_note(mtl: str, png: bytes | None, said: str, tmp_path: Path) -> None:
     folder = tmp_path / "here"

@@ -45,7 +45,7 @@ def beside(path: Path, name: str, what: str, at_most: int = LARGEST_FILE_BYTES) 
     Raises:
         TextureError: it lies elsewhere, is not there, or cannot be read.
     """
-    short = name[:80]
+    short = _short(name)
     folder = path.parent.resolve()
     try:
         target = (folder / PurePosixPath(name.replace("\\", "/"))).resolve()
@@ -78,7 +78,7 @@ class Pictures:
         """
         if name not in self._unpacked:
             try:
-                self._unpacked[name] = self._unpack(content(), name[:80])
+                self._unpacked[name] = self._unpack(content(), _short(name))
             except TextureError as reason:
                 self._unpacked[name] = reason
         found = self._unpacked[name]
@@ -109,6 +109,11 @@ class Pictures:
             raise
         except Exception as error:  # a damaged picture may raise anything at all
             raise TextureError(f"its picture '{name}' is damaged or of a kind that is not read") from error
+
+
+def _short(name: str) -> str:
+    """Return a name out of a file as a terminal may show it."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:80])
 
 
 def _between(pixels: ByteArray, uv: FloatArray) -> ByteArray:
