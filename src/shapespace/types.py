@@ -20,10 +20,14 @@ from shapespace.reprs import short_repr
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int32]
+ByteArray: TypeAlias = npt.NDArray[np.uint8]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0})
 """Millimetres in one of each unit a scan may come in."""
+
+GREY = 128
+"""Red, green and blue of vertices without a colour, where others of their surface have one."""
 
 
 def read_only(array: npt.ArrayLike) -> FloatArray:
@@ -46,6 +50,8 @@ class Mesh:
         faces: (F, 3) int32 indices into `vertices`, counter-clockwise seen from outside; None for a point cloud.
         landmarks: name -> (3,) float64, in the same frame and unit as `vertices`.
         name: where it came from, used in messages and result files.
+        colours: (V, 3) uint8 red, green and blue of each vertex, as screens show them (sRGB); None where not known.
+        notes: what was left out as it was read, a sentence each.
 
     Raises:
         MeshError: arrays of the wrong shape, or faces that index past the end of the vertices.
@@ -55,6 +61,8 @@ class Mesh:
     faces: IntArray | None = None
     landmarks: Mapping[str, FloatArray] = field(default_factory=lambda: dict[str, FloatArray]())
     name: str = "mesh"
+    colours: ByteArray | None = None
+    notes: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -83,6 +91,13 @@ class Mesh:
             if point.shape != (3,):
                 raise MeshError(f"{self.name}: landmark {key!r} must be 3 numbers, not {point.shape}.")
         object.__setattr__(self, "landmarks", MappingProxyType(landmarks))
+        if self.colours is not None:
+            given = np.asarray(self.colours)
+            if given.shape != vertices.shape or given.dtype != np.uint8:
+                raise MeshError(f"{self.name}: colours must be (V, 3) uint8, not {given.shape} {given.dtype}.")
+            colours = np.ascontiguousarray(given).view()
+            colours.setflags(write=False)
+            object.__setattr__(self, "colours", colours)
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -92,8 +107,9 @@ class Mesh:
         self.__init__(**state)  # type: ignore[misc]
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
-        """Return the same triangles on other `vertices` (V, 3); landmarks are dropped unless given."""
-        return Mesh(np.asarray(vertices, dtype=np.float64), self.faces, landmarks or {}, self.name)
+        """Return the same triangles and colours on other `vertices` (V, 3); landmarks are dropped unless given."""
+        moved = np.asarray(vertices, dtype=np.float64)
+        return Mesh(moved, self.faces, landmarks or {}, self.name, self.colours, self.notes)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.

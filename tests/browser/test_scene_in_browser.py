@@ -384,6 +384,33 @@ def test_a_fit_says_what_its_colours_mean(page_of, staged: StagedFit, kind: str)
     assert tab.complaints == []
 
 
+def test_the_colour_of_the_scan_is_shown_where_there_is_one(page_of, staged: StagedFit) -> None:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    script = 'Shapespace.widgets.fit(document.getElementById("f"), "f-data").then((w) => (window.w = w));'
+    tab = page_of(PLACES, script, **{"f-data": scene.pack_fit(staged)})
+    tab.page.wait_for_function("window.w")
+    assert tab.page.locator("#f option[value=colour]").count() == 0
+    final = staged.surfaces["final"]
+    green = np.tile(np.array([0, 255, 0], np.uint8), (len(final.vertices), 1))
+    given = replace(
+        staged,
+        scan=replace(staged.scan, colours=np.zeros(staged.scan.vertices.shape, np.uint8)),
+        surfaces={**staged.surfaces, "final": replace(final, colours=green)},
+    )
+    tab = page_of(PLACES, script, **{"f-data": scene.pack_fit(given)})
+    tab.page.wait_for_function("window.w")
+    tab.page.get_by_label("Colour").last.select_option("colour")
+    tab.page.wait_for_timeout(300)
+    shown = Image.open(io.BytesIO(tab.page.locator("#f .ss-plate").screenshot())).convert("RGB")
+    red, light, blue = np.moveaxis(np.asarray(shown).astype(int), 2, 0)
+    assert ((light > red + 80) & (light > blue + 80)).mean() > 0.1
+    assert "does not follow" in tab.page.inner_text("#f .ss-said")
+    assert tab.complaints == []
+
+
 def test_the_widgets_fit_a_narrow_phone(browser, open_tab, page_of, staged: StagedFit) -> None:
     tab = page_of(PLACES, WIDGETS, **payloads(staged))
     tab.page.set_viewport_size({"width": 340, "height": 700})

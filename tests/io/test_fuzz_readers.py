@@ -4,6 +4,7 @@
 A new reader needs an entry in `MESHES` or `LANDMARKS`; what was found by a long run belongs into `FOUND`.
 """
 
+import base64
 import gzip
 import json
 import os
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +42,7 @@ SURFACE = Mesh(
     np.random.default_rng(1).normal(size=(5, 3)), np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]], dtype=np.int32)
 )
 CLOUD = Mesh(SURFACE.vertices)
+PAINTED = replace(SURFACE, colours=np.arange(15, dtype=np.uint8).reshape(5, 3))
 MARKS = {"nose tip": np.array([0.1, 1 / 3, -2e-7]), 'left "eye"': np.array([1e6 / 7, -0.0, 3.0])}
 MOVED = f"Transform {{ rotation 0 0 1 .5 scale 1 -1 2 children [ {FACE} ] }} DEF a {FACE} Group {{ USE b }}"
 VRML_1 = (
@@ -69,6 +72,32 @@ LJSON_1 = {"version": 1, "groups": [{"label": "a", "landmarks": [{"point": [0, 1
 OBJ = "v 0 0 0 1 1 1\nv 1 0 0\n\nv 0 1 0\nv 0 0 1 # c\nvt 0 0\nf 1/1 2/1 3//1\nf -4 \\\n -3 -2 -1\nusemtl a\n"
 OFF = "NCOFF # c\n4 2 0\n0 0 0 255\n1 0 0 255\n\n1 1 0 255\n0 1 0 255\n4 0 1 2 3 255 0 0\n3 0 1 2\n"
 PLY = trimesh.creation.box().export(file_type="ply", encoding="ascii")
+PAINTED_PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    b"property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n0 0 0 255 0 9\n1 0 0 0 9 255\n"
+)
+PAINTED_VTK = (
+    b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nPOINTS 2 float\n0 0 0\n1 1 1\nPOINT_DATA 2\n"
+    b"NORMALS n float\n0 0 1\n0 0 1\nFIELD f 1\nw 1 2 float\n0 1\nCOLOR_SCALARS c 4\n0 0.5 1 1\n1 1 0 1\n"
+)
+PNG = bytes.fromhex(
+    "89504e470d0a1a0a0000000d4948445200000002000000020802000000fdd49a73000000164944415478"
+    "9c6348616038c1c0c0c0c090c2c07002000f4a02598111cca80000000049454e44ae426082"
+)
+TEXTURED = (
+    b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\nf -3/-3 -2/-2 -1/-1\n"
+)
+MATERIALS = b"newmtl a\nmap_Kd a.png\n"
+TEXTURED_GLTF = gltf_tree(
+    meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 0, "TEXCOORD_1": 2}, "material": 0}]}],
+    accessors=[
+        *gltf_tree()["accessors"],  # type: ignore[misc]
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"},
+    ],
+    materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}],
+    textures=[{"source": 0}],
+    images=[{"uri": "data:image/png;base64," + base64.b64encode(PNG).decode()}],
+)
 LISTS = (
     b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     b"element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
@@ -86,13 +115,26 @@ def marked(ending: str) -> list[bytes]:
 
 
 MESHES: dict[str, list[bytes]] = {
-    ".ply": [*written(SURFACE, ".ply"), PLY, LISTS],
-    ".obj": [*written(SURFACE, ".obj"), OBJ.encode(), b"\xef\xbb\xbf" + OBJ.replace("\n", "\r\n").encode()],
+    ".ply": [*written(SURFACE, ".ply"), *written(PAINTED, ".ply"), PAINTED_PLY, PLY, LISTS],
+    ".obj": [
+        *written(SURFACE, ".obj"),
+        *written(PAINTED, ".obj"),
+        OBJ.encode(),
+        b"\xef\xbb\xbf" + OBJ.replace("\n", "\r\n").encode(),
+    ],
     ".stl": [*written(SURFACE, ".stl"), trimesh.creation.box().export(file_type="stl_ascii").encode()],
-    ".off": [*written(SURFACE, ".off"), OFF.encode()],
-    ".vtk": [*written(SURFACE, ".vtk"), *written(CLOUD, ".vtk"), vtk_5_1(binary=True), vtk_5_1(binary=False)],
+    ".off": [*written(SURFACE, ".off"), *written(PAINTED, ".off"), OFF.encode()],
+    ".vtk": [
+        *written(SURFACE, ".vtk"),
+        *written(CLOUD, ".vtk"),
+        *written(PAINTED, ".vtk"),
+        PAINTED_VTK,
+        vtk_5_1(binary=True),
+        vtk_5_1(binary=False),
+    ],
     ".vtp": [
         *written(SURFACE, ".vtp"),
+        *written(PAINTED, ".vtp"),
         *(
             vtp(form, packed, order, header)
             for form, packed, order, header in [
@@ -104,8 +146,14 @@ MESHES: dict[str, list[bytes]] = {
             ]
         ),
     ],
-    ".glb": [*written(SURFACE, ".glb"), *written(CLOUD, ".glb")],
-    ".gltf": [*written(SURFACE, ".gltf"), json.dumps(gltf_tree()).encode(), json.dumps(MORPHED).encode()],
+    ".glb": [*written(SURFACE, ".glb"), *written(PAINTED, ".glb"), *written(CLOUD, ".glb")],
+    ".gltf": [
+        *written(SURFACE, ".gltf"),
+        *written(PAINTED, ".gltf"),
+        json.dumps(TEXTURED_GLTF).encode(),
+        json.dumps(gltf_tree()).encode(),
+        json.dumps(MORPHED).encode(),
+    ],
     ".wrl": [FACE.encode(), MOVED.encode(), VRML_1.encode()],
     ".raw": [b"0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1 -0.0\n", b"a\n1 2 3 # c\n4,5,6\n7 8 9\n"],
     ".xyz": [b"//X Y Z R\n0 0 0 255\n1 0.5 -1e3 0\n", b"2\n1,2,3\n4;5;6\n"],
@@ -256,6 +304,23 @@ def test_a_damaged_mesh_file_is_a_mesh_or_one_sentence(ending: str, tmp_path: Pa
 
 def test_a_damaged_packed_file_is_a_mesh_or_one_sentence(tmp_path: Path) -> None:
     fuzz(read_mesh, tmp_path / "bad.xyz.gz", [gzip.compress(data, mtime=0) for data in MESHES[".xyz"]])
+
+
+@pytest.mark.parametrize("damaged", ["a.obj", "a.mtl", "a.png"])
+def test_a_damaged_texture_leaves_a_mesh_or_one_sentence(damaged: str, tmp_path: Path) -> None:
+    whole = {"a.obj": TEXTURED, "a.mtl": MATERIALS, "a.png": PNG}
+    for name, data in whole.items():
+        (tmp_path / name).write_bytes(data)
+    assert read_mesh(tmp_path / "a.obj").colours is not None
+    scan = tmp_path / "a.obj"
+
+    def read(path: Path) -> Mesh:
+        mesh = read_mesh(scan)
+        assert damaged == "a.obj" or len(mesh.vertices) == 3
+        assert all(note.endswith(".") and "\n" not in note for note in mesh.notes)
+        return mesh
+
+    fuzz(read, tmp_path / damaged, [whole[damaged]])
 
 
 @pytest.mark.parametrize("ending", LANDMARKS)

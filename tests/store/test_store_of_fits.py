@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from shapespace.batch.results import read_record
 from shapespace.batch.store import Store
 from shapespace.commands.export import export
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.io.meshes import read_mesh
+from shapespace.io.ply import ply_comment, write_ply
 from shapespace.store import manifest as manifests
 from shapespace.store.manifest import read_manifest
 from shapespace.store.results import Results, mesh_at
@@ -100,6 +103,20 @@ def test_export_gives_the_single_files_back(store: Path, singles: Path, tmp_path
     assert cli.main(["export", str(store), "--all", "-o", str(tmp_path / "back"), "--quiet"]) == 0
     assert_same(Results(tmp_path / "back"), singles)
     assert sorted(content(tmp_path / "back")) == sorted(content(singles))
+
+
+def test_colours_of_surfaces_stay_with_theirs(singles: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "painted"
+    shutil.copytree(singles, folder)
+    path = sorted(folder.glob("*.fitted.ply"))[1]
+    mesh = read_mesh(path)
+    colours = np.arange(mesh.vertices.size, dtype=np.uint8).reshape(-1, 3)
+    path.write_bytes(write_ply(replace(mesh, colours=colours), ply_comment(path)))
+    assert not Store(folder).compact().left
+    results = Results(folder)
+    for name in (one for one in results.names() if results.has(one, "fitted")):
+        found = results.surface(name).colours
+        assert np.array_equal(found, colours) if path.name.startswith(name) else found is None
 
 
 def test_export_of_a_name_that_there_is_not_names_near_ones(store: Path, capsys: pytest.CaptureFixture[str]) -> None:

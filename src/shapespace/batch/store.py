@@ -298,19 +298,23 @@ class Store:
                 def array(name: str, shape: tuple[int, ...], kind: str, chunk: tuple[int, ...]) -> Any:
                     return root.create_array(
                         name, shape=shape, dtype=kind, chunks=chunk, compressors=None, filters=None,
-                        fill_value=-1 if kind[1] == "i" else np.nan,
+                        fill_value={"i": -1, "u": 0, "f": np.nan}[kind[1]],
                     )  # fmt: skip
 
                 if first.faces is not None:
                     array("faces", first.faces.shape, "<i4", first.faces.shape)[:] = first.faces
                 for kind in kinds:
                     offsets = array(kind, (len(group), count, 3), "<f4", (1, count, 3))
+                    colours: Any = None
                     origins = np.full((len(group), 3), np.nan)
                     for k, result in enumerate(group):
                         if kind in result.kinds:
-                            vertices = self._surface(result.name, kind).vertices
-                            origins[k] = _middle(vertices)
-                            offsets[k] = vertices - origins[k]
+                            surface = self._surface(result.name, kind)
+                            origins[k] = _middle(surface.vertices)
+                            offsets[k] = surface.vertices - origins[k]
+                            if surface.colours is not None:
+                                colours = colours or array(f"{kind}_colours", offsets.shape, "|u1", (1, count, 3))
+                                colours[k] = surface.colours
                     array(f"{kind}_origin", origins.shape, "<f8", origins.shape)[:] = origins
 
         return self._written(SURFACES, called, write)

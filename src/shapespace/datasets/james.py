@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from shapespace.datasets import fetch
@@ -22,7 +23,7 @@ def james_available() -> bool:
 
 
 def load_james(folder: Path | None = None) -> Mesh:
-    """Return James in millimetres, 6,393 vertices and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
+    """Return James in mm, 6,393 vertices in colours and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
 
     Args:
         folder: holds `james.obj` and `james.ljson`; None takes the mirror or the cache, verified, and never downloads.
@@ -33,4 +34,4 @@ def load_james(folder: Path | None = None) -> Mesh:
     """
     folder = fetch.present_folder(NAME, "James") if folder is None else folder
     scan = read_mesh(Path(folder) / "james.obj")
-    return Mesh(scan.vertices, scan.faces, read_landmarks(Path(folder) / "james.ljson"), "james")
+    return replace(scan, landmarks=read_landmarks(Path(folder) / "james.ljson"), name="james")

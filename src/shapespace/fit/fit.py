@@ -26,6 +26,7 @@ from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.verdict import verdict
+from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
@@ -244,6 +245,7 @@ def fit_scan(
         model=model,
         scan=placed.scan,
         find_regions=fitted.regions,
+        find_closest=partial(_closest, placed.target, placed.T_scan_mm.inverse()),
         landmark_stddev_mm=_landmark_stddev_mm(model, fitted, held, dense=config.dense),
         files=files,
     )
@@ -310,7 +312,7 @@ def _place(
     if landmarks:
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=Marks.of(model, marks_mm, stddev_mm))
-    said += [f"{finding.what} {finding.action}".strip() for finding in findings]
+    said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
 
 
@@ -437,6 +439,10 @@ def _dense_stage(
         seen=dense.seen,
         moved_mm=dense.moved_mm,
     )
+
+
+def _closest(target: ScanTarget, T_mm_scan: Similarity, points: FloatArray) -> ClosestPoints:
+    return target.engine.query(T_mm_scan.apply(points))
 
 
 def _distances(

@@ -13,6 +13,9 @@ FOLLOWED, REJECTED, BORDER, UNSEEN = range(4)
 SHOWN = (FOLLOWED, REJECTED)
 """Where the scan shows something, be it what the model follows or not."""
 
+MATCHED = (FOLLOWED, BORDER)
+"""Where the model follows the scan, up to its border."""
+
 
 def all_followed(vertices: int) -> IntArray:
     """Return the codes (V,) of a method that takes every vertex for matched."""

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.regions import SHOWN
+from shapespace.fit.colours import carried_colours
+from shapespace.fit.regions import MATCHED, SHOWN
 from shapespace.fit.state import IcpState
+from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.late import OpenViewer, late
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr, told_briefly
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,6 +111,7 @@ class FitResult:
         model: the model that was fitted.
         scan: what was fitted: the scan as repaired, in its own frame and unit.
         find_regions: finds `regions`.
+        find_closest: finds the closest points of the scan to vertices (V, 3) in its own frame and unit.
         landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
             scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
             the region that the fit was held to.
@@ -137,6 +140,7 @@ class FitResult:
     model: ShapeModel = field(repr=False)
     scan: Mesh = field(repr=False)
     find_regions: Callable[[], IntArray] = field(repr=False)
+    find_closest: Callable[[FloatArray], ClosestPoints] = field(repr=False)
     landmark_stddev_mm: Mapping[str, FloatArray] | None = field(default=None, repr=False)
     files: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
@@ -163,6 +167,23 @@ class FitResult:
         Empty where the model has no landmarks.
         """
         return dict(self.surface(stage="dense" if "dense" in self.stages else "final").landmarks)
+
+    @cached_property
+    def colours(self) -> Mapping[str, ByteArray]:
+        """(V, 3) uint8 of the surface at `final`, and at `dense` where there is one; empty of a scan without colours.
+
+        A vertex takes the colour of the closest point of the scan. Where the surface does not follow the scan, or the
+        scan shows nothing, it is grey.
+        """
+        colours = self.scan.colours
+        if colours is None:
+            return {}
+        found: dict[str, ByteArray] = {}
+        for name in ("final", *(("dense",) if "dense" in self.stages else ())):
+            followed = self.stages[name].seen
+            seen = np.isin(self.regions, MATCHED) if followed is None else followed
+            found[name] = carried_colours(colours, self.scan, self.find_closest(self._vertices(name)), seen)
+        return found
 
     @property
     def iterations(self) -> dict[str, int]:
@@ -205,6 +226,8 @@ class FitResult:
     def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:
         """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order.
 
+        At `final` and `dense` it has the colours of the scan, see `colours`.
+
         Args:
             model: the model that was fitted, which the result knows; it may be left out.
             stage: a name of `stages`.
@@ -217,10 +240,9 @@ class FitResult:
                 f"{self.scan_name} was fitted with another model than the one given, whose surface would be wrong; "
                 "leave the model out, as the result knows its own."
             )
-        at = self.stages[stage]
-        vertices = at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
+        vertices = self._vertices(stage)
         landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
-        return Mesh(vertices, self.model.faces, landmarks, name=self.scan_name)
+        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
         """Write what `shapespace fit` writes of a scan, and return the path of the record, NAME.fit.json.
@@ -269,3 +291,7 @@ class FitResult:
 
     def _repr_html_(self) -> str:
         return late("html_of_fit")(self)
+
+    def _vertices(self, stage: str) -> FloatArray:
+        at = self.stages[stage]
+        return at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices

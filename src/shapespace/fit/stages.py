@@ -21,7 +21,8 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
     Of each stage the vertices (V, 3), the signed distances `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,),
     positive where the scan lies outside of the model, not-a-number at scan points beyond the model's rim. `scan` and
     `scan_faces` are the scan as repaired; `regions` the codes of `fit.regions.REGIONS`; `history_*` each iteration,
-    with T (I, 3, 4) from the model's frame then to the frame of the final pose.
+    with T (I, 3, 4) from the model's frame then to the frame of the final pose. Of a scan with colours, `scan_colours`
+    (S, 3), `colours_final` and `colours_dense` (V, 3) are there too, uint8.
     """
     T_model_scan = result.T_scan_model.inverse()
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -35,6 +36,10 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
         arrays[f"scan_to_model_{name}"] = stage.distances.scan_to_model_signed_mm.astype(np.float32)
         if stage.seen is not None:
             arrays[f"seen_{name}"] = stage.seen
+    for name, colours in result.colours.items():
+        arrays[f"colours_{name}"] = colours
+    if result.scan.colours is not None:
+        arrays["scan_colours"] = result.scan.colours
     if model.faces is not None:
         arrays["faces"] = model.faces
     if result.scan.faces is not None:

@@ -134,6 +134,7 @@ class _Doctor:
         self.mesh = mesh
         self.findings: list[Finding] = []
         self.vertices = mesh.vertices
+        self.colours = mesh.colours
         self.faces: IntArray | None = None if mesh.faces is None else np.array(mesh.faces)
         self.in_file = self.faces
         """The triangles in the numbering of the file, in step with `faces`."""
@@ -186,6 +187,7 @@ class _Doctor:
         return True
 
     def _keep_vertices(self, keep: BoolArray) -> None:
+        self.colours = None if self.colours is None else self.colours[keep]
         if self.faces is None:
             self.vertices = self.vertices[keep]
         else:
@@ -200,6 +202,7 @@ class _Doctor:
         self.duplicates = len(self.vertices) - len(first)
         if self.duplicates:
             self.vertices = self.vertices[first]
+            self.colours = None if self.colours is None else self.colours[first]
             self.faces = None if self.faces is None else index[self.faces]
             self._fixed(
                 f"{_some(self.duplicates, 'vertex lies', 'vertices lie')} exactly on another.",
@@ -406,7 +409,8 @@ class _Doctor:
         """Return the mesh after the repairs."""
         if not self.changed:
             return self.mesh
-        return Mesh(self.vertices, self.faces, self.mesh.landmarks, self.mesh.name)
+        mesh = self.mesh
+        return Mesh(self.vertices, self.faces, mesh.landmarks, mesh.name, self.colours, mesh.notes)
 
     def report(self) -> MeshReport:
         """Return what was found."""

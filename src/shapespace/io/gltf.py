@@ -10,6 +10,7 @@ import binascii
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import unquote
@@ -30,7 +31,8 @@ from shapespace.io.parsing import (
     mesh_of,
     strip_triangles,
 )
-from shapespace.types import FloatArray, Mesh
+from shapespace.io.textures import Pictures, TextureError, beside
+from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -80,6 +82,7 @@ class _Gltf:
     binary: bytes | None
     allowance: Allowance
     buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
+    pictures: Pictures = field(default_factory=Pictures)
 
     def buffer(self, index: int) -> bytes:
         entry = self.tree["buffers"][index]
@@ -179,7 +182,8 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     """Read glTF or GLB: all meshes of the scene in the order of its nodes, moved by the nodes' transforms.
 
     Primitives that share their positions share their vertices here too. Morph targets are applied with the
-    weights of the node or mesh; skins, lines, textures and animations are passed over. glTF means metres.
+    weights of the node or mesh; skins, lines and animations are passed over. glTF means metres. Colours are those of
+    the vertices, else of the pictures of base colour; a note says why these are not read.
 
     Args:
         data: the whole file.
@@ -286,21 +290,34 @@ def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray
 
 def _scene(gltf: _Gltf) -> Mesh:
     points: list[FloatArray] = []
+    colours: list[ByteArray | None] = []
+    notes: list[str] = []
     faces: list[IndexArray] = []
     before = 0
     for node, matrix in _nodes_with_meshes(gltf):
-        for vertices, triangles in _primitives(gltf, node):
+        for vertices, triangles, painted in _primitives(gltf, node, notes):
             gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
             if triangles is not None:
                 # A mirroring transform turns triangles inside out.
                 mirrored = np.linalg.det(matrix[:3, :3]) < 0
                 faces.append((triangles[:, ::-1] if mirrored else triangles) + before)
+            colours.append(painted)
             before += len(vertices)
     if not points:
         raise damaged(gltf.path, "its scene holds no points and no triangles")
     joined = np.concatenate(faces) if faces else None
-    return mesh_of(np.concatenate(points), joined, gltf.path)
+    return mesh_of(
+        np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
+    )
+
+
+def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -> ByteArray | None:
+    """Return the colours of all parts, grey where only others have some; None where none has."""
+    if all(part is None for part in colours):
+        return None
+    pairs = zip(points, colours, strict=True)
+    return np.concatenate([np.full(at.shape, GREY, np.uint8) if part is None else part for at, part in pairs])
 
 
 def _morphs(gltf: _Gltf) -> Morphs:
@@ -314,8 +331,8 @@ def _morphs(gltf: _Gltf) -> Morphs:
     count = len(mesh["primitives"][0]["targets"])
     gltf.allowance.part(count)
     # Without its weights, so that what is read is the shape from which the targets are counted.
-    parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()})
-    vertices = np.concatenate([points for points, _ in parts])
+    parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()}, [])
+    vertices = np.concatenate([points for points, _, _ in parts])
     gltf.allowance.take(vertices.size * (count + 1), 8)
     targets = np.zeros((count, len(vertices), 3))
     before, done, faces = 0, set[int](), list[IndexArray]()
@@ -324,7 +341,7 @@ def _morphs(gltf: _Gltf) -> Morphs:
         if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in done:
             continue
         done.add(key)
-        points, triangles = parts[len(done) - 1]
+        points, triangles, _ = parts[len(done) - 1]
         for k, target in enumerate(primitive.get("targets", ())):
             gltf.allowance.part()
             if "POSITION" in target:
@@ -374,11 +391,14 @@ def _local(node: dict[str, Any]) -> FloatArray:
     return out
 
 
-def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, IndexArray | None]]:
-    """Return the points and triangles of a node's mesh; primitives that share their positions come as one."""
+def _primitives(
+    gltf: _Gltf, node: dict[str, Any], notes: list[str]
+) -> list[tuple[FloatArray, IndexArray | None, ByteArray | None]]:
+    """Return points, triangles and colours of a node's mesh; primitives that share their positions come as one."""
     mesh = gltf.tree["meshes"][node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     vertices: dict[int, FloatArray] = {}
+    colours: dict[int, ByteArray | None] = {}
     triangles: dict[int, list[IndexArray]] = {}
     for primitive in mesh["primitives"]:
         gltf.allowance.part()
@@ -394,6 +414,7 @@ def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, Ind
                 if weight and "POSITION" in target:
                     position = position + float(weight) * gltf.accessor(target["POSITION"])
             vertices[key] = position
+            colours[key] = _colours(gltf, primitive, len(position), notes)
         if mode == _POINTS:
             continue
         if "indices" in primitive:
@@ -410,7 +431,64 @@ def _primitives(gltf: _Gltf, node: dict[str, Any]) -> list[tuple[FloatArray, Ind
         # Checked here: joined, an index past this primitive would point into the next.
         mesh_of(vertices[key], found, gltf.path)
         triangles.setdefault(key, []).append(found)
-    return [(v, np.concatenate(triangles[k]) if k in triangles else None) for k, v in vertices.items()]
+    return [(v, np.concatenate(triangles[k]) if k in triangles else None, colours[k]) for k, v in vertices.items()]
+
+
+def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[str]) -> ByteArray | None:
+    """Return the colours (V, 3) of the points of a primitive; None where it has none, or none that can be read."""
+    attributes = primitive["attributes"]
+    try:
+        if "COLOR_0" in attributes:
+            values = gltf.accessor(attributes["COLOR_0"])
+            return _from_linear(values[:, :3]) if len(values) == vertices and values.shape[1] >= 3 else None
+        if "TEXCOORD_0" not in attributes or "material" not in primitive:
+            return None
+        base = gltf.tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
+        coordinates = attributes[f"TEXCOORD_{int(base.get('texCoord', 0))}"]
+        number = int(gltf.tree["textures"][base["index"]]["source"])
+        image = gltf.tree["images"][number]
+        uv = gltf.accessor(coordinates).astype(np.float64)
+        if len(uv) != vertices or uv.shape[1] != 2:
+            return None
+        # Of glTF the upper left corner is the origin.
+        uv[:, 1] = 1.0 - uv[:, 1]
+        uri = str(image.get("uri", ""))
+        name = f"{number} in it" if not uri or uri.startswith("data:") else unquote(uri)
+        return gltf.pictures.sampled(name, partial(_picture, gltf, image), uv)
+    except TextureError as reason:
+        notes.append(f"It is read without all of its colours: {reason}.")
+        return None
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, FileError):
+        return None  # the surface is whole, whatever its material lacks
+
+
+def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
+    """Return the content of a picture that lies in a buffer, in the JSON or in a file."""
+    if "bufferView" in image:
+        length = int(gltf.tree["bufferViews"][image["bufferView"]]["byteLength"])
+        return gltf.view(image["bufferView"], 0, np.dtype(np.uint8), length, 1).tobytes()
+    if image["uri"].startswith("data:"):
+        return base64.b64decode(image["uri"].partition(",")[2], validate=True)
+    return beside(gltf.path, unquote(image["uri"]), "its picture")
+
+
+def _from_linear(values: Values) -> ByteArray | None:
+    """Return colours (N, 3) that are linear in light, 0 to 1, as screens show them (sRGB)."""
+    light = values.astype(np.float64) / (1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
+    if not np.isfinite(light).all():
+        return None
+    light = np.clip(light, 0.0, 1.0)
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.rint(255.0 * shown).astype(np.uint8)
+
+
+def _to_linear(colours: ByteArray) -> Values:
+    """Return (N, 4) uint16 of sRGB colours (N, 3), linear in light and opaque, fine enough to come back as they are."""
+    shown = np.arange(256) / 255.0
+    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    out = np.full((len(colours), 4), 65535, dtype="<u2")
+    out[:, :3] = np.rint(65535.0 * light).astype(np.uint16)[colours]
+    return out
 
 
 def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
@@ -439,6 +517,15 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
         accessors.append({"bufferView": 1, "componentType": 5125, "count": count, "type": "SCALAR"})
         primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": _TRIANGLES}
         binary += indices
+    if mesh.colours is not None:
+        painted = _to_linear(mesh.colours).tobytes()
+        primitive["attributes"]["COLOR_0"] = len(accessors)
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(painted), "target": 34962})
+        accessors.append({
+            "bufferView": len(views) - 1, "componentType": 5123, "normalized": True, "count": len(mesh.colours),
+            "type": "VEC4",
+        })  # fmt: skip
+        binary += painted
     node: dict[str, Any] = {"mesh": 0, "name": mesh.name}
     if far:
         node["translation"] = centre.tolist()

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: its `v` and `f` lines; texture seams, normals, groups and materials change nothing."""
+"""Wavefront OBJ: its `v` and `f` lines and its colours; texture seams, normals and groups change nothing."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.errors import FileFormatError
+from shapespace.io.obj_textures import texture_colours
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
+    bytes_of_colours,
     damaged,
     fan_triangles,
     floats,
@@ -22,15 +25,19 @@ from shapespace.io.parsing import (
 )
 from shapespace.types import FloatArray, Mesh
 
+_COLOURED_WORDS = 7
+"""Of a line such as `v x y z r g b`."""
+
 
 def read_obj(data: bytes, path: Path) -> Mesh:
     """Read OBJ: one vertex for each `v` line, in the file's order, and polygons as fans.
 
-    Negative indices count back from the last `v` line above; colours and weights after `x y z` are ignored.
+    Negative indices count back from the last `v` line above. Colours are those after `x y z` where all vertices have
+    them, else of the pictures that its materials name; a note says why these are not read. Weights are ignored.
 
     Args:
         data: the whole file.
-        path: its name, for messages and the mesh's name.
+        path: its name; materials and pictures are read from its folder and from nowhere else.
 
     Raises:
         FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
@@ -40,6 +47,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     if b"\\" in data:
         data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     vertices: list[FloatArray] = []
+    colours: list[FloatArray | None] = []
     faces: list[IndexArray] = []
     count = polygon_count = 0
     for lines in line_blocks(data):
@@ -57,13 +65,19 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 above.append(count + len(points))
         if points:
             vertices.append(_points(points, count, path))
+            colours.append(_colours(points, path))
             count += len(points)
         if polygons:
             faces.append(_faces(polygons, above, polygon_count, path))
             polygon_count += len(polygons)
     if not count:
         raise damaged(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
-    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path)
+    own = [part for part in colours if part is not None]
+    painted = bytes_of_colours(np.concatenate(own)) if len(own) == len(colours) else None
+    notes: tuple[str, ...] = ()
+    if painted is None:
+        painted, notes = texture_colours(data, count, path)
+    return mesh_of(np.concatenate(vertices), joined(faces, np.int64, 3), path, painted, notes)
 
 
 def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
@@ -75,6 +89,16 @@ def _points(points: list[list[bytes]], before: int, path: Path) -> FloatArray:
         flat = list(chain.from_iterable(points))
         return np.stack([floats(flat[axis :: len(points[0])], path) for axis in (1, 2, 3)], axis=1)
     return floats(chain.from_iterable(words[1:4] for words in points), path).reshape(-1, 3)
+
+
+def _colours(points: list[list[bytes]], path: Path) -> FloatArray | None:
+    """Return what stands after the coordinates, (n, 3), where that is three numbers of each vertex."""
+    if set(map(len, points)) != {_COLOURED_WORDS}:
+        return None
+    try:
+        return floats(chain.from_iterable(words[4:] for words in points), path).reshape(-1, 3)
+    except FileFormatError:
+        return None
 
 
 def _faces(polygons: list[list[bytes]], above: list[int], before: int, path: Path) -> IndexArray:
@@ -97,8 +121,12 @@ def _faces(polygons: list[list[bytes]], above: list[int], before: int, path: Pat
 
 
 def write_obj(mesh: Mesh) -> bytes:
-    """Return `mesh` as OBJ text with 17 significant digits, so that reading it back is exact."""
-    text = number_lines(mesh.vertices, "v %.17g %.17g %.17g")
+    """Return `mesh` as OBJ text with 17 significant digits, so that reading it back is exact, colours after them."""
+    pattern = "v %.17g %.17g %.17g"
+    if mesh.colours is None:
+        text = number_lines(mesh.vertices, pattern)
+    else:
+        text = number_lines(np.hstack([mesh.vertices, mesh.colours / 255.0]), f"{pattern} %.6g %.6g %.6g")
     if mesh.faces is not None:
         text += number_lines(mesh.faces.astype(np.int64) + 1, "f %d %d %d")
     return text.encode("ascii")

@@ -1,4 +1,4 @@
-"""OFF, the text format of Geomview, with its colours, normals and texture coordinates ignored."""
+"""OFF, the text format of Geomview, with its normals, texture coordinates and the colours of faces ignored."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.errors import FileFormatError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
+    bytes_of_colours,
     check_count,
     damaged,
     fan_triangles,
@@ -26,7 +28,7 @@ from shapespace.io.parsing import (
 from shapespace.types import FloatArray, Mesh
 
 # Geomview writes CN, MeshLab NC.
-_KEYWORD = re.compile(rb"(?:ST)?(?:CN?|NC?)?(4?n?)OFF")
+_KEYWORD = re.compile(rb"(?:ST)?(CN?|NC?)?(4?n?)OFF")
 _ROWS = 1 << 13
 
 
@@ -46,7 +48,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
     keyword = _KEYWORD.match(first[0])
     if keyword is None:
         raise damaged(path, "it does not start with 'OFF', so it is not an OFF file")
-    if keyword[1] or first[-1].upper() == b"BINARY":
+    if keyword[2] or first[-1].upper() == b"BINARY":
         raise damaged(path, "it is a binary or four-dimensional OFF file, so save it as plain text OFF")
     head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
     counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
@@ -55,9 +57,19 @@ def read_off(data: bytes, path: Path) -> Mesh:
     n, m = counts
     check_count(n, 6, len(data), "vertices", path)
     check_count(m, 2, len(data), "faces", path)
-    vertices = joined([_points(part, path) for part in _batches(rows, n, "vertices", path)], np.float64, 3)
+    # Normals stand before colours, whichever the keyword names first.
+    kinds = keyword[1] or b""
+    at = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
+    points: list[FloatArray] = []
+    colours: list[FloatArray | None] = []
+    for part in _batches(rows, n, "vertices", path):
+        points.append(_points(part, path))
+        colours.append(_colours(part, at, path) if at else None)
+    vertices = joined(points, np.float64, 3)
+    own = [part for part in colours if part is not None]
+    painted = bytes_of_colours(np.concatenate(own)) if own and len(own) == len(colours) else None
     faces = joined([_faces(part, path) for part in _batches(rows, m, "faces", path)], np.int64, 3)
-    return mesh_of(vertices, faces, path)
+    return mesh_of(vertices, faces, path, painted)
 
 
 def _rows(data: bytes) -> Iterator[list[bytes]]:
@@ -88,6 +100,16 @@ def _points(rows: list[list[bytes]], path: Path) -> FloatArray:
     return floats(chain.from_iterable(words[:3] for words in rows), path).reshape(-1, 3)
 
 
+def _colours(rows: list[list[bytes]], at: int, path: Path) -> FloatArray | None:
+    """Return the three numbers from word `at` of each line, (n, 3); None where some line has none."""
+    if min(map(len, rows)) < at + 3:
+        return None
+    try:
+        return floats(chain.from_iterable(words[at : at + 3] for words in rows), path).reshape(-1, 3)
+    except FileFormatError:
+        return None
+
+
 def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
     sizes = ints((words[0] for words in rows), path)
     lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
@@ -98,8 +120,13 @@ def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
 
 
 def write_off(mesh: Mesh) -> bytes:
-    """Return `mesh` as OFF text with 17 significant digits, so that reading it back is exact."""
+    """Return `mesh` as OFF text, or COFF with its colours, with 17 significant digits: reading it back is exact."""
     faces = np.zeros((0, 3), dtype=np.int32) if mesh.faces is None else mesh.faces
-    text = f"OFF\n{len(mesh.vertices)} {len(faces)} 0\n"
-    text += number_lines(mesh.vertices, "%.17g %.17g %.17g") + number_lines(faces, "3 %d %d %d")
+    text = f"{'OFF' if mesh.colours is None else 'COFF'}\n{len(mesh.vertices)} {len(faces)} 0\n"
+    pattern = "%.17g %.17g %.17g"
+    if mesh.colours is None:
+        text += number_lines(mesh.vertices, pattern)
+    else:
+        text += number_lines(np.hstack([mesh.vertices, mesh.colours]), f"{pattern} %d %d %d 255")
+    text += number_lines(faces, "3 %d %d %d")
     return text.encode("ascii")

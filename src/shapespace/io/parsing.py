@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
 from shapespace.io.limits import MOST_PARTS
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import ByteArray, FloatArray, Mesh
 
 IndexArray = npt.NDArray[np.int64]
 
@@ -167,13 +167,34 @@ def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray
     return out
 
 
-def mesh_of(vertices: FloatArray, faces: IndexArray | None, path: Path) -> Mesh:
+def mesh_of(
+    vertices: FloatArray,
+    faces: IndexArray | None,
+    path: Path,
+    colours: ByteArray | None = None,
+    notes: tuple[str, ...] = (),
+) -> Mesh:
     """Return the mesh read from `path`: (V, 3) float64 and (F, 3) int64, which `Mesh` checks and narrows.
 
     Raises:
         MeshError: faces that point past the end of the vertices.
     """
-    return Mesh(vertices, faces, name=path.name)  # pyright: ignore[reportArgumentType]  # checked, then narrowed
+    return Mesh(vertices, faces, {}, path.name, colours, notes)  # pyright: ignore[reportArgumentType]  # narrowed
+
+
+def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:
+    """Return (V, 3) uint8 of colours as files have them; None where they are none, which no surface is refused for.
+
+    Args:
+        values: (V, 3) uint8, or other numbers that run up to 1, to 255 or to 65535.
+    """
+    if values.dtype == np.uint8:
+        return values
+    low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    if not (low >= 0.0 and high <= 65535.0):
+        return None
+    scale = 255.0 if high <= 1.0 else 1.0 if high <= 255.0 else 255.0 / 65535.0
+    return np.rint(values * scale).astype(np.uint8)
 
 
 def number_lines(values: npt.NDArray[Any], pattern: str) -> str:

@@ -16,6 +16,7 @@ from shapespace.errors import FileFormatError
 from shapespace.io.parsing import (
     CUT_SHORT,
     IndexArray,
+    bytes_of_colours,
     check_count,
     damaged,
     fan_triangles,
@@ -26,7 +27,7 @@ from shapespace.io.parsing import (
     plain_text,
     word_block,
 )
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import ByteArray, FloatArray, Mesh
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -38,6 +39,7 @@ _SCALARS = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20
 _FIRST_LINES = 512
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _INDEX_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -124,7 +126,7 @@ class _Words:
 
 
 def read_ply(data: bytes, path: Path) -> Mesh:
-    """Read PLY: all scalar types, both byte orders, extra properties and elements, polygons as fans.
+    """Read PLY: all scalar types, both byte orders, colours, extra properties and elements, polygons as fans.
 
     Args:
         data: the whole file.
@@ -137,6 +139,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     data = plain_text(data)
     order, elements, at = _header(data, path)
     vertices: FloatArray | None = None
+    colours: ByteArray | None = None
     faces: IndexArray | None = None
     words = _Words(data, at)
     for element in elements:
@@ -160,11 +163,12 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                 _refuse_without_xyz(element, path)
             if order == "":
                 if positions:
-                    vertices = _ascii_positions(words, element, path)
+                    vertices, colours = _ascii_vertices(words, element, path)
                 else:
                     words.skip(element.count * len(element.properties))
             else:
-                vertices = _binary_positions(data, at, element, order) if positions else vertices
+                if positions:
+                    vertices, colours = _binary_vertices(data, at, element, order)
                 at += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
@@ -175,7 +179,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             faces = fan_triangles(counts, corners)
     if vertices is None:
         raise damaged(path, "its header declares no vertices")
-    return mesh_of(vertices, faces, path)
+    return mesh_of(vertices, faces, path, colours)
 
 
 def _plural(name: str) -> str:
@@ -222,20 +226,37 @@ def _refuse_without_xyz(element: _Element, path: Path) -> None:
         raise damaged(path, "its vertices have no x, y and z")
 
 
-def _binary_positions(data: bytes, at: int, element: _Element, order: str) -> FloatArray:
+def _colour_names(names: list[str]) -> tuple[str, ...]:
+    return next((three for three in _COLOURS if set(three) <= set(names)), ())
+
+
+def _colours(element: _Element, columns: dict[str, npt.NDArray[Any]]) -> ByteArray | None:
+    """Return colours (V, 3) from their columns, as the types of their properties say."""
+    three = _colour_names([p.name for p in element.properties])
+    if not three:
+        return None
+    kinds = {p.item for p in element.properties if p.name in three}
+    values = np.stack([columns[name] for name in three], axis=1)
+    # The type tells what white is, of dark scans too.
+    if kinds == {"u1"}:
+        return values.astype(np.uint8) if ((values >= 0) & (values <= 255)).all() else None
+    return bytes_of_colours(values)
+
+
+def _binary_vertices(data: bytes, at: int, element: _Element, order: str) -> tuple[FloatArray, ByteArray | None]:
     names = [p.name for p in element.properties]
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
     table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
     out = np.empty((element.count, 3), dtype=np.float64)
     for axis, name in enumerate("xyz"):
         out[:, axis] = table[f"p{names.index(name)}"]
-    return out
+    return out, _colours(element, {name: table[f"p{names.index(name)}"] for name in _colour_names(names)})
 
 
-def _ascii_positions(words: _Words, element: _Element, path: Path) -> FloatArray:
+def _ascii_vertices(words: _Words, element: _Element, path: Path) -> tuple[FloatArray, ByteArray | None]:
     names = [p.name for p in element.properties]
     width = len(names)
-    columns: dict[str, list[FloatArray]] = {axis: [] for axis in "xyz"}
+    columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names))}
     taken = 0
     for part in words.take(element.count * width):
         for axis, parts in columns.items():
@@ -244,7 +265,8 @@ def _ascii_positions(words: _Words, element: _Element, path: Path) -> FloatArray
         taken += len(part)
     if taken < element.count * width:
         raise _ended(element, path)
-    return np.stack([joined(parts, np.float64) for parts in columns.values()], axis=1)
+    found = {name: joined(parts, np.float64) for name, parts in columns.items()}
+    return np.stack([found[axis] for axis in "xyz"], axis=1), _colours(element, found)
 
 
 def _ended(element: _Element, path: Path) -> FileFormatError:
@@ -387,7 +409,7 @@ def _indices(values: npt.NDArray[Any]) -> IndexArray:
 
 
 def write_ply(mesh: Mesh, comment: str = "") -> bytes:
-    """Return `mesh` as binary little-endian PLY with double coordinates, so that reading it back is exact.
+    """Return `mesh` as binary little-endian PLY with double coordinates, and colours: reading it back is exact.
 
     Args:
         mesh: vertices in whatever unit they are in.
@@ -398,6 +420,11 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
     lines += [f"element vertex {len(mesh.vertices)}"]
     lines += [f"property double {axis}" for axis in "xyz"]
     body = mesh.vertices.astype("<f8").tobytes()
+    if mesh.colours is not None:
+        lines += [f"property uchar {name}" for name in _COLOURS[0]]
+        rows = np.empty(len(mesh.vertices), dtype=[("at", "<f8", (3,)), ("colour", "u1", (3,))])
+        rows["at"], rows["colour"] = mesh.vertices, mesh.colours
+        body = rows.tobytes()
     if faces is not None:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         table = np.empty(len(faces), dtype=[("n", "u1"), ("i", "<i4", (3,))])

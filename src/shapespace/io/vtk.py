@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.errors import FileFormatError
 from shapespace.io.limits import Allowance
 from shapespace.io.parsing import (
     CUT_SHORT,
@@ -35,7 +36,7 @@ from shapespace.io.parsing import (
     word_block,
     xml_root,
 )
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import ByteArray, FloatArray, Mesh
 
 _LEGACY = {
     "unsigned_char": "u1", "char": "i1", "signed_char": "i1", "unsigned_short": "u2", "short": "i2",
@@ -56,6 +57,8 @@ _OFFSETS = re.compile(rb"\s*OFFSETS\s")
 _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 # zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
 _MAX_INFLATION = 1040
+_COLOUR_WIDTHS = (3, 4)
+_MOST_ATTRIBUTES = 100
 
 Values = npt.NDArray[Any]
 
@@ -213,7 +216,62 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
             raise damaged(path, f"it has an unknown section '{name}'; {CUT_SHORT}")
     if vertices is None:
         raise damaged(path, f"it has no POINTS; {CUT_SHORT}")
-    return mesh_of(vertices, joined(faces, np.int64, 3), path)
+    colours = _legacy_colours(cursor, len(vertices)) if word == b"POINT_DATA" else None
+    return mesh_of(vertices, joined(faces, np.int64, 3), path, colours)
+
+
+def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
+    """Return the first colours among what is known of the points; what comes after the surface is not judged."""
+    try:
+        if _count(cursor, cursor.path) != vertices:
+            return None
+        for _ in range(_MOST_ATTRIBUTES):
+            word = cursor.word()
+            if word == b"SCALARS":
+                cursor.word()
+                kind, width = cursor.word().decode("ascii", "replace").lower(), _width(cursor.word())
+                if cursor.word() != b"LOOKUP_TABLE":
+                    return None
+                cursor.word()
+                values = cursor.array(vertices * width, _kind(kind, cursor.path))
+                if kind == "unsigned_char" and width in _COLOUR_WIDTHS:
+                    return _three_bytes(values, width)
+            elif word == b"COLOR_SCALARS":
+                cursor.word()
+                width = _width(cursor.word())
+                in_text = isinstance(cursor, _TextCursor)
+                values = cursor.array(vertices * width, "f4" if in_text else "u1")
+                if width in _COLOUR_WIDTHS:
+                    return _three_bytes(np.rint(255.0 * values) if in_text else values, width)
+            elif word in (b"NORMALS", b"VECTORS"):
+                cursor.word()
+                cursor.array(3 * vertices, _next_kind(cursor, cursor.path))
+            elif word == b"FIELD":
+                cursor.word()
+                for _ in range(min(_count(cursor, cursor.path), _MOST_ATTRIBUTES)):
+                    while cursor.word() == b"METADATA":
+                        cursor.skip_metadata()
+                    width, rows = _count(cursor, cursor.path), _count(cursor, cursor.path)
+                    kind = cursor.word().decode("ascii", "replace").lower()
+                    values = cursor.array(width * rows, _kind(kind, cursor.path))
+                    if kind == "unsigned_char" and width in _COLOUR_WIDTHS and rows == vertices:
+                        return _three_bytes(values, width)
+            elif word == b"METADATA":
+                cursor.skip_metadata()
+            else:
+                return None
+    except FileFormatError:
+        return None
+    return None
+
+
+def _width(word: bytes) -> int:
+    return int(word) if word in (b"1", b"2", b"3", b"4") else 1
+
+
+def _three_bytes(values: Values, width: int) -> ByteArray | None:
+    rows = values.reshape(-1, width)[:, :3]
+    return rows.astype(np.uint8) if ((rows >= 0) & (rows <= 255)).all() else None
 
 
 def _skip_field(cursor: _Cursor, path: Path) -> None:
@@ -290,7 +348,11 @@ def write_vtk(mesh: Mesh) -> bytes:
     packed[:, 0], packed[:, 1:] = cells.shape[1], cells
     section = f"\n{'VERTICES' if mesh.faces is None else 'POLYGONS'} {len(cells)} {packed.size}\n"
     points = mesh.vertices.astype(">f8").tobytes()
-    return head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
+    surface = head.encode("ascii") + points + section.encode("ascii") + packed.tobytes() + b"\n"
+    if mesh.colours is None:
+        return surface
+    told = f"POINT_DATA {n}\nSCALARS RGB unsigned_char 3\nLOOKUP_TABLE default\n"
+    return surface + told.encode("ascii") + mesh.colours.tobytes() + b"\n"
 
 
 @dataclass(frozen=True)
@@ -336,6 +398,7 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
     header = order + ("u8" if root.get("header_type") == "UInt64" else "u4")
     xml = _Xml(path, order, header, compressor != "", appended, base, Allowance(len(data), path))
     points: list[FloatArray] = []
+    colours: list[ByteArray | None] = []
     faces: list[IndexArray] = []
     before = 0
     for piece in root.iterfind("PolyData/Piece"):
@@ -354,10 +417,13 @@ def read_vtp(data: bytes, path: Path) -> Mesh:
             # Checked piece by piece: joined, an index past one piece would point into the next.
             faces.append(_faces_of(mesh_of(vertices, triangles, path)) + before)
         points.append(vertices)
+        colours.append(_piece_colours(piece, len(vertices), xml))
         before += len(vertices)
     if not points:
         raise damaged(path, f"it holds no points; {CUT_SHORT}")
-    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path)
+    own = [part for part in colours if part is not None]
+    painted = np.concatenate(own) if len(own) == len(colours) else None
+    return mesh_of(np.concatenate(points), joined(faces, np.int64, 3), path, painted)
 
 
 def _faces_of(mesh: Mesh) -> IndexArray:
@@ -375,6 +441,19 @@ def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
     if len(values) != 3 * declared:
         raise damaged(xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}")
     return values.reshape(-1, 3)
+
+
+def _piece_colours(piece: ET.Element, vertices: int, xml: _Xml) -> ByteArray | None:
+    """Return the first array of bytes, three or four a point, among what is known of the points."""
+    for array in piece.iterfind("PointData/DataArray"):
+        width = _width(array.get("NumberOfComponents", "1").encode("ascii", "replace"))
+        if array.get("type") == "UInt8" and width in _COLOUR_WIDTHS:
+            try:
+                values = _data_array(array, xml)
+            except FileFormatError:
+                return None
+            return _three_bytes(values, width) if len(values) == width * vertices else None
+    return None
 
 
 def _data_array(array: ET.Element, xml: _Xml) -> Values:
@@ -473,6 +552,10 @@ def write_vtp(mesh: Mesh) -> bytes:
         packed = base64.b64encode(len(raw).to_bytes(8, "little") + raw).decode("ascii")
         return f'<DataArray type="{kind}" Name="{name}"{components} format="binary">{packed}</DataArray>'
 
+    colours: list[str] = []
+    if mesh.colours is not None:
+        told = array("RGB", "UInt8", mesh.colours, ' NumberOfComponents="3"')
+        colours = ['<PointData Scalars="RGB">', told, "</PointData>"]
     lines = [
         '<?xml version="1.0"?>',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
@@ -482,6 +565,7 @@ def write_vtp(mesh: Mesh) -> bytes:
         "<Points>",
         array("Points", "Float64", mesh.vertices.astype("<f8"), ' NumberOfComponents="3"'),
         "</Points>",
+        *colours,
         f"<{section}>",
         array("connectivity", "Int64", cells.astype("<i8").ravel()),
         array("offsets", "Int64", ends),

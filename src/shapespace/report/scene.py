@@ -181,6 +181,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
     the scan is a point cloud, not-a-number where unknown; `beyond_model_STAGE` and
     `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes;
+    of a scan with colours `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3) uint8;
     `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
     and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
 
@@ -219,6 +220,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     }
     if not small:
         arrays |= _history(staged)
+    arrays |= _colours(staged, of_model, of_scan)
     facts = {
         "kind": "fit",
         "name": staged.name,
@@ -258,6 +260,19 @@ def _stage_arrays(
         arrays[f"scan_to_model_{stage}"] = quantised(backward, step=step, coded=small)
         arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
         arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
+    return arrays
+
+
+def _colours(
+    staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp]
+) -> dict[str, npt.NDArray[Any] | Steps]:
+    """Return the colours of the scan, and those that the surfaces took from it, where there are any."""
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    if staged.scan.colours is not None:
+        arrays["scan_colours"] = staged.scan.colours[of_scan]
+    for stage, surface in staged.surfaces.items():
+        if surface.colours is not None:
+            arrays[f"colours_{stage}"] = surface.colours[of_model]
     return arrays
 
 

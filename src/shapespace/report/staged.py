@@ -114,12 +114,16 @@ class StagedFit:
             raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {again}.")
         try:
             faces = arrays.get("faces")
-            scan = Mesh(arrays["scan"].astype(np.float64), arrays.get("scan_faces"), name=name)
+            scan = Mesh(
+                arrays["scan"].astype(np.float64), arrays.get("scan_faces"), name=name,
+                colours=arrays.get("scan_colours"),
+            )  # fmt: skip
             surfaces: dict[str, Mesh] = {}
             forward: dict[str, FloatArray] = {}
             backward: dict[str, FloatArray] = {}
             for stage in (*STAGES, *(("dense",) if "dense" in arrays else ())):
-                surfaces[stage] = Mesh(arrays[stage].astype(np.float64), faces, name=name)
+                colours = arrays.get(f"colours_{stage}")
+                surfaces[stage] = Mesh(arrays[stage].astype(np.float64), faces, name=name, colours=colours)
                 forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
                 backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
             regions = np.clip(arrays["regions"], 0, len(REGIONS)).astype(np.int32)

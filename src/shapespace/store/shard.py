@@ -16,7 +16,7 @@ import numpy.typing as npt
 from shapespace.errors import FileError, FileFormatError, ShapespaceError
 from shapespace.store.manifest import AGAIN, ShardEntry, arrow, require_store_extra
 from shapespace.store.rows import RECORD, kind_of
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import ByteArray, FloatArray, Mesh
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -112,8 +112,8 @@ class Shard:
         if self.entry.surfaces is None:
             raise FileFormatError(f"{self.name} has no surfaces; {AGAIN}.")
         path = self.entry.surfaces.path(self.root)
-        vertices, faces = _surfaces(path, path.stat().st_mtime_ns).read(kind, at)
-        return Mesh(vertices, faces, name=name)
+        vertices, faces, colours = _surfaces(path, path.stat().st_mtime_ns).read(kind, at)
+        return Mesh(vertices, faces, name=name, colours=colours)
 
     def stages(self, name: str) -> bytes:
         """Return the content of NAME.stages.npz.
@@ -225,13 +225,14 @@ def array_metadata(shape: Sequence[int], chunk: Sequence[int], kind: str) -> dic
         "data_type": kind,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}],
+        # Bytes have no order.
+        "codecs": [{"name": "bytes"} | ({} if kind == "uint8" else {"configuration": {"endian": "little"}})],
         "zarr_format": 3,
         "node_type": "array",
     }
 
 
-_ITEM = {"float32": 4, "float64": 8, "int32": 4}
+_ITEM = {"float32": 4, "float64": 8, "int32": 4, "uint8": 1}
 
 
 @lru_cache(maxsize=_OPEN)
@@ -260,11 +261,14 @@ class _Surfaces:
             if "faces" in self._shapes:
                 self._faces = self._chunk("faces", 0)
 
-    def read(self, kind: str, at: int) -> tuple[FloatArray, npt.NDArray[np.int32] | None]:
-        """Return vertices (V, 3) of row `at`, and the faces."""
+    def read(self, kind: str, at: int) -> tuple[FloatArray, npt.NDArray[np.int32] | None, ByteArray | None]:
+        """Return vertices (V, 3) of row `at`, the faces, and the colours (V, 3) where there are some."""
         with _damage(self._path):
             offsets, origin = self._chunk(kind, at)[0], self._chunk(f"{kind}_origin", 0)[at]
-            return offsets.astype(np.float64) + origin, self._faces
+            # Only what has colours has a chunk there.
+            painted = f"{kind}_colours"
+            colours = self._chunk(painted, at)[0] if f"{painted}/c/{at}/0/0" in self._sizes else None
+            return offsets.astype(np.float64) + origin, self._faces, colours
 
     def _chunk(self, name: str, at: int) -> npt.NDArray[Any]:
         """Return the chunk `at` of an array, which must be in the file with its full size."""

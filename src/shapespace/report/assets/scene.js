@@ -447,7 +447,7 @@
     /**
      * Colour a surface by numbers at its vertices: {map, range, threshold, signal}, or {categories: [[r,g,b], ...]}
      * where they are codes, or {squares: [[r,g,b], ...]} where they are two a vertex: places on a checkerboard.
-     * values null goes back to the plain colour.
+     * {rgb: true} where they are three bytes a vertex, its colour. values null goes back to the plain colour.
      */
     paint(id, values, options) {
       const thing = this._things.get(id);
@@ -459,10 +459,14 @@
         this.request();
         return;
       }
-      const { map = null, range = [0, 1], threshold = null, signal = SIGNAL, unknown = GREY, categories = null, squares = null } = options;
+      const { map = null, range = [0, 1], threshold = null, signal = SIGNAL, unknown = GREY, categories = null, squares = null, rgb = false } = options;
       const attributes = thing.object.geometry.attributes;
       const count = Math.min(values.length, attributes.position.count);
-      if (categories) {
+      if (rgb) {
+        attributes.own.array.set(values.subarray(0, attributes.own.array.length));
+        attributes.own.needsUpdate = true;
+        uniforms.paint.value = 2;
+      } else if (categories) {
         const own = attributes.own.array;
         for (let v = 0; v < count; v++) {
           const colour = categories[values[v]] || unknown;

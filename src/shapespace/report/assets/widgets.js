@@ -304,7 +304,10 @@
           Shapespace.colourBar(bar, { ...scale, keys: [...beyond, ...scale.keys] });
         }
         view.paint("scan", state.map === "scan" ? values() : null, map);
-        if (state.map === "regions") {
+        if (state.map === "colour") {
+          view.paint("scan", arrays.scan_colours, { rgb: true });
+          view.paint("model", arrays[`colours_${state.stage}`] || arrays.colours_final, { rgb: true });
+        } else if (state.map === "regions") {
           view.paint("model", arrays.regions, { categories: REGIONS.map((name) => colours().regions[name]) });
         } else {
           view.paint("model", state.map === "model" ? values() : null, map);
@@ -312,7 +315,7 @@
         bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : "Where scan and model overlap, the nearer one is shown.";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey is what the fit does not follow on the scan." : "Where scan and model overlap, the nearer one is shown.";
         said.hidden = !said.textContent;
       }
 
@@ -377,6 +380,7 @@
         make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, scan.row, model.row),
         select("Colour", [
           ["none", "plain"], ["model", "distance, model to scan"], ["scan", "distance, scan to model"], ["regions", "what the fit used"],
+          ...(arrays.colours_final && arrays.scan_colours ? [["colour", "colour of the scan"]] : []),
         ], state.map, (key) => {
           state.map = key;
           // The coloured surface is seen alone; the sliders bring the other one back.

@@ -74,7 +74,7 @@
       this.limit = facts.scale_mm > 0 ? facts.scale_mm : 1;
       const keep = this.view || {};
       this.view = {
-        stage: "final", moment: null, layout: keep.layout || "overlay", colour: keep.colour || "plain",
+        stage: "final", moment: null, layout: keep.layout || "overlay", colour: keep.colour === "colour" && !arrays.colours_final ? "plain" : keep.colour || "plain",
         scanOpacity: 1, modelOpacity: 1, marked: false, threshold: Math.min(this.limit / 2, 2),
       };
       this._build();
@@ -104,6 +104,7 @@
         this.draw();
       });
       const colours = [["plain", "Plain"], ["model", "Model to scan"], ["scan", "Scan to model"], ["regions", "Regions"]];
+      if (arrays.colours_final && arrays.scan_colours) colours.push(["colour", "Colour of the scan"]);
       this.colourButtons = segments(colours, "Colour", id("colour"), (colour) => {
         this.view.colour = colour;
         if (this.view.moment !== null) Object.assign(this.view, { moment: null, stage: "final" });
@@ -170,7 +171,7 @@
     _opacities() {
       const view = this.view;
       const overlay = view.layout === "overlay";
-      const only = { plain: null, model: "model", regions: "model", scan: "scan" }[view.colour];
+      const only = { plain: null, model: "model", regions: "model", scan: "scan", colour: "model" }[view.colour];
       view.scanOpacity = overlay && only === "model" ? 0 : 1;
       view.modelOpacity = overlay && only === "scan" ? 0 : 1;
     }
@@ -274,6 +275,12 @@
       if (view.colour === "regions") {
         model.paint("model", arrays.regions, { categories: REGION_CODES.map((name) => about.region_colours[name]) });
         stage.legend(REGION_CODES.map((name) => [REGIONS[name], about.region_colours[name]]));
+        return;
+      }
+      if (view.colour === "colour") {
+        stage.a.paint("scan", arrays.scan_colours, { rgb: true });
+        model.paint("model", arrays[`colours_${view.stage}`] || arrays.colours_final, { rgb: true });
+        stage.legend([["not followed on the scan", [0.5, 0.5, 0.5]]]);
         return;
       }
       const onModel = view.colour === "model";

@@ -1,0 +1,131 @@
+"""Pictures that textured surfaces come with, sampled to colours of vertices; read by Pillow, of the extra `report`.
+
+What cannot be read leaves a surface without colours and says so in a note: a fit needs the shape alone.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from shapespace.errors import ShapespaceError
+from shapespace.io.files import read_bytes
+from shapespace.types import ByteArray, FloatArray
+
+LARGEST_FILE_BYTES = 2**28
+"""Pictures in longer files are not read (256 MiB)."""
+
+MOST_PIXELS = 2**26
+"""Pictures with more are not unpacked (8192 times 8192)."""
+
+MOST_PIXELS_IN_ALL = 2**28
+"""All pictures of one surface have no more than these."""
+
+_SIDE = 2048
+_KINDS = ("JPEG", "PNG", "BMP", "TIFF")
+
+
+class TextureError(Exception):
+    """Why a picture gives no colours, as a clause."""
+
+
+def beside(path: Path, name: str, what: str, at_most: int = LARGEST_FILE_BYTES) -> bytes:
+    """Return the content of the file called `name` in the folder of `path` or below it.
+
+    Args:
+        path: of the surface.
+        name: as its file has it.
+        what: the file is, for messages.
+        at_most: bytes; a longer file is not read.
+
+    Raises:
+        TextureError: it lies elsewhere, is not there, or cannot be read.
+    """
+    short = _short(name)
+    folder = path.parent.resolve()
+    try:
+        target = (folder / PurePosixPath(name.replace("\\", "/"))).resolve()
+        if "://" in name or not target.is_relative_to(folder):
+            raise TextureError(f"{what} '{short}' lies outside of its folder, where nothing is read")
+        if not target.is_file():
+            raise TextureError(f"{what} '{short}' is not beside it")
+        return read_bytes(target, at_most)
+    except (ShapespaceError, OSError, ValueError, RuntimeError) as error:
+        raise TextureError(f"{what} '{short}' cannot be read") from error
+
+
+class Pictures:
+    """The pictures of one surface, each unpacked once, and in all no more than `MOST_PIXELS_IN_ALL`."""
+
+    def __init__(self) -> None:
+        self._unpacked: dict[str, ByteArray | TextureError] = {}
+        self._pixels = MOST_PIXELS_IN_ALL
+
+    def sampled(self, name: str, content: Callable[[], bytes], uv: FloatArray) -> ByteArray:
+        """Return the colours (N, 3) of a picture at `uv`, between its pixels linearly.
+
+        Args:
+            name: of the picture, by which it is known again.
+            content: gives the bytes of its JPEG, PNG, BMP or TIFF file.
+            uv: (N, 2) from the lower left corner (0, 0) to the upper right (1, 1); beyond these it repeats.
+
+        Raises:
+            TextureError: no Pillow, or the picture cannot be had, is damaged, of another kind or too large.
+        """
+        if name not in self._unpacked:
+            try:
+                self._unpacked[name] = self._unpack(content(), _short(name))
+            except TextureError as reason:
+                self._unpacked[name] = reason
+        found = self._unpacked[name]
+        if isinstance(found, TextureError):
+            raise found
+        return _between(found, uv)
+
+    def _unpack(self, picture: bytes, name: str) -> ByteArray:
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise TextureError(
+                f"its picture '{name}' is read with Pillow, which pip install 'shapespace[report]' adds"
+            ) from error
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                image = Image.open(io.BytesIO(picture), formats=_KINDS)
+                count = image.width * image.height
+                if count > min(MOST_PIXELS, self._pixels):
+                    raise TextureError(f"its picture '{name}' has {image.width} times {image.height} pixels, too many")
+                self._pixels -= count
+                # Of a JPEG only as much is unpacked as is needed.
+                image.draft("RGB", (_SIDE, _SIDE))
+                image.thumbnail((_SIDE, _SIDE))
+                return np.asarray(image.convert("RGB"))
+        except TextureError:
+            raise
+        except Exception as error:  # a damaged picture may raise anything at all
+            raise TextureError(f"its picture '{name}' is damaged or of a kind that is not read") from error
+
+
+def _short(name: str) -> str:
+    """Return a name out of a file as a terminal may show it."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:80])
+
+
+def _between(pixels: ByteArray, uv: FloatArray) -> ByteArray:
+    height, width = pixels.shape[:2]
+    known = np.where(np.isfinite(uv), uv, 0.0)
+    # 1 is the last pixel and not the first one again.
+    inside = np.where((known >= 0.0) & (known <= 1.0), known, known - np.floor(known))
+    x = np.clip(inside[:, 0] * width - 0.5, 0.0, width - 1.0)
+    y = np.clip((1.0 - inside[:, 1]) * height - 0.5, 0.0, height - 1.0)
+    left, top = x.astype(np.int64), y.astype(np.int64)
+    right, low = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    across, down = (x - left)[:, None], (y - top)[:, None]
+    upper = pixels[top, left] * (1.0 - across) + pixels[top, right] * across
+    lower = pixels[low, left] * (1.0 - across) + pixels[low, right] * across
+    return np.rint(upper * (1.0 - down) + lower * down).astype(np.uint8)
