@@ -51,6 +51,7 @@ MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
 _MOST_WORST = 3
+_VERDICT = "Do not trust this fit: "
 _FEWEST_LEVELS = 2
 _RESERVE_BYTES = 400_000
 
@@ -214,7 +215,10 @@ class FolderPage:
         bad = [fit for fit in self.fits if fit.status != "converged"]
         places = self._details | self._cards
         items: list[str | Item] = [
-            Item(f"{STATUS_WORDS[fit.status]}. {fit.reason}", Cell(fit.name, place=places.get(fit.name)))
+            Item(
+                f"{STATUS_WORDS[fit.status]}. {_without_verdict(fit.reason)}",
+                Cell(fit.name, place=places.get(fit.name)),
+            )
             for fit in bad[:_MOST_NAMED]
         ]
         if len(bad) > _MOST_NAMED:
@@ -228,7 +232,8 @@ class FolderPage:
         if len(good) < 2:
             return []
         told = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
-        return [Text(f"Of the others, these lie farthest from their scans on average: {told}.")]
+        which = "These" if len(good) == len(self.fits) else "Of those with nothing against them, these"
+        return [Text(f"{which} lie farthest from their scans on average: {told}.")]
 
     def curves(self) -> Figure:
         """Return which share of the surface lies within each distance."""
@@ -279,7 +284,7 @@ class FolderPage:
         for fit in self.main:
             made = page.section(
                 f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name],
-                folded=several, status=status(fit.status),
+                folded=several, status=status(fit.status) if several else None,
             )  # fmt: skip
             # Of a single fit, its pictures matter more than its numbers.
             parts.insert(len(parts) if several else 0, made)
@@ -323,12 +328,14 @@ class FolderPage:
         self.page.step(fit.name)
         seen = fit.distance_mm("scan_to_model")
         told = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
+        # The summary has the whole reason of these.
+        named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
         return Card(
             self._cards[fit.name],
             fit.name,
             status(fit.status),
             fit.label if fit.label != fit.name else "",
-            told + fit.reason,
+            told + (_first_reason(fit) if fit.name in named else fit.reason),
             image,
             why,
             self._details.get(fit.name),
@@ -446,6 +453,18 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
     empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
     first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
     return [*first, *rest[: MOST_CARDS - len(first)]]
+
+
+def _without_verdict(reason: str) -> str:
+    """Return a reason without the words that its status says already."""
+    rest = reason.removeprefix(_VERDICT)
+    return rest if rest == reason else rest[:1].upper() + rest[1:]
+
+
+def _first_reason(fit: SavedFit) -> str:
+    """Return the first of the reasons of a fit, and how many there are beside it."""
+    first, *others = _without_verdict(fit.reason).split("; ")
+    return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
 
 
 def _median(values: Sequence[float]) -> float:

@@ -113,10 +113,10 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
                 in_columns(
                     page.figure(
                         figures.modes_figure(model, modes=shown),
-                        f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each "
-                        "point moves at 3. One scale for all rows.",
-                        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard deviations, "
-                        "with maps of the displacement",
+                        f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
+                        "each point moves at 3. One scale for all rows.",
+                        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard "
+                        "deviations, with maps of the displacement",
                     ),
                     page.figure(
                         figures.spectrum_figure(model),

@@ -79,7 +79,7 @@ def _level(name: str, value: object) -> str:
 
 
 def _flat(key: str, values: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """Return settings by `owner.name`, those of a part in the place of the part; the steps have a table of their own."""
+    """Return settings by `owner.name`, those of a part in its place; the steps have a table of their own."""
     out: list[tuple[str, object]] = []
     for name, value in values.items():
         if name == "levels":
