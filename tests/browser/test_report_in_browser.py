@@ -159,10 +159,5 @@ def test_it_prints(open_tab, report: Path, tmp_path: Path) -> None:
 
 def test_the_picture_in_the_readme_is_this_report(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri(), {"width": 1200, "height": 900})
-    widget = tab.page.locator(MAIN_WIDGETS).first
-    widget.scroll_into_view_if_needed()
-    widget.locator("canvas").first.wait_for(state="visible")
-    tab.page.wait_for_timeout(800)
-    tab.page.evaluate("window.scrollTo(0, 0)")
-    tab.page.wait_for_timeout(300)
+    tab.until("[...document.querySelectorAll('.card img')].every(i => i.complete)")
     same_as_kept("report.png", tab.shot("readme"), width=1000)
