@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
-from pages import WICKED, WINDOWS, World
+from pages import PHONE, WICKED, WINDOWS, World
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
@@ -42,8 +42,9 @@ def test_every_figure_is_drawn(open_tab, report: Path, viewport: dict, scheme: s
         widget.scroll_into_view_if_needed()
         canvas = widget.locator("canvas").first
         canvas.wait_for(state="visible")
-        tab.page.wait_for_timeout(400)
-        assert drawn_share(canvas.screenshot()) > 0.005, widget.get_attribute("aria-label")
+        ends = time.monotonic() + 60
+        while drawn_share(canvas.screenshot()) <= 0.005:
+            assert time.monotonic() < ends, widget.get_attribute("aria-label")
     tab.shot(f"{where}-whole", full_page=True)
     assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "it scrolls sideways"
     assert tab.complaints == []
@@ -94,6 +95,7 @@ def test_a_label_that_is_a_script_stays_text(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri())
     assert tab.page.evaluate("window.wicked") is None
     assert "&lt;script&gt;" in report.read_text(encoding="utf-8")
+    tab.page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     for k in range(tab.page.locator(MAIN_WIDGETS).count()):
         tab.page.locator(MAIN_WIDGETS).nth(k).scroll_into_view_if_needed()
         tab.page.wait_for_timeout(300)
@@ -109,7 +111,25 @@ def test_without_script_it_can_still_be_read(open_tab, report: Path) -> None:
     assert "broken" in text
     posters = tab.page.locator("figure.turning .poster img")
     assert posters.count() >= 2
+    tab.page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     assert all(posters.nth(k).is_visible() for k in range(posters.count()))
+    tab.page.mouse.wheel(0, 1500)
+    tab.until("scrollY > 1000")
+    assert tab.page.locator("nav").bounding_box()["y"] == 0
+
+
+def test_the_navigation_stays_and_links_open_what_is_folded(open_tab, report: Path) -> None:
+    tab = open_tab(report.as_uri(), PHONE)
+    tab.page.locator("a", has_text="All pictures of").first.click()
+    assert tab.page.locator("details.part[open] figure.turning").first.is_visible()
+    nav = tab.page.locator("nav")
+    tab.until("document.querySelector('nav [aria-current]').textContent === 'Fits'")
+    assert nav.bounding_box()["y"] == 0
+    last = nav.locator("a").last
+    last.click()
+    tab.until("document.querySelector('nav [aria-current]').textContent === 'Settings'")
+    box = last.bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= PHONE["width"] and nav.bounding_box()["y"] == 0
 
 
 def test_it_can_be_read_by_ear_and_by_keyboard(open_tab, report: Path) -> None:
@@ -139,10 +159,5 @@ def test_it_prints(open_tab, report: Path, tmp_path: Path) -> None:
 
 def test_the_picture_in_the_readme_is_this_report(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri(), {"width": 1200, "height": 900})
-    widget = tab.page.locator(MAIN_WIDGETS).first
-    widget.scroll_into_view_if_needed()
-    widget.locator("canvas").first.wait_for(state="visible")
-    tab.page.wait_for_timeout(800)
-    tab.page.evaluate("window.scrollTo(0, 0)")
-    tab.page.wait_for_timeout(300)
+    tab.until("[...document.querySelectorAll('.card img')].every(i => i.complete)")
     same_as_kept("report.png", tab.shot("readme"), width=1000)

@@ -89,7 +89,8 @@ def ready(tab, part: str = "model"):
 
 
 def view(tab) -> bytes:
-    tab.page.wait_for_timeout(500)  # what is drawn coarsely while it moves is drawn finely at rest
+    # What is drawn coarsely while it moves is drawn finely at rest.
+    tab.until("document.getElementById('loading').hidden && window.shapespaceStage.a.rests")
     return tab.page.get_by_test_id("view").screenshot()
 
 
@@ -97,11 +98,13 @@ def slide(tab, mode: int, value: float) -> None:
     tab.page.get_by_test_id(f"mode-{mode}").evaluate(MOVE, value)
 
 
-def drop(tab, path: Path) -> None:
+def drop(tab, *paths: Path) -> None:
     data = tab.page.evaluate_handle(
-        """([name, content]) => { const t = new DataTransfer();
-        t.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name)); return t; }""",
-        [path.name, base64.b64encode(path.read_bytes()).decode()],
+        """(files) => { const t = new DataTransfer();
+        for (const [name, content] of files) {
+          t.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name));
+        } return t; }""",
+        [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in paths],
     )
     for event in ("dragenter", "dragover", "drop"):
         tab.page.dispatch_event("body", event, {"dataTransfer": data})
@@ -198,7 +201,7 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     assert any("broken" in detail for detail in seen)
     assert not any("Pose and shape stood still" in detail for detail in seen)
     tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
-    tab.page.wait_for_timeout(800)
+    tab.until("document.getElementById('caption-a').textContent.startsWith('holes')")
     told = tab.page.get_by_test_id("fit-detail").get_by_test_id("shown").inner_text()
     assert "mean where the scan shows it" in told and "mean where the model covers it" in told
     shown = view(tab)
@@ -217,7 +220,7 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     tab = ready(open_tab(address))
     drop(tab, world.scan)
     assert verdict(tab) == "converged"
-    tab.page.wait_for_timeout(800)
+    tab.page.get_by_test_id("scan-remove").wait_for()
     assert drawn_share(view(tab)) > 0.1
     tab.shot("verdict")
     assert "mean where the scan shows it" in tab.page.get_by_test_id("verdict").inner_text()
@@ -231,16 +234,37 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     assert tab.complaints == []
 
 
-def test_a_broken_file_gives_one_sentence_and_the_page_goes_on(open_tab, address: str, world: World) -> None:
-    tab = ready(open_tab(address))
-    drop(tab, world.broken)
+def test_of_several_files_a_broken_one_gives_one_sentence_and_the_others_go_on(
+    open_tab, address: str, world: World
+) -> None:
+    tab = ready(open_tab(address), "scan")
+    tab.page.get_by_test_id("dense").check()
+    drop(tab, world.broken, world.scan)
     assert verdict(tab) == "failed"
     said = tab.page.get_by_test_id("scan-status").inner_text()
     assert "broken.ply" in said
     assert "Traceback" not in said
     tab.shot("sentence")
-    drop(tab, world.scan)
+    rows = tab.page.get_by_test_id("own-scan")
+    assert [row.get_attribute("data-name") for row in rows.all()] == ["broken.ply", "plain.ply"]
+    tab.page.locator('[data-testid="own-scan"].converged').wait_for()
+    rows.nth(1).click()
     tab.until("document.querySelector('[data-testid=scan-status]')?.dataset.status === 'converged'")
+    tab.page.get_by_test_id("scan-detail").locator("[data-value=dense]").click()
+    assert "dense surface" in tab.page.get_by_test_id("scan-exported").inner_text()
+    tab.page.get_by_test_id("scan-remove").click()
+    tab.until("!document.querySelector('[data-testid=own-scan]')")
+    assert tab.page.get_by_test_id("scan-status").get_attribute("data-status") == "failed"
+
+
+def test_the_difference_is_told_by_what_it_moves(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    slide(tab, 1, 1.0)
+    tab.page.get_by_test_id("more-modes").click()
+    tab.page.locator("#sliders .mode input[type=range]").last.evaluate(MOVE, 3.0)
+    tab.page.get_by_test_id("tab-compare").click()
+    told = tab.page.get_by_test_id("compare-facts").inner_text()
+    assert "mode 1: it moves" in told and "at +1.00 standard deviations" in told
 
 
 def test_what_is_no_scan_is_refused_in_a_sentence(open_tab, address: str, tmp_path: Path) -> None:
@@ -334,6 +358,17 @@ def test_a_message_covers_nothing_and_goes(open_tab, address: str, tmp_path: Pat
     tab.until("document.querySelector('[data-testid=message]').innerText.includes('does not answer')")
     tab.page.wait_for_timeout(200)
     assert message.is_visible()  # a failure is no success
+
+
+def test_on_a_phone_no_key_covers_the_picture(open_tab, address: str) -> None:
+    tab = ready(open_tab(address, PHONE), "fits")
+    tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
+    for colour, key in (("plain", "legend"), ("regions", "legend"), ("model", "colour-bar")):
+        tab.page.get_by_test_id("fit-detail").locator(f"[data-testid=fit-colour] [data-value={colour}]").click()
+        tab.page.evaluate("scrollTo(0, 0)")
+        below = box(tab.page.get_by_test_id(key))
+        assert below[1] >= box(tab.page.get_by_test_id("view"))[3] - 1
+        assert below[3] <= box(tab.page.get_by_test_id("tab-fits"))[1] + 1
 
 
 def test_the_names_of_files_keep_their_letters(open_tab, address: str) -> None:

@@ -632,3 +632,13 @@ def test_the_smallest_type_is_legible_on_a_phone() -> None:
 
 def test_the_package_loads_no_window_toolkit() -> None:
     assert "pyplot" not in Path(figures.__file__).read_text()
+
+
+@pytest.mark.parametrize(("count", "bars"), [(3, False), (9, False), (10, True)])
+def test_a_few_values_are_dots_and_no_histogram(count: int, bars: bool) -> None:
+    rng = np.random.default_rng(5)
+    scans = [figures.Coefficients(f"{k}", "", 0.0, *2 * (rng.normal(size=2),)) for k in range(count)]
+    matrix = figures.scatter_matrix(scans)
+    assert any(axes.patches for axes in matrix.axes) == bars
+    drawn = sum(len(np.asarray(line.get_xdata())) for axes in matrix.axes for line in axes.lines)
+    assert bars or drawn == 2 * count

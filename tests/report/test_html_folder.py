@@ -39,11 +39,18 @@ def page(fits_template: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_every_part_is_there_in_order_and_none_is_broken(page: str) -> None:
     assert 'class="broken"' not in page
     headings = Page(page).headings
-    wanted = ["6 fits in out", "Summary", "Main figures", "The model", "The fits", "Every fit in numbers"]
-    wanted += ["The fits together", "Settings, versions and hashes"]
+    wanted = ["6 fits in out", "Summary", "The fits", "Every fit in numbers", "charlie in detail"]
+    wanted += ["The fits together", "The model", "Settings, versions and hashes"]
     at = [headings.index(text) for text in wanted]
     assert at == sorted(at)
     assert "Recognition" not in headings
+
+
+def test_details_of_several_fits_are_folded_and_settings_told_in_words(page: str) -> None:
+    parts = re.findall(r'<details class="part"><summary><h3 id="pictures-of-([^"]+)"', page)
+    assert parts[0] == "charlie" and len(parts) == 3
+    words = Page(page).words
+    assert "found from the size of each scan" in words and "at most 4 in each phase" in words
 
 
 def test_headings_go_down_one_level_at_a_time(page: str) -> None:

@@ -64,7 +64,7 @@ def test_the_page_tells_of_all_and_shows_some(folder: Path, few: None, sketched:
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert page.headings[0] == "160 fits in out"
-    wanted = ["Summary", "Distributions", "Farthest from the mean", "Time and site", "Fits to look at"]
+    wanted = ["Summary", "Fits to look at", "Distributions", "Farthest from the mean", "Time and site"]
     at = [page.headings.index(heading) for heading in wanted]
     assert at == sorted(at) and 'class="broken"' not in text
     assert path.stat().st_size < LARGEST_REPORT_BYTES

@@ -82,6 +82,30 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_does(
     assert not list(viewer.root.rglob("upload-*")) and list(viewer.root.rglob("*.fitted.ply"))
 
 
+def test_a_dropped_scan_of_a_format_only_read_is_taken_densely(start: Start, scan_file: Path) -> None:
+    scan = read_mesh(scan_file)
+    assert scan.faces is not None
+    points = ", ".join(" ".join(f"{x:.6f}" for x in point) for point in scan.vertices)
+    faces = ", ".join(f"{a}, {b}, {c}, -1" for a, b, c in scan.faces)
+    text = (
+        f"#VRML V2.0 utf8\nShape {{ geometry IndexedFaceSet {{ coord Coordinate {{ point [ {points} ] }} "
+        f"coordIndex [ {faces} ] }} }}\n"
+    )
+    visitor = start().visitor()
+    assert ".wrl" in visitor.get("/api/about").json()["formats"]
+    answer = visitor.put("/api/scans?name=face.wrl&dense=1", content=text.encode())
+    assert answer.status_code == 201 and answer.json()["dense"]
+    key = answer.json()["id"]
+    assert told(visitor, key)[-2]["pictured"]
+    record = visitor.get(f"/api/scans/{key}/record").json()
+    assert record["config"]["dense"] and "dense" in record["distances_mm"]
+    final, dense = (
+        visitor.post("/api/export?format=ply", json={"scan": key, "stage": stage}).content
+        for stage in ("final", "dense")
+    )
+    assert len(final) > 1000 and len(dense) > 1000 and final != dense
+
+
 def test_two_visitors_do_not_see_each_others_scans(start: Start, scan_file: Path) -> None:
     viewer = start(worker=agrees)
     one, other = viewer.visitor(), viewer.visitor()

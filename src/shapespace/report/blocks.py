@@ -67,11 +67,19 @@ class Table:
         stack: on a phone the cells of a row stand under each other, for tables of long text.
     """
 
+    MOST_OPEN = 14
+    """Rows beyond which a table scrolls within itself."""
+
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     caption: str
     sortable: bool = False
     stack: bool = False
+
+    @property
+    def long(self) -> bool:
+        """Whether it scrolls within itself, under its heads."""
+        return len(self.rows) > self.MOST_OPEN
 
 
 @dataclass(frozen=True)
@@ -224,15 +232,15 @@ class Folded:
 
 @dataclass(frozen=True)
 class Group:
-    """Blocks in two columns, or side by side, where the window has room for them."""
+    """Blocks in two columns, one of the columns, or blocks side by side, where the window has room for them."""
 
-    kind: Literal["columns", "beside"]
+    kind: Literal["columns", "column", "beside"]
     body: Sequence[Block]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page under a heading of `level` 2 to 6, at a place that links lead to."""
+    """A part of the page under a heading of `level` 2 to 6, at a place that links lead to; perhaps folded away."""
 
     heading: str
     place: str
@@ -240,6 +248,9 @@ class Section:
     level: int = 3
     link: str = ""
     """What the navigation calls it."""
+    folded: bool = False
+    status: Cell | None = None
+    """Beside the heading."""
 
 
 Block: TypeAlias = (

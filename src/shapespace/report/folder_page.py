@@ -18,7 +18,6 @@ from shapespace.report.blocks import (
     Card,
     Cell,
     Command,
-    Facts,
     Figure,
     Folded,
     Gallery,
@@ -34,7 +33,8 @@ from shapespace.report.blocks import (
 from shapespace.report.labels import find_labels, labelled
 from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder, SavedFit, model_of, posed, raw_scan, staged_fit
-from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable, setting, words
+from shapespace.report.settings import settings_told
+from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
 from shapespace.schemas import Quality, read
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -45,10 +45,13 @@ if TYPE_CHECKING:
 
 MOST_CARDS = 24
 MOST_EMPTY_CARDS = 6
+MOST_OPEN_CARDS = 6
 MOST_DETAILS = 3
 MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
+_MOST_WORST = 3
+_VERDICT = "Do not trust this fit: "
 _FEWEST_LEVELS = 2
 _RESERVE_BYTES = 400_000
 
@@ -118,13 +121,16 @@ class FolderPage:
         name = self.folder.root.resolve().name
         chapters = [
             Chapter("Summary", self.summary),
-            Chapter("The model", self.model_part, "Model"),
             Chapter("The fits", self.fits_part, "Fits"),
+            Chapter("The fits together", self.together_part, "Together"),
+            Chapter("The model", self.model_part, "Model"),
             Chapter("Settings, versions and hashes", self.settings, "Settings"),
         ]
+        if sum(fit.fitted for fit in self.fits) < 2:
+            del chapters[2]
         if self.recognised:
             found = Chapter("Recognition", lambda: recognition.recognition_section(self.page, self.folder))
-            chapters.insert(3, found)
+            chapters.insert(-2, found)
         lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
         made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
@@ -174,7 +180,8 @@ class FolderPage:
             Tiles(tiles),
             *self.other_models(),
             self.doubts(),
-            self.page.section("Main figures", self.main_figures),
+            *self.worst(),
+            *self.without_stages(),
         ]
 
     def told(self, counts: Mapping[str, int]) -> str:
@@ -208,45 +215,34 @@ class FolderPage:
         bad = [fit for fit in self.fits if fit.status != "converged"]
         places = self._details | self._cards
         items: list[str | Item] = [
-            Item(f"{STATUS_WORDS[fit.status]}. {fit.reason}", Cell(fit.name, place=places.get(fit.name)))
+            Item(
+                f"{STATUS_WORDS[fit.status]}. {_without_verdict(fit.reason)}",
+                Cell(fit.name, place=places.get(fit.name)),
+            )
             for fit in bad[:_MOST_NAMED]
         ]
         if len(bad) > _MOST_NAMED:
             items.append(f"{counted(len(bad) - _MOST_NAMED, 'other')}, in the table of all fits.")
         return Notice("Not to be trusted without a look", items)
 
-    def main_figures(self) -> list[Block]:
-        """Return the main fits side by side, and how near all of them come."""
-        from shapespace.report import figures
-
-        shown, problems = sections.usable(self.main, self.staged)
-        if not shown:
-            return self.without_stages(problems)
-        labels = [f"{fit.name} ({STATUS_WORDS[fit.status]})" for fit in shown]
-        which = (
-            "All fits."
-            if len(shown) == len(self.fits)
-            else "The doubtful fit that needs a look most, and of the others the worst and the median."
-            if any(fit.status == "doubtful" for fit in shown)
-            else "The worst and the median fit."
-        )
-        pictures: list[Block] = [
-            self.page.figure(
-                figures.portrait_figure(shown, labels, title="Raw scans and the model fitted to them"),
-                f"{which} The last column maps the distance from the model to the scan, all rows on one scale.",
-                alt=f"Scan, fitted model, both over each other, and a distance map, for {listed(labels)}",
-            )
-        ]
-        if len(self.fits) > 1:
-            pictures += self.page.tried(self.curves)
-        return [sections.in_columns(*pictures), Notice("Not in the pictures", problems)]
+    def worst(self) -> list[Block]:
+        """Return in a sentence which fits lie farthest from their scans, of those with nothing else against them."""
+        good = [fit for fit in self.fits if fit.status == "converged" and isfinite(fit.distance_mm("model_to_scan"))]
+        far = sorted(good, key=lambda fit: -fit.distance_mm("model_to_scan"))[:_MOST_WORST]
+        if len(good) < 2:
+            return []
+        told = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
+        which = "These" if len(good) == len(self.fits) else "Of those with nothing against them, these"
+        return [Text(f"{which} lie farthest from their scans on average: {told}.")]
 
     def curves(self) -> Figure:
         """Return which share of the surface lies within each distance."""
         from shapespace.report import figures
 
         pictured = [fit for fit in self.fits if fit.pictured]
-        shown, _ = sections.usable(pictured[:MOST_CURVES], self.staged)
+        shown, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
+        if not shown:
+            raise InputError(problems[0] if problems else "The stages of these fits were not saved.")
         some = f" The first {MOST_CURVES} fits of the table." if len(pictured) > MOST_CURVES else ""
         return self.page.figure(
             figures.error_curves(shown),
@@ -256,41 +252,51 @@ class FolderPage:
             chart=True,
         )
 
-    def without_stages(self, problems: Sequence[str]) -> list[Block]:
+    def without_stages(self) -> list[Block]:
         """Return why there are no pictures of the fit itself, and what adds them."""
         fitted = [fit for fit in self.fits if fit.fitted]
         if not fitted:
             return [Text("There is no fit to show.", "broken")]
+        if any(fit.pictured for fit in fitted):
+            return [Notice("Not in the pictures", sections.usable(self.main, self.staged)[1])]
         record = fitted[0].record
         scan = record.scan.path or "SCAN"
         scans = str(Path(scan).parent) if len(fitted) > 1 else scan
-        out: list[Block] = []
-        if not any(fit.pictured for fit in fitted):
-            out = [
-                Text(
-                    "The stages of these fits were not saved, so there are no distance maps, overlays and surfaces to "
-                    "turn; this adds them, run in the folder of the results:"
-                ),
-                Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages --resume"),
-            ]
-        return [*out, Notice("Not in the pictures", problems)]
+        return [
+            Text(
+                "The stages of these fits were not saved, so there are no distance maps, overlays and surfaces to "
+                "turn; this adds them, run in the folder of the results:"
+            ),
+            Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages --resume"),
+        ]
 
     # Fits
 
     def fits_part(self) -> list[Block]:
-        """Return the gallery, the table, the fits together, and the main ones in detail."""
+        """Return the gallery, the table, and the main fits in detail, folded away where there are several."""
         page = self.page
         parts: list[Block] = []
         if self._cards:
             heading = "All fits" if len(self.fits) <= MOST_CARDS else f"The {MOST_CARDS} fits to look at first"
             parts.append(page.section(heading, self.gallery))
         parts.append(page.section("Every fit in numbers", self.numbers))
-        if sum(fit.fitted for fit in self.fits) > 1:
-            parts.append(page.section("The fits together", self.together))
+        several = len(self.fits) > 1
         for fit in self.main:
-            place = self._details[fit.name]
-            parts.append(page.section(f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=place))
+            made = page.section(
+                f"{fit.name} in detail", lambda fit=fit: self.detail(fit), place=self._details[fit.name],
+                folded=several, status=status(fit.status) if several else None,
+            )  # fmt: skip
+            # Of a single fit, its pictures matter more than its numbers.
+            parts.insert(len(parts) if several else 0, made)
         return parts
+
+    def together_part(self) -> list[Block]:
+        """Return how near all fits come, and their coefficients against each other."""
+        curves = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else []
+        coefficients = self.page.tried(self.together)
+        drawn = [block for block in coefficients if isinstance(block, Figure)]
+        rest = [block for block in coefficients if not isinstance(block, Figure)]
+        return [sections.in_columns(*curves, *drawn), *rest]
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
@@ -306,7 +312,11 @@ class FolderPage:
             out.append(Text(more))
         if sample:
             out.append(ScaleKey(limit, self.page.image(stills.colour_bar(), "from blue over pale to red")))
-        return [*out, Gallery([self.card(fit, limit) for fit in self.carded])]
+        cards = [self.card(fit, limit) for fit in self.carded]
+        out.append(Gallery(cards[:MOST_OPEN_CARDS]))
+        if len(cards) > MOST_OPEN_CARDS:
+            out.append(Folded(f"{len(cards) - MOST_OPEN_CARDS} more", [Gallery(cards[MOST_OPEN_CARDS:])]))
+        return out
 
     def card(self, fit: SavedFit, limit_mm: float) -> Card:
         """Return one fit of the gallery, its map on a scale that ends at `limit_mm`."""
@@ -318,12 +328,14 @@ class FolderPage:
         self.page.step(fit.name)
         seen = fit.distance_mm("scan_to_model")
         told = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
+        # The summary has the whole reason of these.
+        named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
         return Card(
             self._cards[fit.name],
             fit.name,
             status(fit.status),
             fit.label if fit.label != fit.name else "",
-            told + fit.reason,
+            told + (_first_reason(fit) if fit.name in named else fit.reason),
             image,
             why,
             self._details.get(fit.name),
@@ -393,7 +405,9 @@ class FolderPage:
         staged = self.staged(fit)
         population = self.others(fit)
         reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
-        return [*sections.fit_facts(fit), *sections.fit_in_full(self.page, staged, population, reserve=reserve)]
+        alone = len(self.fits) == 1
+        pictures = sections.fit_in_full(self.page, staged, population, reserve=reserve, folded=alone)
+        return [*sections.fit_facts(fit), *pictures]
 
     def others(self, fit: SavedFit) -> FloatArray | None:
         """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
@@ -411,17 +425,13 @@ class FolderPage:
         versions = sorted({fit.record.version for fit in self.fits} - {""})
         if versions:
             rows.append(("Fits", f"shapespace {listed(versions)}"))
-        dense = any(config.get("dense") for config in configs)
-        for key in dict.fromkeys(key for config in configs for key in config if dense or key != "dense_settings"):
-            values = list(dict.fromkeys(setting(config.get(key)) for config in configs))
-            rows.append((words(key), values[0] if len(values) == 1 else f"differs: {'; '.join(values[:4])}"))
         files = [
             [fit.name, *(part or DASH for part in (fit.record.scan.name, fit.record.scan.hash, fit.record.model.hash))]
             for fit in self.fits[:MOST_ROWS]
         ]
         heads = ("Fit", "Scan", "Hash of the scan", "Hash of the model")
         hashes = text_table(heads, files, "Content hashes of the files that took part")
-        return [Facts(rows, "Settings and versions"), Folded("Content hashes (SHA-256)", [hashes])]
+        return [*settings_told(configs, rows), Folded("Content hashes (SHA-256)", [hashes])]
 
 
 def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:
@@ -443,6 +453,18 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
     empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
     first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
     return [*first, *rest[: MOST_CARDS - len(first)]]
+
+
+def _without_verdict(reason: str) -> str:
+    """Return a reason without the words that its status says already."""
+    rest = reason.removeprefix(_VERDICT)
+    return rest if rest == reason else rest[:1].upper() + rest[1:]
+
+
+def _first_reason(fit: SavedFit) -> str:
+    """Return the first of the reasons of a fit, and how many there are beside it."""
+    first, *others = _without_verdict(fit.reason).split("; ")
+    return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
 
 
 def _median(values: Sequence[float]) -> float:

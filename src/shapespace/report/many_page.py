@@ -95,10 +95,10 @@ class ManyPage(FolderPage):
         name = self.folder.root.resolve().name
         chapters = [
             Chapter("Summary", self.summary),
+            Chapter("Fits to look at", self.fits_part, "Fits"),
             Chapter("Distributions", self.distributions),
             Chapter("Time and site", self.drift),
             Chapter("The model", self.model_part, "Model"),
-            Chapter("Fits to look at", self.fits_part, "Fits"),
             Chapter("Settings and versions", self.settings, "Settings"),
         ]
         lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
@@ -167,6 +167,7 @@ class ManyPage(FolderPage):
                 *page.tried(self._histograms), *page.tried(self._coefficients), *page.tried(self._density)
             ),
             page.section("Farthest from the mean", self.outliers),
+            Folded("The fits to look at in space, to be turned", self.page.tried(self.together)),
         ]
 
     def _histograms(self) -> Block:

@@ -11,7 +11,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from shapespace.errors import ShapespaceError
-from shapespace.report.blocks import Block, Figure, Image, Section, Text, Turning
+from shapespace.report.blocks import Block, Cell, Figure, Image, Section, Text, Turning
 from shapespace.report.wording import anchor
 
 if TYPE_CHECKING:
@@ -80,10 +80,13 @@ class Page:
         self._anchors.add(name)
         return name
 
-    def section(self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "") -> Section:
+    def section(
+        self, heading: str, make: Make, level: int = 3, place: str | None = None, link: str = "", *,
+        folded: bool = False, status: Cell | None = None,
+    ) -> Section:  # fmt: skip
         """Return a section, or its heading and why it could not be made."""
         place = place or self.place(heading)
-        return Section(heading, place, self.tried(make), level, link or heading)
+        return Section(heading, place, self.tried(make), level, link or heading, folded, status)
 
     def tried(self, make: Make) -> Sequence[Block]:
         """Return what `make` gives, or why it could not."""

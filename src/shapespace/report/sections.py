@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -44,6 +45,8 @@ SCAN_TRIANGLES = 8_000
 
 _From = TypeVar("_From")
 _To = TypeVar("_To")
+_CAPTION_HEIGHT = 0.14
+"""Of a figure, beside its width."""
 _DETAIL_BYTES = 1_300_000
 _VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)
 
@@ -56,9 +59,20 @@ def concern(fit: SavedFit) -> tuple[int, float]:
     return ORDER_OF_CONCERN.index(fit.status), -error if isfinite(error) else 0.0
 
 
-def in_columns(*pictures: Block) -> Group:
-    """Return pictures in two columns where the window has room for them."""
-    return Group("columns", pictures)
+def in_columns(*pictures: Block) -> Block:
+    """Return pictures in two columns of about equal height, each in the order given; a single one as it is."""
+    if len(pictures) < 2:
+        return pictures[0] if pictures else Group("columns", ())
+    tall = np.array([_height(picture) for picture in pictures])
+    right = np.array([(0, *rest) for rest in product((0, 1), repeat=len(pictures) - 1)], dtype=bool)
+    best = right[np.abs(right @ tall - (~right) @ tall).argmin()]
+    sides = [[picture for picture, there in zip(pictures, best, strict=True) if there == side] for side in (0, 1)]
+    return Group("columns", [Group("column", side) for side in sides])
+
+
+def _height(block: Block) -> float:
+    """Return about how high a block is beside its width."""
+    return block.image.size[1] / block.image.size[0] + _CAPTION_HEIGHT if isinstance(block, Figure) else _CAPTION_HEIGHT
 
 
 # The model
@@ -91,27 +105,33 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
     ]
     shown = min(5, model.n_modes)
     return [
-        Facts(rows, "The shape model"),
         modes_to_move(page, model, to_move),
-        in_columns(
-            page.figure(
-                figures.modes_figure(model, modes=shown),
-                f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far each "
-                "point moves at 3. One scale for all rows.",
-                alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard deviations, "
-                "with maps of the displacement",
-            ),
-            page.figure(
-                figures.spectrum_figure(model),
-                "Share of the training set's variance that the first modes hold.",
-                alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
-                chart=True,
-            ),
-            page.figure(
-                figures.mean_figure(model),
-                "The mean shape from three sides" + (", with the model's landmarks." if model.landmarks else "."),
-                alt="The mean shape from three sides",
-            ),
+        Facts(rows, "The shape model"),
+        Folded(
+            "Its modes as stills, their variance, the mean from three sides",
+            [
+                in_columns(
+                    page.figure(
+                        figures.modes_figure(model, modes=shown),
+                        f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
+                        "each point moves at 3. One scale for all rows.",
+                        alt=f"Mean shape and the first {counted(shown, 'mode')} at minus and plus three standard "
+                        "deviations, with maps of the displacement",
+                    ),
+                    page.figure(
+                        figures.spectrum_figure(model),
+                        "Share of the training set's variance that the first modes hold.",
+                        alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
+                        chart=True,
+                    ),
+                    page.figure(
+                        figures.mean_figure(model),
+                        "The mean shape from three sides"
+                        + (", with the model's landmarks." if model.landmarks else "."),
+                        alt="The mean shape from three sides",
+                    ),
+                )
+            ],
         ),
     ]
 
@@ -154,7 +174,13 @@ def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
 
 
 def fit_in_full(
-    page: Page, fit: StagedFit, population: FloatArray | None = None, *, reserve: int = 0, of_paper: bool = False
+    page: Page,
+    fit: StagedFit,
+    population: FloatArray | None = None,
+    *,
+    reserve: int = 0,
+    of_paper: bool = False,
+    folded: bool = False,
 ) -> list[Block]:
     """Return one fit to turn and every picture of it, as far as the file's size allows.
 
@@ -164,11 +190,14 @@ def fit_in_full(
         population: (N, K) coefficients of others in standard deviations, or None.
         reserve: bytes of the page that are kept free.
         of_paper: whether captions name the figures of the paper.
+        folded: whether all but what turns is folded away.
     """
     if page.left < _DETAIL_BYTES + reserve:
         return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
     turning = page.tried(lambda: fit_to_turn(page, fit))
-    return [*turning, fit_pictures(page, fit, population, of_paper=of_paper)]
+    pictures = fit_pictures(page, fit, population, of_paper=of_paper)
+    told = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
+    return [*turning, Folded(told, [pictures]) if folded else pictures]
 
 
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
@@ -207,7 +236,7 @@ def share_within(fit: StagedFit, limit_mm: float) -> str:
     return percent(float((known <= limit_mm).mean())) if len(known) else "none"
 
 
-def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Group:
+def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
     """Return every picture of one fit, as `fit_in_full` has them."""
     from shapespace.report import figures
 
@@ -342,7 +371,7 @@ def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
     )
     if any(len(point.b) < 3 for point in points):
         return [matrix]
-    return [matrix, *page.tried(lambda: scatter_to_turn(page, points))]
+    return [matrix, Folded("The same in space, to be turned", page.tried(lambda: scatter_to_turn(page, points)))]
 
 
 def lines_through_neutral(

@@ -56,6 +56,7 @@ class Upload:
         model: the model's file.
         model_name: the model's name, for the record.
         landmarks: points to start from, or None.
+        dense: whether the surface is then taken the rest of the way to the scan.
     """
 
     scan: Path
@@ -64,6 +65,7 @@ class Upload:
     model: Path
     model_name: str
     landmarks: Path | None = None
+    dense: bool = False
 
 
 Worker: TypeAlias = Callable[[Connection, Upload], None]
@@ -100,8 +102,8 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
     # A file that cannot be shown cannot be fitted either, and the record says why.
     with contextlib.suppress(ShapespaceError, MemoryError):
         tell("scan", **_preview(model, upload))
-    job = Job(NAME, upload.scan, upload.landmarks)
-    record = fit_file(job, model, upload.model, upload.folder, FitConfig(), stages=True, on_state=on_state)
+    job, config = Job(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
+    record = fit_file(job, model, upload.model, upload.folder, config, stages=True, on_state=on_state)
     for key, name in (("scan", upload.shown), ("model", upload.model_name)):
         # Our own names and folders mean nothing to the visitor.
         record[key] |= {"name": name, "path": ""}

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp
 from shapespace.errors import FileError
 from shapespace.io.files import read_bytes
 from shapespace.io.landmarks import write_landmarks
-from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
+from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.report import colours
 from shapespace.schemas import to_json
 from shapespace.types import Mesh
@@ -157,7 +157,9 @@ class _Viewer:
                 "landmarks": list(model.landmarks),
                 "has_fits": self._shown.folder is not None,
                 "upload_bytes": limits.upload_bytes,
-                "formats": list(MESH_FORMATS),
+                "unfinished": limits.unfinished,
+                "kept": limits.kept,
+                "formats": list(MESH_ENDINGS),
                 "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
                 "sequential": colours.as_list(colours.SEQUENTIAL),
                 "diverging": colours.as_list(colours.DIVERGING),
@@ -202,17 +204,18 @@ class _Viewer:
             return read_bytes(path)
 
     def _asked_mesh(self, question: Mapping[str, Any], session: Session | None) -> Mesh:
-        fit, key = question.get("fit"), question.get("scan")
+        fit, key, dense = question.get("fit"), question.get("scan"), question.get("stage") == "dense"
         if isinstance(fit, str):
             try:
-                return self._shown.fitted_mesh(fit)
+                return self._shown.fitted_mesh(fit, dense=dense)
             except KeyError:
                 raise HTTPException(404, "There is no such fit.") from None
         if isinstance(key, str):
             scan = session.scans.get(key) if session else None
-            if scan is None or not (scan.folder / f"{NAME}.fitted.ply").is_file():
+            surface = None if scan is None else scan.folder / f"{NAME}.{'dense' if dense else 'fitted'}.ply"
+            if surface is None or not surface.is_file():
                 raise HTTPException(404, _NO_SCAN)
-            return read_mesh(scan.folder / f"{NAME}.fitted.ply")
+            return read_mesh(surface)
         z = question.get("z")
         if not _numbers(z):
             raise HTTPException(400, "An export needs z, a list of numbers in standard deviations.")
@@ -227,8 +230,8 @@ class _Viewer:
         limits = self._sessions.limits
         name = _shown_name(request.query_params.get("name", ""))
         ending = Path(name).suffix.lower()
-        if ending not in MESH_FORMATS:
-            raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_FORMATS)}.")
+        if ending not in MESH_ENDINGS:
+            raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_ENDINGS)}.")
         if session.unfinished() >= limits.unfinished:
             raise HTTPException(
                 429, f"{limits.unfinished} of your scans are being fitted or wait for it; wait for one, or stop one."
@@ -253,7 +256,7 @@ class _Viewer:
             size = await self._receive(request, path, too_large)
             if self._sessions.find(session.key) is None:
                 raise HTTPException(403, _NO_SESSION)
-            scan = self._sessions.add(session, name, folder, path, size)
+            scan = self._sessions.add(session, name, folder, path, size, dense=request.query_params.get("dense") == "1")
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise

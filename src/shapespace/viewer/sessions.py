@@ -16,6 +16,7 @@ from typing import Any
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, Upload, Worker, converse, fit_upload
 from shapespace.viewer.limits import Limits
 
+_RESULTS = ("fit.json", "fitted.ply", "dense.ply", "stages.npz")
 _HELPED_BY_LANDMARKS = ("doubtful", "failed", "max_iterations")
 
 
@@ -25,12 +26,13 @@ class DroppedScan:
     All of it is touched by the server's event loop alone, except `stop`.
     """
 
-    def __init__(self, key: str, name: str, folder: Path, upload: Path, size: int) -> None:
+    def __init__(self, key: str, name: str, folder: Path, upload: Path, size: int, *, dense: bool = False) -> None:
         self.key = key
         self.name = name
         self.folder = folder
         self.upload: Path | None = upload
         self.size = size
+        self.dense = dense
         self.state = "waiting"
         self.run = 0
         self.gone = False
@@ -47,7 +49,13 @@ class DroppedScan:
 
     def facts(self) -> dict[str, Any]:
         """Return what the list of a visitor's scans says of it."""
-        return {"id": self.key, "name": self.name, "state": self.state, "can_place_landmarks": self.upload is not None}
+        return {
+            "id": self.key,
+            "name": self.name,
+            "state": self.state,
+            "dense": self.dense,
+            "can_place_landmarks": self.upload is not None,
+        }
 
     def start_over(self) -> None:
         """Forget an earlier fit of the same scan."""
@@ -56,7 +64,7 @@ class DroppedScan:
         self.stop = threading.Event()
         self.events = []
         self._unwatched_since = time.monotonic()
-        for name in (PREVIEW, PICTURE, f"{NAME}.fit.json", f"{NAME}.fitted.ply", f"{NAME}.stages.npz"):
+        for name in (PREVIEW, PICTURE, *(f"{NAME}.{kind}" for kind in _RESULTS)):
             (self.folder / name).unlink(missing_ok=True)
 
     def tell(self, message: Message) -> None:
@@ -176,9 +184,11 @@ class Sessions:
         folder.mkdir(mode=0o700)
         return folder
 
-    def add(self, session: Session, name: str, folder: Path, upload: Path, size: int) -> DroppedScan:
+    def add(
+        self, session: Session, name: str, folder: Path, upload: Path, size: int, *, dense: bool = False
+    ) -> DroppedScan:
         """Take a scan of `size` bytes that lies in `folder`, and put its fit into the queue."""
-        scan = DroppedScan(folder.name, name, folder, upload, size)
+        scan = DroppedScan(folder.name, name, folder, upload, size, dense=dense)
         session.scans[scan.key] = scan
         finished = [old for old in session.scans.values() if old.finished]
         for old in finished[: max(0, len(session.scans) - self.limits.kept)]:
@@ -237,7 +247,7 @@ class Sessions:
 
     def _queue(self, scan: DroppedScan, landmarks: Path | None) -> None:
         assert scan.upload is not None
-        upload = Upload(scan.upload, scan.name, scan.folder, self._model, self._model_name, landmarks)
+        upload = Upload(scan.upload, scan.name, scan.folder, self._model, self._model_name, landmarks, scan.dense)
         self._waiting.append(scan)
         self._tell_positions()
         stop, loop = scan.stop, asyncio.get_running_loop()

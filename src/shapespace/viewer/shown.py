@@ -134,8 +134,8 @@ class Shown:
         self.fits()
         return self._picture(name)
 
-    def fitted_mesh(self, name: str) -> Mesh:
-        """Return the fitted surface of the fit `name`, in the frame and unit of its scan.
+    def fitted_mesh(self, name: str, *, dense: bool = False) -> Mesh:
+        """Return the fitted surface of the fit `name`, or its dense one, in the frame and unit of its scan.
 
         Raises:
             FileError: it cannot be read.
@@ -145,7 +145,7 @@ class Shown:
         fit = self.fits()[name]
         assert self.folder is not None
         with _as_damaged(name):
-            return self.folder.mesh(fit.entry.fitted)
+            return self.folder.mesh(fit.entry.dense if dense else fit.entry.fitted)
 
     def _packed_fit(self, name: str) -> bytes:
         assert self.folder is not None

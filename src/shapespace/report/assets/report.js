@@ -111,6 +111,34 @@
   window.addEventListener("resize", tellWide);
   document.addEventListener("toggle", tellWide, true);
 
+  // What an address or a link leads to is opened where it is folded away.
+  function unfold() {
+    const target = document.getElementById(decodeURIComponent(window.location.hash.slice(1)));
+    for (let part = target; part; part = part.parentElement) if (part.tagName === "DETAILS") part.open = true;
+    if (target && target.closest("details")) target.scrollIntoView();
+  }
+  window.addEventListener("hashchange", unfold);
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest && event.target.closest("a[href^='#']");
+    if (link && link.getAttribute("href") === window.location.hash) unfold();
+  });
+  unfold();
+
+  // The navigation stays by itself; here it says which part is read.
+  const links = Array.from(document.querySelectorAll("nav a"));
+  function tellWhere() {
+    const below = links.findIndex((link) => document.getElementById(link.hash.slice(1)).getBoundingClientRect().top > 120);
+    const end = window.innerHeight + window.scrollY >= document.documentElement.scrollHeight - 4;
+    const at = end || below < 0 ? links.length - 1 : Math.max(0, below - 1);
+    links.forEach((link, k) => {
+      if ((k === at) === link.hasAttribute("aria-current")) return;
+      link.toggleAttribute("aria-current", k === at);
+      if (k === at) link.closest("ul").scrollLeft = link.offsetLeft - 60;
+    });
+  }
+  window.addEventListener("scroll", tellWhere, { passive: true });
+  tellWhere();
+
   // Paper has no folds.
   let folded = [];
   window.addEventListener("beforeprint", () => {

@@ -680,6 +680,11 @@
       if (!scheduled) scheduled = requestAnimationFrame(flush);
     }
 
+    /** Whether what is seen is final: nothing waits to be drawn, or to be drawn finer. */
+    get rests() {
+      return !waiting.has(this) && !this._later;
+    }
+
     /** Draw at once as while something moves, wait until the picture is there, and return the milliseconds it took. */
     redraw() {
       if (!this.works) return NaN;
@@ -692,6 +697,7 @@
       const page = gpu();
       waiting.delete(this);
       clearTimeout(this._later);
+      this._later = 0;
       if (!page || page.lost || this._disposed || !(this._near || wait)) return;
       const area = this._frame.clientWidth * this._frame.clientHeight;
       if (!area) return;
@@ -699,7 +705,10 @@
       if (page.bySoftware) {
         // What moves is drawn coarser, and again at twice the resolution once it rests.
         ratio = Math.min(ratio, Math.max(Math.sqrt(DRAFT_PIXELS / area), 0.5));
-        this._later = setTimeout(() => this._near && this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area))), RESTS_MS);
+        this._later = setTimeout(() => {
+          this._later = 0;
+          if (this._near) this._present(Math.min(2, Math.sqrt(STILL_PIXELS / area)));
+        }, RESTS_MS);
       }
       this._present(ratio, wait);
     }

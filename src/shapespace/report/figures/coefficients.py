@@ -14,6 +14,7 @@ from shapespace.errors import InputError
 from shapespace.report.colours import CATEGORIES, MODEL_COLOUR
 from shapespace.report.figures.draw import (
     DPI,
+    FEWEST_BINNED,
     GREY,
     INK,
     SMALL,
@@ -296,7 +297,12 @@ def _handles(
 
 
 def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
-    """Draw how `values` (n,) are spread, the labels on top of each other."""
+    """Draw how `values` (n,) are spread, the labels on top of each other; a few of them as dots."""
+    if len(values) < FEWEST_BINNED:
+        for _, look, at in groups:
+            axes.plot(values[at], np.full(len(at), 0.5), ls="", ms=8, alpha=0.8, clip_on=False, **look)
+        axes.set_ylim(0, 1)
+        return
     edges = np.linspace(*_limits(values), min(max(8, round(len(values) ** 0.5) + 4), 24))
     parts, colours = [values[at] for _, _, at in groups], [look["color"] for _, look, _ in groups]
     axes.hist(parts, edges.tolist(), stacked=True, color=colours)

@@ -54,6 +54,8 @@ FORWARD, BACKWARD = "#0072B2", "#D55E00"
 WIDTH, DPI = 960, 160
 TITLE, TEXT, SMALL = 12.0, 11.0, 9.5
 MOST_PANELS = 48
+FEWEST_BINNED = 10
+"""Values of which a histogram tells something; fewer are drawn one by one."""
 _GAP, _EDGE = 8, 4
 _MOST_LINES = 4
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22

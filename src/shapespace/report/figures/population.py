@@ -15,6 +15,7 @@ from shapespace.errors import InputError
 from shapespace.report.colours import CATEGORIES, SEQUENTIAL
 from shapespace.report.figures.draw import (
     BACKWARD,
+    FEWEST_BINNED,
     FORWARD,
     GREY,
     INK,
@@ -61,9 +62,14 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         low = 0.0 if low < 0.5 * high else low
         edges = np.linspace(low if high > low else high - 1.0, high, _BINS + 1)
         parts = [np.clip(far[known & which], edges[0], edges[-1]) for which in (trusted, ~trusted)]
-        axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
+        if known.sum() < FEWEST_BINNED:
+            for part, colour, label in zip(parts, (FORWARD, BACKWARD), ("converged", "others"), strict=True):
+                axes.plot(part, np.full(len(part), 0.5), "o", color=colour, ms=8, alpha=0.8, clip_on=False, label=label)
+            axes.set(ylim=(0, 1), yticks=[])
+        else:
+            axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
+            axes.set_ylabel("fits")
         axes.set_xlabel(_wrapped(name))
-        axes.set_ylabel("fits")
         axes.set_xlim(edges[0], edges[-1])
         middle = float(np.median(far[known & trusted])) if (known & trusted).any() else np.nan
         if np.isfinite(middle):

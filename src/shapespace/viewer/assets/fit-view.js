@@ -134,19 +134,25 @@
       this.rms = h("div", { class: "chart" });
       this.steps = this.n > 1 ? h("div", {}, h("h2", {}, "Iterations"), this.moments.row, h("div", { class: "row" }, this.play), this.rms) : null;
       this.bars = h("div", { class: "chart" });
+      this.exported = h("h2", { "data-testid": id("exported") });
       const kinds = this.context.about.exports;
       const exports = h("div", { class: "row" },
         ...kinds.map((kind) => h("button", {
-          type: "button", "data-testid": id(`export-${kind}`), onclick: () => this.context.download(this.source, kind, `${facts.name}.fitted`),
+          type: "button", "data-testid": id(`export-${kind}`), onclick: () => this._surface(kind),
         }, `Surface ${kind.toUpperCase()}`)),
         h("button", { type: "button", "data-testid": id("export-csv"), onclick: () => this._csv() }, "Coefficients CSV"),
         h("button", { type: "button", "data-testid": id("use"), onclick: () => this.context.apply(this._z(), facts.label || facts.name) }, "Use in Model"));
       this.element.replaceChildren(
         ...[h("h2", {}, "Stage"), this.stageButtons, h("h2", {}, "Show"), this.layoutButtons, this.colourButtons,
-          this.scanSlider.row, this.modelSlider.row, this.mapControls, this.steps, this.bars, h("h2", {}, "Export"), exports].filter(Boolean));
+          this.scanSlider.row, this.modelSlider.row, this.mapControls, this.steps, this.bars, this.exported, exports].filter(Boolean));
       if (this.steps) Viewer.rmsChart(this.rms, Array.from(arrays.history_rms_mm), Array.from(arrays.history_phase), null);
       const error = Array.from(arrays.b_stddev, (sd, k) => sd / (k < this.stddev.length ? this.stddev[k] : NaN));
       Viewer.coefficientChart(this.bars, [{ z: this._z(), error }], this.K);
+    }
+
+    _surface(kind) {
+      const dense = this.view.stage === "dense";
+      this.context.download({ ...this.source, stage: dense ? "dense" : "final" }, kind, `${this.payload.facts.name}.${dense ? "dense" : "fitted"}`);
     }
 
     _z() {
@@ -299,6 +305,7 @@
       const { view } = this, { arrays } = this.payload;
       press(this.stageButtons, view.moment === null ? view.stage : "");
       press(this.layoutButtons, view.layout);
+      this.exported.textContent = view.stage === "dense" ? "Export the dense surface" : "Export the fitted surface";
       press(this.colourButtons, view.colour);
       for (const [slider, value] of [[this.scanSlider, view.scanOpacity], [this.modelSlider, view.modelOpacity]]) {
         slider.input.value = value;

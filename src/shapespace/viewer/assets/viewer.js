@@ -23,8 +23,8 @@
   let shown = "model";
 
   const download = guarded(async (question, kind, name) => {
-    const { fit, scan, z: shape } = question;
-    const asked = fit !== undefined ? { fit } : scan !== undefined ? { scan } : { z: Array.from(shape) };
+    const { fit, scan, stage: at, z: shape } = question;
+    const asked = fit !== undefined ? { fit, stage: at } : scan !== undefined ? { scan, stage: at } : { z: Array.from(shape) };
     const answer = await ask(`/api/export?format=${kind}`, post(asked));
     save(await answer.blob(), `${name.replace(/[^\w.-]+/g, "_").replace(/\.(ply|obj|stl|off|vtk|vtp|glb|gltf)(?=\.|$)/i, "")}.${kind}`);
   });
@@ -332,13 +332,14 @@
     stage.captions(t === 0 ? a.name : t === 1 ? b.name : `${Math.round(100 * t)} % of the way to ${b.name}`);
     if (!changed) return;
     const steps = za.map((value, k) => zb[k] - value);
-    let mm = 0;
-    for (let k = 0; k < model.K; k++) mm += (steps[k] * stddev[k]) ** 2;
-    const most = steps.reduce((best, value, k) => (Math.abs(value) > Math.abs(steps[best]) ? k : best), 0);
+    // By what it moves on the surface: a faint mode may be many standard deviations off and move nothing.
+    const moved = Float64Array.from(steps, (value, k) => Math.abs(value * stddev[k]) / Math.sqrt(model.V));
+    const apart = Math.hypot(...moved);
+    const most = moved.reduce((best, value, k) => (value > moved[best] ? k : best), 0);
     const facts = [
-      ["Apart", `${Math.hypot(...steps).toFixed(2)} standard deviations`],
-      ["", `${Math.sqrt(mm / model.V).toFixed(2)} mm (RMS over the vertices)`],
-      ["Most in", steps[most] ? `mode ${most + 1}, ${sign(steps[most])} standard deviations` : "no mode; they are equal"],
+      ["Apart", `${apart.toFixed(2)} mm (RMS over the vertices)`],
+      ["", `${Math.hypot(...steps).toFixed(2)} standard deviations`],
+      ["Most in", apart > 0 ? `mode ${most + 1}: it moves ${moved[most].toFixed(2)} mm, at ${sign(steps[most])} standard deviations` : "no mode; they are equal"],
     ];
     $("compare-facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
     Viewer.coefficientChart($("compare-chart"), [{ z: Array.from(za), name: "from" }, { z: Array.from(zb), name: "to" }], K);
@@ -562,52 +563,89 @@
 
   // Your scan -------------------------------------------------------------------------------------------------------
 
-  let own = null; // {id, name, states, preview, origin, unit, verdict, placing}
-  let stream = null;
-  const scansHere = new Map(); // id -> name
+  let own = null; // the one that is looked at
+  const dropped = []; // all of this visit: {id, name, file, dense, states, preview, said, verdict, placing, ...}
+  let sending = false;
+
+  const fresh = () => ({ states: [], preview: null, previewed: false, said: null, verdict: null, helped: false, placing: null, frame: null });
 
   function suits(name) {
     const ending = (/\.[^.]+$/.exec(name.toLowerCase()) || [""])[0];
     return about.formats.includes(ending);
   }
 
-  const dropFile = guarded(async (file) => {
+  const dropFiles = guarded(async (files) => {
     show("scan");
-    if (/\.csv$/i.test(file.name)) { await readCsv(file); return; }
-    if (!suits(file.name)) throw new Error(`${file.name} is not a scan that can be read; drop ${about.formats.join(", ")}.`);
-    if (file.size > about.upload_bytes) {
-      throw new Error(`${file.name} is larger than the ${Math.round(about.upload_bytes / 2 ** 20)} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
+    const refused = [], taken = [];
+    for (const file of files) {
+      if (/\.csv$/i.test(file.name)) await readCsv(file);
+      else if (!suits(file.name)) refused.push(`${file.name} is not a scan that can be read; drop ${about.formats.join(", ")}.`);
+      else if (file.size > about.upload_bytes) {
+        refused.push(`${file.name} is larger than the ${Math.round(about.upload_bytes / 2 ** 20)} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
+      } else if (taken.length < about.kept) taken.push(file);
+      else refused.push(`${file.name} is left out, for ${about.kept} scans are kept at a time; fit more with shapespace fit.`);
     }
-    beginScan({ id: null, name: file.name });
-    progress(`Sending ${file.name}`, 0);
+    const records = taken.map((file) => ({ id: null, name: file.name, file, dense: $("dense").checked, ...fresh() }));
+    dropped.push(...records);
+    for (const mine of records) say(mine, "Waits to be sent", null);
+    if (records.length) look(records[0]);
+    sendNext();
+    if (refused.length) throw new Error(refused.length > 2 ? `${refused[0]} So are ${refused.length - 1} others.` : refused.join(" "));
+  });
+
+  const unfinished = () => dropped.filter((one) => one.id && !one.done).length;
+
+  /** Send what waits, one after another, as many as may be fitted at once; the end of a fit calls again. */
+  const sendNext = telling(async () => {
+    if (sending) return;
+    sending = true;
     try {
-      const facts = await upload(file);
-      scansHere.set(facts.id, facts.name);
-      own.id = facts.id;
-      own.name = facts.name;
+      for (;;) {
+        const mine = dropped.find((one) => one.file);
+        if (!mine || unfinished() >= about.unfinished) return;
+        const { file } = mine;
+        try {
+          const facts = await upload(mine, file);
+          Object.assign(mine, { id: facts.id, name: facts.name, file: null });
+        } catch (error) {
+          drop(mine);
+          throw error;
+        }
+        // The oldest goes where there are too many, and the server decides which.
+        const kept = new Set((await json("/api/scans")).map((scan) => scan.id));
+        dropped.filter((one) => one.id && !kept.has(one.id)).forEach(drop);
+        if (dropped.includes(mine)) follow(mine);
+      }
+    } finally {
+      sending = false;
       listScans();
-      follow();
-    } catch (error) {
-      $("progress").hidden = true;
-      throw error;
     }
   });
 
   /** PUT with progress, which fetch does not tell. */
-  function upload(file) {
+  function upload(mine, file) {
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest();
-      request.open("PUT", `/api/scans?name=${encodeURIComponent(file.name)}`);
+      request.open("PUT", `/api/scans?name=${encodeURIComponent(file.name)}&dense=${mine.dense ? 1 : 0}`);
       request.responseType = "json";
-      request.upload.onprogress = (event) => { if (event.lengthComputable) progress(`Sending ${file.name}`, event.loaded / event.total); };
+      request.upload.onprogress = (event) => { if (event.lengthComputable) say(mine, `Sending ${file.name}`, event.loaded / event.total); };
       request.onerror = () => reject(new Error(`${file.name} could not be sent; see whether shapespace view still runs, and try again.`));
       request.onload = () => {
         const told = request.response || {};
         if (request.status === 201) resolve(told);
         else reject(new Error(told.error || `The server answered with the error ${request.status}; reload the page.`));
       };
+      say(mine, `Sending ${file.name}`, 0);
       request.send(file);
     });
+  }
+
+  /** Say how far a scan is: in full where it is looked at, shortly in the list. */
+  function say(mine, text, part) {
+    mine.said = { text, part };
+    if (own === mine) progress(text, part);
+    const row = mine.row && mine.row.lastElementChild;
+    if (row) row.textContent = stateOf(mine);
   }
 
   function progress(text, part) {
@@ -618,56 +656,74 @@
     else $("progress-bar").value = part;
   }
 
-  function beginScan({ id, name }) {
-    if (stream) stream.close();
-    own = { id, name, states: [], preview: null, verdict: null, placing: null, frame: null };
+  /** Look at one of the dropped scans, wherever its fit is. */
+  function look(mine) {
+    if (own && own !== mine) own.placing = null;
+    own = mine;
+    $("scan-detail").hidden = false;
     scanView.clear();
-    $("verdict").hidden = true;
-    $("placing").hidden = true;
+    for (const part of ["verdict", "placing", "progress"]) $(part).hidden = true;
     $("progress-chart").replaceChildren();
     $("zone").classList.add("compact");
-    if (shown === "scan") { stage.clear(); stage.split(false); }
+    if (shown === "scan") { stage.clear(); stage.split(false); scanView.active = true; }
+    listScans();
+    if (mine.verdict) telling(async () => { await showVerdict(mine); if (own === mine && mine.helped) offerLandmarks(mine); })();
+    else {
+      if (mine.said) progress(mine.said.text, mine.said.part);
+      telling(drawPreview)(mine);
+    }
   }
 
-  function follow() {
-    const mine = own;
-    stream = new EventSource(`/api/scans/${mine.id}/events`);
-    const source = stream;
+  async function drawPreview(mine) {
+    if (mine.previewed && !mine.preview) mine.preview = await binary(`/api/scans/${mine.id}/preview`);
+    if (own === mine && mine.preview && !mine.verdict) drawScanStates();
+  }
+
+  function follow(mine) {
+    const source = new EventSource(`/api/scans/${mine.id}/events`);
+    mine.source = source;
+    mine.done = false;
     let scheduled = 0;
     source.onmessage = telling(async (event) => {
-      if (own !== mine) { source.close(); return; }
       const told = JSON.parse(event.data);
-      if (told.event === "queue") progress(told.position > 1 ? `Waiting: ${told.position - 1} before it` : "Waiting for a free place", null);
-      else if (told.event === "started") progress("Reading the scan", null);
+      if (told.event === "queue") say(mine, told.position > 1 ? `Waiting: ${told.position - 1} before it` : "Waiting for a free place", null);
+      else if (told.event === "started") say(mine, "Reading the scan", null);
       else if (told.event === "scan") {
-        Object.assign(mine, { origin: told.origin, unit: told.mm_per_scan_unit });
-        progress(`${told.vertices.toLocaleString("en")} vertices; looking for a place to start`, null);
-        mine.preview = await binary(`/api/scans/${mine.id}/preview`);
-        if (own === mine && !mine.verdict) drawScanStates();
+        Object.assign(mine, { origin: told.origin, unit: told.mm_per_scan_unit, previewed: true });
+        say(mine, `${told.vertices.toLocaleString("en")} vertices; looking for a place to start`, null);
+        if (own === mine) await drawPreview(mine);
       } else if (told.event === "state") {
         mine.states.push(told);
-        if (!scheduled) scheduled = requestAnimationFrame(() => { scheduled = 0; if (own === mine && !mine.verdict) tellState(); });
+        if (!scheduled) scheduled = requestAnimationFrame(() => { scheduled = 0; if (!mine.verdict) tellState(mine); });
       } else if (told.event === "verdict") {
         mine.verdict = told;
-        await showVerdict(mine);
+        if (told.b) {
+          shapes.set(`scan ${mine.id}`, { name: mine.name, z: told.z });
+          fillChoices();
+        }
+        listScans();
+        if (own === mine) await showVerdict(mine);
       } else if (told.event === "done") {
         source.close();
-        $("progress").hidden = true;
-        mine.helped = told.can_place_landmarks;
-        if (told.can_place_landmarks) offerLandmarks(mine);
+        Object.assign(mine, { done: true, helped: told.can_place_landmarks });
+        if (own === mine) {
+          $("progress").hidden = true;
+          if (mine.helped && !mine.placing) offerLandmarks(mine);
+        }
+        sendNext();
       } else if (told.event === "removed") source.close();
     });
     source.onerror = () => {
       // The browser tries again by itself; what matters is whether there is still a server, and still this scan.
       setTimeout(telling(async () => {
-        if (own !== mine || mine.verdict) return;
+        if (mine.source !== source || mine.verdict) return;
         let known = null;
         try {
           known = (await json("/api/scans")).some((scan) => scan.id === mine.id);
         } finally {
           if (!known) {
             source.close();
-            $("progress").hidden = true;
+            if (own === mine) $("progress").hidden = true;
           }
         }
         if (!known) throw new Error("The visit has ended, and its scans were removed; reload the page.");
@@ -675,14 +731,15 @@
     };
   }
 
-  function tellState() {
-    const last = own.states[own.states.length - 1];
+  function tellState(mine) {
+    const last = mine.states[mine.states.length - 1];
     const what = last.phase === 1 ? "Finding the pose" : "Fitting pose and shape";
-    progress(`${what}: iteration ${last.iteration}, RMS ${last.rms_mm.toFixed(2)} mm`, null);
-    clearTimeout(own.quiet);
-    const mine = own;
-    own.quiet = setTimeout(() => { if (own === mine && !mine.verdict) progress("Checking whether the fit can be trusted", null); }, 700);
-    Viewer.rmsChart($("progress-chart"), own.states.map((s) => s.rms_mm), own.states.map((s) => s.phase), null);
+    say(mine, `${what}: iteration ${last.iteration}, RMS ${last.rms_mm.toFixed(2)} mm`, null);
+    clearTimeout(mine.quiet);
+    const after = mine.dense ? "Following the scan densely, and checking whether the fit can be trusted" : "Checking whether the fit can be trusted";
+    mine.quiet = setTimeout(() => { if (!mine.verdict) say(mine, after, null); }, 700);
+    if (own !== mine) return;
+    Viewer.rmsChart($("progress-chart"), mine.states.map((s) => s.rms_mm), mine.states.map((s) => s.phase), null);
     drawScanStates();
   }
 
@@ -738,6 +795,8 @@
     $("verdict").hidden = false;
     $("progress").hidden = true;
     if (!told.b) {
+      if (mine.previewed && !mine.preview) mine.preview = await binary(`/api/scans/${mine.id}/preview`);
+      if (own !== mine) return;
       if (mine.preview) drawScanStates();
       else if (shown === "scan") nothing(`There is no picture of ${mine.name}`);
       return;
@@ -745,8 +804,6 @@
     const start = { landmarks: "landmarks", upright: "the scan as it stands", rotations: "a search over rotations", given: "a given pose" }[told.start];
     const seconds = Object.values(told.seconds || {}).reduce((sum, value) => sum + value, 0);
     $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)}\u00a0s.`));
-    shapes.set(`scan ${mine.id}`, { name: mine.name, z: told.z });
-    fillChoices();
     if (!told.pictured) return;
     const payload = await binary(`/api/scans/${mine.id}/picture`);
     if (own !== mine || mine.placing) return;
@@ -757,17 +814,21 @@
       }) }, "Record (JSON)"),
       h("button", { type: "button", "data-testid": "scan-remove", onclick: guarded(async () => {
         await ask(`/api/scans/${mine.id}`, { method: "DELETE" });
-        forget(mine.id);
+        drop(mine);
       }) }, "Remove from the server")));
   }
 
-  function forget(id) {
-    scansHere.delete(id);
-    shapes.delete(`scan ${id}`);
+  /** Forget a scan that the server has removed, or never had. */
+  function drop(mine) {
+    if (mine.source) mine.source.close();
+    dropped.splice(dropped.indexOf(mine), 1);
+    shapes.delete(`scan ${mine.id}`);
     fillChoices();
-    listScans();
-    if (!own || own.id !== id) return;
+    if (own !== mine) { listScans(); return; }
+    const next = dropped[dropped.length - 1];
+    if (next) { look(next); return; }
     own = null;
+    listScans();
     scanView.clear();
     for (const part of ["verdict", "placing", "progress"]) $(part).hidden = true;
     $("zone").classList.remove("compact");
@@ -775,17 +836,38 @@
     stage.split(false);
   }
 
+  function stateOf(mine) {
+    if (mine.verdict) return mine.verdict.shown ? shortly(mine.verdict) : mine.verdict.status;
+    if (mine.file) return mine.said && mine.said.part !== null ? "being sent" : "waits";
+    return mine.states.length ? `iteration ${mine.states[mine.states.length - 1].iteration}` : "waits";
+  }
+
+  /** The dropped scans beside each other, where there are several. */
   function listScans() {
-    const several = scansHere.size > 1;
     $("own").replaceChildren();
-    if (!several) return;
-    const select = h("select", { "data-testid": "own-select", "aria-label": "Your scans" }, ...Array.from(scansHere, ([id, name]) => h("option", { value: id }, name)));
-    if (own && own.id) select.value = own.id;
-    select.addEventListener("change", () => {
-      beginScan({ id: select.value, name: scansHere.get(select.value) });
-      follow();
+    if (dropped.length < 2) return;
+    const list = h("div", { class: "list", role: "listbox", tabindex: "0", "aria-label": "Your scans", "data-testid": "own-list" });
+    dropped.forEach((mine, i) => {
+      mine.row = h("div", {
+        role: "option", id: `own-${i}`, class: mine.verdict ? mine.verdict.status : "", "aria-selected": String(mine === own),
+        "data-testid": "own-scan", "data-name": mine.name, onclick: () => look(mine),
+      }, h("i", { class: "dot" }), h("span", {}, mine.name), h("small", {}, stateOf(mine)));
+      list.append(mine.row);
+      if (mine === own) list.setAttribute("aria-activedescendant", `own-${i}`);
     });
-    $("own").append(h("label", { class: "field" }, "Scan ", select));
+    list.addEventListener("keydown", (event) => {
+      const next = dropped[dropped.indexOf(own) + ({ ArrowDown: 1, ArrowUp: -1 }[event.key] || NaN)];
+      if (!next) return;
+      event.preventDefault();
+      look(next);
+      $("own").firstElementChild.nextElementSibling.focus();
+    });
+    const fitted = dropped.filter((one) => one.verdict && one.verdict.b);
+    const all = fitted.length > 1 ? h("button", { type: "button", "data-testid": "own-csv", onclick: () => {
+      const rows = fitted.map(({ name, verdict: { status, b, z: values, b_stddev: sd } }) => ({ name: name.replace(/\.[^.]*$/, ""), status, b, z: values, sd }));
+      save(Viewer.coefficientsCsv(rows, about.modes), "coefficients.csv");
+    } }, `Coefficients of all ${fitted.length} (CSV)`) : null;
+    $("own").append(h("div", { class: "list-head" }, h("span", {}, "Your scans"), h("span", {}, "model to scan / scan to model")), list, ...(all ? [h("div", { class: "row" }, all)] : []));
   }
 
   // Landmarks on a scan
@@ -882,16 +964,17 @@
     await ask(`/api/scans/${mine.id}/landmarks`, post({ landmarks }));
     $("scan-detail").hidden = false;
     scanView.active = shown === "scan";
-    beginScan({ id: mine.id, name: mine.name });
-    progress("Starting from your landmarks", null);
-    follow();
+    Object.assign(mine, fresh());
+    say(mine, "Starting from your landmarks", null);
+    look(mine);
+    follow(mine);
   });
 
   async function startScan() {
     $("zone-hint").textContent = `${about.formats.map((ending) => ending.slice(1).toUpperCase()).join(", ")}, up to ${Math.round(about.upload_bytes / 2 ** 20)} MB. It is fitted on the machine where the viewer runs; no other visitor sees it, and the file is removed after the fit.`;
     $("file").accept = about.formats.join(",");
     $("choose").addEventListener("click", () => $("file").click());
-    $("file").addEventListener("change", () => { if ($("file").files[0]) dropFile($("file").files[0]); $("file").value = ""; });
+    $("file").addEventListener("change", () => { dropFiles(Array.from($("file").files)); $("file").value = ""; });
     $("stop").addEventListener("click", guarded(async () => { if (own && own.id) await ask(`/api/scans/${own.id}/cancel`, post({})); }));
     let depth = 0;
     const withFiles = (event) => event.dataTransfer && Array.from(event.dataTransfer.types).includes("Files");
@@ -903,18 +986,18 @@
       event.preventDefault();
       depth = 0;
       $("cover").hidden = true;
-      const files = Array.from(event.dataTransfer.files);
-      if (files[0]) dropFile(files[0]);
-      if (files.length > 1) alertUser(`One scan at a time can be dropped; ${files[0].name} is taken.`);
+      dropFiles(Array.from(event.dataTransfer.files));
     });
     const earlier = await json("/api/scans");
-    for (const facts of earlier) scansHere.set(facts.id, facts.name);
-    const last = earlier[earlier.length - 1];
-    if (last) {
-      beginScan(last);
-      listScans();
+    for (const { id, name, dense } of earlier) {
+      const mine = { id, name, dense, ...fresh() };
+      dropped.push(mine);
+      // Those that have ended are told of at once, and their streams close.
+      follow(mine);
+    }
+    if (dropped.length) {
       show("scan");
-      follow();
+      look(dropped[dropped.length - 1]);
     }
   }
 

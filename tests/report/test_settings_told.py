@@ -1,0 +1,59 @@
+"""Settings of fits are read as sentences, and the numbers of a method with what each of them is."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import pytest
+
+from shapespace.fit.fit import FitConfig
+from shapespace.fit.paper_method import Paper
+from shapespace.fit.settings import DenseSettings, ResidualSettings, RobustSettings
+from shapespace.report.blocks import Block, Facts, Folded, Table
+from shapespace.report.settings import described, settings_told
+
+
+def told(blocks: Sequence[Block]) -> str:
+    out: list[str] = []
+    for block in blocks:
+        if isinstance(block, Facts):
+            out += [f"{name}: {value}" for name, value in block.rows]
+        elif isinstance(block, Folded):
+            out += [block.summary, told(block.body)]
+        elif isinstance(block, Table):
+            out += [" | ".join(cell.text for cell in row) for row in block.rows]
+    return "\n".join(out)
+
+
+def config(**settings: Any) -> Mapping[str, Any]:
+    return json.loads(json.dumps(FitConfig(**settings).as_dict()))
+
+
+def test_choices_are_sentences_and_numbers_say_what_they_are() -> None:
+    words = told(settings_told([config(dense=True)], [("Report", "shapespace")]))
+    assert "Unit of the scans: found from the size of each scan" in words
+    assert "Method: robust: what does not match the model is left out" in words
+    assert (
+        "beyond share | 0.2 | it follows when what the model leaves is this share" in words
+    )
+    assert "all | 20,000 | 1,500 | triangles | 15 | 0.05" in words
+    assert "All numbers of the dense stage" in words and "local share | 0.03 | variance of the local modes" in words
+
+
+def test_what_differs_between_fits_is_said() -> None:
+    words = told(settings_told([config(), config(unit="cm", max_iterations=9)], []))
+    assert "found from the size of each scan; of others: cm, as given" in words
+    assert "at most 500 in each phase; of others: at most 9 in each phase" in words
+    assert "dense stage" not in words.replace("Dense stage: not made", "")
+
+
+@pytest.mark.parametrize("settings", [RobustSettings, DenseSettings, ResidualSettings, Paper])
+def test_every_number_is_described(settings: type) -> None:
+    meaning = described(settings)
+    assert {field.name for field in fields(settings)} <= set(meaning) and all(meaning.values())
+
+
+@pytest.mark.parametrize("damaged", [{}, {"method": 3}, {"method": "robust", "robust": 7}, {"robust": {"levels": [1]}}])
+def test_damaged_settings_break_nothing(damaged: Mapping[str, Any]) -> None:
+    assert "Method" in told(settings_told([damaged, config()], []))
