@@ -159,5 +159,6 @@ def test_it_prints(open_tab, report: Path, tmp_path: Path) -> None:
 
 def test_the_picture_in_the_readme_is_this_report(open_tab, report: Path) -> None:
     tab = open_tab(report.as_uri(), {"width": 1200, "height": 900})
+    tab.page.evaluate("document.getElementById('the-fits').scrollIntoView()")
     tab.until("[...document.querySelectorAll('.card img')].every(i => i.complete)")
     same_as_kept("report.png", tab.shot("readme"), width=1000)

@@ -38,7 +38,7 @@ def page(fits_template: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def test_every_part_is_there_in_order_and_none_is_broken(page: str) -> None:
     assert 'class="broken"' not in page
-    headings = Page(page).headings
+    headings = [text.strip() for text in Page(page).headings]
     wanted = ["6 fits in out", "Summary", "The fits", "Every fit in numbers", "charlie in detail"]
     wanted += ["The fits together", "The model", "Settings, versions and hashes"]
     at = [headings.index(text) for text in wanted]

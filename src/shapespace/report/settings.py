@@ -12,6 +12,7 @@ from shapespace.fit.settings import DenseSettings, ResidualSettings, RobustSetti
 from shapespace.report.blocks import Block, Facts, Folded, text_table
 from shapespace.report.wording import DASH, plain, words
 
+_NOTHING: Mapping[str, Any] = {}
 _CAPTION = "Settings and versions"
 _OF: Mapping[str, type] = {
     "robust": RobustSettings, "paper": Paper, "dense_settings": DenseSettings, "residual": ResidualSettings,
@@ -39,7 +40,7 @@ def settings_told(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[st
     wanted = [*parts, *(["dense_settings"] if any(config.get("dense") is True for config in configs) else [])]
     for key in wanted:
         found = [_mapping(config.get(key)) for config in configs]
-        values = next((value for value in found if value), {})
+        values = next((value for value in found if value), _NOTHING)
         if not values:
             continue
         what = "the dense stage" if key == "dense_settings" else f"the {key} method"
@@ -90,7 +91,7 @@ def _flat(key: str, values: Mapping[str, Any]) -> list[tuple[str, object]]:
 
 
 def _mapping(value: object) -> Mapping[str, Any]:
-    return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else {}
+    return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else _NOTHING
 
 
 def _list(value: object) -> list[object]:
@@ -125,12 +126,20 @@ def _dense(config: Mapping[str, Any]) -> str:
     return "made: the surface goes the rest of the way to the scan" if config.get("dense") is True else "not made"
 
 
+def _iterations(config: Mapping[str, Any]) -> str:
+    return f"at most {plain(config.get('max_iterations'))} in each phase"
+
+
+def _seed(config: Mapping[str, Any]) -> str:
+    return f"from seed {plain(config.get('seed'))}"
+
+
 _CHOICES = (
     ("Method", _method),
     ("Modes", _modes),
     ("Unit of the scans", _unit),
     ("Size", _scale),
     ("Dense stage", _dense),
-    ("Iterations", lambda config: f"at most {plain(config.get('max_iterations'))} in each phase"),
-    ("Random numbers", lambda config: f"from seed {plain(config.get('seed'))}"),
+    ("Iterations", _iterations),
+    ("Random numbers", _seed),
 )
