@@ -292,7 +292,7 @@ class FolderPage:
 
     def together_part(self) -> list[Block]:
         """Return how near all fits come, and their coefficients against each other."""
-        curves = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else []
+        curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
         coefficients = self.page.tried(self.together)
         drawn = [block for block in coefficients if isinstance(block, Figure)]
         rest = [block for block in coefficients if not isinstance(block, Figure)]
