@@ -463,6 +463,8 @@ def _without_verdict(reason: str) -> str:
 
 def _first_reason(fit: SavedFit) -> str:
     """Return the first of the reasons of a fit, and how many there are beside it."""
+    if not fit.reason.startswith(_VERDICT):
+        return fit.reason
     first, *others = _without_verdict(fit.reason).split("; ")
     return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
 
