@@ -292,7 +292,7 @@ class FolderPage:
 
     def together_part(self) -> list[Block]:
         """Return how near all fits come, and their coefficients against each other."""
-        curves = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else []
+        curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
         coefficients = self.page.tried(self.together)
         drawn = [block for block in coefficients if isinstance(block, Figure)]
         rest = [block for block in coefficients if not isinstance(block, Figure)]
@@ -463,6 +463,8 @@ def _without_verdict(reason: str) -> str:
 
 def _first_reason(fit: SavedFit) -> str:
     """Return the first of the reasons of a fit, and how many there are beside it."""
+    if not fit.reason.startswith(_VERDICT):
+        return fit.reason
     first, *others = _without_verdict(fit.reason).split("; ")
     return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
 

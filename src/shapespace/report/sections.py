@@ -376,7 +376,7 @@ def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
 
 def lines_through_neutral(
     page: Page, points: Sequence[Coefficients], neutral: Coefficients | None, *, figures_of: Sequence[str] = ("", "")
-) -> Group:
+) -> Block:
     """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
 
     Args:
