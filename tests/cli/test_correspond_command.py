@@ -59,8 +59,11 @@ def test_scans_come_by_address_and_list_and_what_is_known_of_them_is_kept(
     pytest.importorskip("fsspec")
     shutil.make_archive(str(tmp_path / "scans"), "zip", raw)
     archive = f"file://{tmp_path}/scans.zip"
-    rows = [f"zip://blob{k}.ply::{archive},anna{k},{30 + k}" for k in range(SCANS)]
-    (tmp_path / "list.csv").write_text("\n".join(["scan,id,age", *rows, f"zip://torn.ply::{archive},torn,1"]))
+    write_landmarks(tmp_path / "far.csv", {"tip": np.array([1e6, 0.0, 0.0])})
+    rows = [f"zip://blob{k}.ply::{archive},anna{k},{30 + k},{'' if k else 'far.csv'}" for k in range(SCANS)]
+    (tmp_path / "list.csv").write_text(
+        "\n".join(["scan,id,age,landmarks", *rows, f"zip://torn.ply::{archive},torn,1,"])
+    )
     out = tmp_path / "out"
     assert run("correspond", tmp_path / "list.csv", "-o", out, *QUICK).code == 1
     for k in range(SCANS):
@@ -71,6 +74,7 @@ def test_scans_come_by_address_and_list_and_what_is_known_of_them_is_kept(
             read_mesh(f).vertices for f in (out / f"anna{k}.corresponding.ply", same / f"blob{k}.corresponding.ply")
         ]
         np.testing.assert_array_equal(*surfaces)
+        assert any("landmarks" in note for note in record["notes"]) is (k == 0)
     torn = json.loads((out / "torn.correspond.json").read_text("utf-8"))
     assert torn["status"] == "set aside" and torn["metadata"] == {"age": "1"}
     assert run("report", out, "--no-open").code == 0

@@ -105,14 +105,16 @@ def correspond_files(
 def _jobs(given: Sequence[Given]) -> list[Job]:
     paths = [one.path for one in given]
     names = names_for(paths, None, {one.path: one.address for one in given if one.address})
-    return with_ids([Job(n, one.path, address=one.address) for n, one in zip(names, given, strict=True)], given)
+    return with_ids(
+        [Job(n, one.path, one.landmarks, address=one.address) for n, one in zip(names, given, strict=True)], given
+    )
 
 
 def _corresponding(
     jobs: Sequence[Job], files: CorrespondFiles, folder: Path, settings: CorrespondSettings, *, quiet: bool, say: _Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
-    marks.refuse_shared([job.scan for job in jobs])
+    marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
     read = _read_all(jobs, marks, quiet=quiet)
     scans, notes = read.scans, read.notes
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
@@ -183,7 +185,7 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Rea
             try:
                 with job.readable() as file:
                     mesh, content_hash = read_mesh(file), sha256_of_file(file)
-                mesh = marks.onto(mesh, job.scan)
+                mesh = marks.onto(mesh, job.scan, job.landmarks)
             except ShapespaceError as error:
                 read.unread[job.name] = f"broken: {error}"
             else:

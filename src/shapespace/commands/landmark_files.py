@@ -75,17 +75,16 @@ class LandmarkFiles:
 
     def of_scan(self, scan: Path) -> Path | None:
         """Return the file with the landmarks of `scan`, None where there is none."""
-        file = self.files.get(scan.stem)
+        file = self.files.get(stem_of(scan))
         if file is not None:
-            self.used.add(scan.stem)
+            self.used.add(stem_of(scan))
         return file
 
-    def onto(self, mesh: Mesh, path: Path) -> Mesh:
-        """Return `mesh`, read from `path`, with the landmarks that the folder has for it."""
-        file = self.files.get(stem_of(path))
+    def onto(self, mesh: Mesh, path: Path, own: Path | None = None) -> Mesh:
+        """Return `mesh`, read from `path`, with the landmarks in the file `own`, or those of the folder for it."""
+        file = own or self.of_scan(path)
         if file is None:
             return mesh
-        self.used.add(stem_of(path))
         try:
             return replace(mesh, landmarks=read_landmarks(file))
         except ShapespaceError as error:
