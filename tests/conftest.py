@@ -6,6 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+# Test workers of a machine are as many as its cores, and threads of BLAS beside them only spin.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
+
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 

@@ -6,6 +6,7 @@ which are in the file's own unit until the fit has found that unit.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -101,7 +102,8 @@ class Mesh:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        return {"vertices": self.vertices, "faces": self.faces, "landmarks": dict(self.landmarks), "name": self.name}
+        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        return {**fields, "landmarks": dict(self.landmarks)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]

@@ -202,6 +202,7 @@ def test_ctrl_c_ends_with_130_and_whole_files(
     if command == "fit":
         assert {path.name for path in tmp_path.iterdir()} == {
             "coefficients.csv", "scan_0.fit.json", "scan_0.fitted.ply",
+            "scan_0.landmarks.csv", "scan_0.landmarks.fcsv", "scan_0.landmarks.mrk.json",
         }  # fmt: skip
         with (tmp_path / "coefficients.csv").open(newline="") as stream:
             assert [row["scan"] for row in csv.DictReader(stream)] == ["scan_0"]

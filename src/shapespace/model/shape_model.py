@@ -145,7 +145,8 @@ class ShapeModel:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        return {**self.fields(), "landmarks": dict(self.landmarks), "coding": dict(self.coding)}
+        plain = {name: dict(getattr(self, name)) for name in ("landmarks", "coding", "regions")}
+        return {**self.fields(), **plain}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
