@@ -8,11 +8,11 @@ import pytest
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 375, "height": 740}
 WINDOWS = (
     pytest.param(DESKTOP, "light", id="desktop-light"),
-    pytest.param(DESKTOP, "dark", id="desktop-dark", marks=pytest.mark.long),
-    pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.long),
+    pytest.param(DESKTOP, "dark", id="desktop-dark", marks=[pytest.mark.long, pytest.mark.pairs]),
+    pytest.param(PHONE, "light", id="phone-light", marks=[pytest.mark.long, pytest.mark.pairs]),
     pytest.param(PHONE, "dark", id="phone-dark"),
 )
-"""Each size and each scheme in every run, and in the long ones each with each."""
+"""Each size and each scheme in every run, and in `make test-all` each with each."""
 
 WICKED = "</script><script>window.wicked = true</script>"
 """A label that stays text."""
