@@ -13,6 +13,7 @@ import time
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from conftest import World, leftovers, without_waiting
@@ -223,6 +224,33 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
 
 @LINUX
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux bounds the memory of a process for certain")
+def test_a_scan_for_which_there_is_not_enough_memory_fails_alone(world: World, tmp_path: Path) -> None:
+    import resource
+
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for k in range(3):
+        shutil.copy(world.scans[k], scans / f"s{k}.ply")
+    vertices = 80_000_000
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    with (scans / "giant.ply").open("wb") as file:
+        file.write(head.encode() + np.random.default_rng(0).normal(size=30_000).astype("<f4").tobytes())
+        file.truncate(len(head) + 12 * vertices)  # zeros that take no room on the disk
+    done = subprocess.run(
+        [*COMMAND, "fit", str(world.model), str(scans), "-o", str(tmp_path / "out"), "--jobs", "2", "--quiet"],
+        capture_output=True, text=True, timeout=200, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (3_500_000_000, 3_500_000_000)),
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "not enough memory" in done.stderr and "giant.ply" in done.stderr and "Traceback" not in done.stderr
+    with (tmp_path / "out" / "coefficients.csv").open(newline="") as stream:
+        status = {row["scan"]: row["status"] for row in csv.DictReader(stream)}
+    assert status == {"giant": "failed", "s0": "converged", "s1": "converged", "s2": "converged"}
+
+
 @pytest.mark.long
 def test_workers_that_are_killed_change_nothing(
     world: World, undisturbed: tuple[Path, list[dict[str, str]]], tmp_path: Path
