@@ -169,6 +169,10 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 
 LONG = ("tutorial-faces.md", "tutorial-recognition.md", "tutorial-spleens.md", "tutorial-volumes.md")
 """Documents whose examples take long."""
+MARKS: dict[str, Any] = dict.fromkeys(LONG, pytest.mark.long)
+MARKS["tutorial-recognition.md"] = [pytest.mark.long, pytest.mark.pairs]
+FEWER = {"--subjects 25": "--subjects 8", "--folds 5": "--folds 4"}
+"""With which the tutorial on recognition takes a third of its time, where it is not run as it stands."""
 BEGINNINGS = (
     "shapespace data faces -o people --subjects 12",
     "shapespace build people -o model.h5 --variance 0.95",
@@ -193,7 +197,7 @@ def copied(source: Path) -> None:
 @pytest.mark.parametrize(
     "document",
     [
-        pytest.param(document, marks=pytest.mark.long if document.name in LONG else ())
+        pytest.param(document, marks=MARKS.get(document.name, ()))
         for document in DOCUMENTS
         if has_examples(document, needing_data=False)
     ],
@@ -210,6 +214,23 @@ def test_examples_run_as_they_stand(
             words = arguments(command)
             instead[command] = partial(copied, home / words[words.index("-o") + 1])
     assert run(document, with_data=False, instead=instead) > 0
+
+
+@pytest.mark.long
+def test_the_tutorial_on_recognition_goes_with_fewer_people(workplace: Path) -> None:
+    document = ROOT / "docs" / "tutorial-recognition.md"
+
+    def with_fewer(command: str, many: str) -> Callable[[], None]:
+        def do() -> None:
+            with contextlib.redirect_stdout(io.StringIO()):
+                assert cli.main(arguments(command.replace(many, FEWER[many]))) == 0
+
+        return do
+
+    typed = [command for block in blocks(document) for command in commands(block)]
+    instead = {command: with_fewer(command, many) for command in typed for many in FEWER if many in command}
+    assert len(instead) == len(FEWER)
+    assert run(document, with_data=False, instead=instead) > 5
 
 
 @pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=True)], ids=named)
