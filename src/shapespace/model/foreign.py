@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.errors import ModelFileError
-from shapespace.formats.eos import read_blendshapes
 from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, orthonormal
-from shapespace.formats.registry import is_known, read_linear
 from shapespace.io.hdf5 import is_ours
 from shapespace.model.model_file import ModelFields
 from shapespace.types import FloatArray
@@ -39,7 +37,11 @@ class Foreign:
 
 def is_foreign(path: Path) -> bool:
     """Whether `path` is there and is a model of another tool."""
-    return not is_ours(path) and is_known(path)
+    if is_ours(path):
+        return False
+    from shapespace.formats.registry import is_known  # all formats, a third of what it takes to load a model
+
+    return is_known(path)
 
 
 def looks_like_model(path: Path) -> bool:
@@ -59,6 +61,8 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         FileError: it cannot be read.
         ModelFileError: it is in no known format, damaged, or holds no variation; or the expressions are of another.
     """
+    from shapespace.formats.registry import read_linear
+
     found, linear = read_linear(path)
     if expressions is not None:
         linear = _with_expressions(linear, path, expressions)
@@ -137,6 +141,8 @@ def parted(linear: LinearModel, rotation: FloatArray, n_identity: int) -> Linear
 
 
 def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> LinearModel:
+    from shapespace.formats.eos import read_blendshapes
+
     block = read_blendshapes(expressions)
     if linear.expression is not None:
         raise ModelFileError(f"{path} has expressions of its own; leave those in {expressions} out.")
