@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shapespace.errors import InputError, ModelFileError
+from shapespace.errors import InputError
 from shapespace.formats.parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
-from shapespace.model.additive import AdditiveModel
+from shapespace.model.additive import AdditiveModel, load_model, model_of_foreign
 from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign
 from shapespace.model.shape_model import ShapeModel
 
@@ -59,14 +59,6 @@ def _load(
             raise InputError(f"{source} is in mm, as all models of shapespace; leave --unit out.")
         if expressions is not None:
             raise InputError(f"{source} is a model of shapespace; --expressions goes with the models of eos.")
-        shape = ShapeModel.load(source)
-        try:
-            return AdditiveModel.load(source), OWN[0], []
-        except ModelFileError:
-            return shape, OWN[0], []
+        return load_model(source), OWN[0], []
     foreign = load_foreign(source, mm, expressions)
-    shape = ShapeModel.of_foreign(foreign, source)
-    notes = list[str](foreign.notes)
-    if foreign.rotation is None:
-        return shape, foreign.format, notes
-    return AdditiveModel(shape, foreign.rotation, foreign.n_identity), foreign.format, notes
+    return model_of_foreign(foreign, source), foreign.format, list(foreign.notes)

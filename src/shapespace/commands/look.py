@@ -12,12 +12,12 @@ import numpy as np
 from shapespace.batch.fit_work import naming
 from shapespace.batch.results import read_record
 from shapespace.commands.corresponding import json_of
-from shapespace.errors import FileError, ModelFileError, ShapespaceError
+from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.surface import faces_of
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import read_mesh
-from shapespace.model.additive import AdditiveModel
+from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
@@ -70,7 +70,11 @@ def info(path: Path) -> dict[str, Any]:
         record = read(CorrespondRecord, json_of(path), path.name, CORRESPOND_AGAIN)
         return {"kind": "scan in correspondence", **to_json(record)}
     if looks_like_model(path):
-        return {"kind": "model", **model_facts(ShapeModel.load(path)), **_parted(path)}
+        model = load_model(path)
+        if isinstance(model, ShapeModel):
+            return {"kind": "model", **model_facts(model)}
+        parted = {"identity_modes": model.n_identity, "expression_modes": model.n_expression}
+        return {"kind": "model", **model_facts(model.shape), "additive": parted}
     if path.name.endswith(".json"):
         record = read_record(path)
         return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
@@ -178,15 +182,6 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "licence": model.licence,
         "hash": model.content_hash,
     }
-
-
-def _parted(path: Path) -> dict[str, Any]:
-    """Return what an additive model says of its two parts; nothing of other models."""
-    try:
-        additive = AdditiveModel.load(path)
-    except ModelFileError:
-        return {}
-    return {"additive": {"identity_modes": additive.n_identity, "expression_modes": additive.n_expression}}
 
 
 def _residual_facts(model: ShapeModel) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.hdf5 import read_hdf5
 from shapespace.model import model_file
-from shapespace.model.foreign import is_foreign, load_foreign, parted
+from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
 from shapespace.model.held_out import held_out_shapes
 from shapespace.model.local_modes import local_modes
 from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
@@ -281,19 +281,13 @@ class AdditiveModel:
         """
         if is_foreign(Path(path)):
             foreign = load_foreign(Path(path))
-            if foreign.rotation is None:
+            found = model_of_foreign(foreign, Path(path))
+            if isinstance(found, ShapeModel):
                 raise ModelFileError(
                     f"{path} ({foreign.format}) does not part identity and expression; give one that does."
                 )
-            return cls(ShapeModel.of_foreign(foreign, Path(path)), foreign.rotation, foreign.n_identity)
-        shape = ShapeModel.load(path)
-        arrays, attributes = read_hdf5(Path(path))
-        if "split_rotation" not in arrays or "split_identity" not in attributes:
-            raise ModelFileError(f"{path} does not part identity and expression; build it with --additive LABELS.csv.")
-        try:
-            return cls(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
-        except (InputError, ValueError, TypeError, OverflowError) as error:
-            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
+            return found
+        return _split(ShapeModel.load(path), Path(path))
 
     def as_linear(self) -> LinearModel:
         """Return what formats of other tools can hold of the model, identity and expression parted."""
@@ -304,6 +298,43 @@ class AdditiveModel:
         if array.ndim < 1 or array.shape[-1] != self.shape.n_modes or not np.isfinite(array).all():
             raise InputError(f"Give {self.shape.n_modes} finite coefficients for each shape, not {array.shape}.")
         return array
+
+
+def load_model(path: Path) -> ShapeModel | AdditiveModel:
+    """Return the model in `path`, parted where its file parts identity and expression.
+
+    Raises:
+        FileError: it cannot be read.
+        ModelFileError: it is damaged, of another version, or not a model.
+    """
+    if is_foreign(path):
+        return model_of_foreign(load_foreign(path), path)
+    shape = ShapeModel.load(path)
+    try:
+        return _split(shape, path)
+    except ModelFileError:
+        return shape
+
+
+def model_of_foreign(foreign: Foreign, path: Path) -> ShapeModel | AdditiveModel:
+    """Return the model that `path` of another tool holds, parted where that file parts it.
+
+    Raises:
+        ModelFileError: its parts do not make a model.
+    """
+    shape = ShapeModel.of_foreign(foreign, path)
+    return shape if foreign.rotation is None else AdditiveModel(shape, foreign.rotation, foreign.n_identity)
+
+
+def _split(shape: ShapeModel, path: Path) -> AdditiveModel:
+    """Return `shape`, read from our file `path`, with what that file says of its two parts."""
+    arrays, attributes = read_hdf5(path)
+    if "split_rotation" not in arrays or "split_identity" not in attributes:
+        raise ModelFileError(f"{path} does not part identity and expression; build it with --additive LABELS.csv.")
+    try:
+        return AdditiveModel(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
+    except (InputError, ValueError, TypeError, OverflowError) as error:
+        raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {error}") from error
 
 
 def _neutrals_and_expressions(

@@ -18,10 +18,10 @@ from shapespace.batch.progress import progress
 from shapespace.batch.run import fit_files, make_jobs
 from shapespace.batch.where import Where
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
-from shapespace.errors import InputError, ModelFileError
+from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.files import make_folder, write_text
-from shapespace.model.additive import AdditiveModel
+from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
@@ -64,11 +64,8 @@ def run_own_study(
     make_folder(folder)
     found = scan_set(data)
     _check(found.scans, data, folds)
-    model = ShapeModel.load(model_file)
-    try:
-        additive: AdditiveModel | None = AdditiveModel.load(model_file)
-    except ModelFileError:
-        additive = None  # a plain shape model, which loaded
+    loaded = load_model(model_file)
+    model, additive = (loaded, None) if isinstance(loaded, ShapeModel) else (loaded.shape, loaded)
     with progress(len(found.scans), "fitting", "scan", quiet=quiet) as bar:
 
         def fitted(job: Job, record: Mapping[str, Any]) -> None:
