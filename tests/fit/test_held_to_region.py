@@ -174,6 +174,17 @@ def test_a_crop_takes_what_stands_behind_out_of_the_fit(kind: str) -> None:
     assert len(result.scan.vertices) < len(scan.vertices) and result.notes[0].startswith("Cropped to ")
 
 
+def test_a_cropped_scan_keeps_its_colours_and_what_its_reader_said() -> None:
+    scan = scanned(0).scan
+    painted = replace(scan, colours=np.full(scan.vertices.shape, 200, np.uint8), notes=("A picture is missing.",))
+    low, high = scan.vertices.min(axis=0), scan.vertices.max(axis=0) - [0.0, 0.0, 3.0]
+    crop = f"box:{','.join(map(str, [*low, *high]))}"
+    result = fit_scan(MODEL, painted, replace(MM, crop=crop, max_iterations=1))
+    assert len(result.scan.vertices) < len(scan.vertices)
+    assert result.scan.colours is not None and (result.scan.colours == 200).all()
+    assert "A picture is missing." in result.notes
+
+
 def test_crops_go_by_the_scans_own_unit_and_landmarks_by_millimetres() -> None:
     raw = scanned(0)
     metres = raw.scan.with_vertices(0.001 * raw.scan.vertices)

@@ -7,6 +7,7 @@ from shapespace.geometry.surface import (
     boundary_vertices,
     face_areas,
     faces_of,
+    part_of,
     vertex_areas,
     vertex_normals,
 )
@@ -55,3 +56,17 @@ def test_point_clouds_are_refused_where_triangles_are_needed() -> None:
     for function in (faces_of, face_areas, vertex_normals, vertex_areas):
         with pytest.raises(MeshError, match=r"cloud\.ply has no faces"):
             function(Mesh(np.zeros((3, 3)), name="cloud.ply"))
+
+
+def test_a_part_has_its_own_triangles_and_all_that_the_mesh_has() -> None:
+    vertices, faces = sphere(30)
+    colours = np.arange(90, dtype=np.uint8).reshape(30, 3)
+    mesh = Mesh(vertices, faces, {"tip": np.ones(3)}, "ball", colours, ("Said.",))
+    kept = vertices[:, 2] > 0
+    for whole in (mesh, Mesh(vertices, None, mesh.landmarks, "ball", colours, ("Said.",))):
+        part = part_of(whole, kept)
+        np.testing.assert_array_equal(part.vertices, vertices[kept])
+        np.testing.assert_array_equal(np.asarray(part.colours), colours[kept])
+        assert (part.name, part.notes, list(part.landmarks)) == ("ball", ("Said.",), ["tip"])
+    inside = [face for face in faces if kept[face].all()]
+    np.testing.assert_array_equal(part_of(mesh, kept).vertices[part_of(mesh, kept).faces], vertices[inside])

@@ -20,9 +20,9 @@ from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.trust import score
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import rms_size, vertex_normals, without_vertices
+from shapespace.geometry.surface import part_of, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import FloatArray, Mesh, Similarity
 
 # Chosen on fits of `benchmarks/reliability.py`, heads, hair and collars, and a real scan with hair and neck.
 _NEAR = 0.05
@@ -57,7 +57,7 @@ def another_beside(
     far = placed.query(target.mesh.vertices).distance > _NEAR * size_mm * scale
     if far.sum() < max(_FEWEST, _LEAST_REST * len(far)):
         return None
-    rest = ScanTarget(_part(target.mesh, far))
+    rest = ScanTarget(part_of(target.mesh, far))
     T = _same_moved(fitted, rest.mesh.vertices, size_mm)
     if T is None:
         return None
@@ -133,14 +133,6 @@ def _same_moved(fitted: Fitted, rest: FloatArray, size_mm: float) -> Similarity 
         kept = np.asarray(distance <= np.quantile(distance, _TRIMMED), dtype=np.bool_)
         move = fit_similarity(x[kept], rest[np.asarray(nearest)[kept]], with_scale=False)
     return move @ T if float(score(move.apply(x), _CAP)) < _SCORED * size_mm * T.scale else None
-
-
-def _part(mesh: Mesh, kept: BoolArray) -> Mesh:
-    """Return the vertices `kept` (S,) with the triangles that have no other."""
-    if mesh.faces is None:
-        return Mesh(mesh.vertices[kept], name=mesh.name)
-    vertices, faces = without_vertices(mesh.vertices, mesh.faces, kept)
-    return Mesh(vertices, faces, name=mesh.name)
 
 
 def _end(states: Generator[IcpState, None, Fitted]) -> Fitted:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.geometry.surface import rms_size, without_vertices
+from shapespace.geometry.surface import part_of, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh
 
@@ -36,7 +36,7 @@ class Crop:
     def __post_init__(self) -> None:
         finite = all(np.isfinite(number) for number in self.numbers)
         if KINDS.get(self.kind) != len(self.numbers) or not finite:
-            raise InputError(f"There is no crop {self.text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM.")
+            raise _no_crop(self.text)
         if self.kind != "box" and self.numbers[-1] <= 0:
             raise InputError(f"The crop {self.text!r} needs a radius above zero.")
 
@@ -58,9 +58,7 @@ class Crop:
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(
-                f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM."
-            ) from error
+            raise _no_crop(text) from error
 
     def cut(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
@@ -84,10 +82,7 @@ class Crop:
                 f"between {low} and {high}; give a crop in the scan's own frame and unit."
             )
         said = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
-        if scan.faces is None:
-            return Mesh(scan.vertices[inside], None, scan.landmarks, name=scan.name), said
-        vertices, faces = without_vertices(scan.vertices, scan.faces, inside)
-        return Mesh(vertices, faces, scan.landmarks, name=scan.name), said
+        return part_of(scan, inside), said
 
     def _inside(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
@@ -106,6 +101,10 @@ class Crop:
         for point in points:
             inside |= np.linalg.norm(x - point, axis=1) * mm <= self.numbers[0]
         return inside
+
+
+def _no_crop(text: str) -> InputError:
+    return InputError(f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM.")
 
 
 def _unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str) -> str:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
-from shapespace.geometry.surface import boundary_vertices, vertex_normals, without_vertices
+from shapespace.geometry.surface import boundary_vertices, part_of, vertex_normals
 from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh
 
@@ -123,7 +123,7 @@ def surface_distances(
     """
     engine = scan_engine or build_engine(scan)
     forward = engine.query(model.vertices)
-    part = model if region is None else _part(model, region)
+    part = model if region is None else part_of(model, region)
     backward = build_engine(part).query(scan.vertices)
     counted = ~on_boundary(backward, part, boundary_vertices(part))
     outside, scan_outside = np.ones(len(model.vertices), dtype=bool), np.ones(len(scan.vertices), dtype=bool)
@@ -136,12 +136,6 @@ def surface_distances(
         forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside,
         region,
     )  # fmt: skip
-
-
-def _part(mesh: Mesh, kept: BoolArray) -> Mesh:
-    if mesh.faces is None:
-        return Mesh(mesh.vertices[kept], None, name=mesh.name)
-    return Mesh(*without_vertices(mesh.vertices, mesh.faces, kept), name=mesh.name)
 
 
 def _in_front(away: FloatArray, normals: FloatArray) -> BoolArray:

@@ -27,6 +27,17 @@ def without_vertices(vertices: FloatArray, faces: IntArray, kept: BoolArray) -> 
     return vertices[kept], number[faces[kept[faces].all(axis=1)]]
 
 
+def part_of(mesh: Mesh, kept: BoolArray) -> Mesh:
+    """Return the vertices `kept` (V,) of a mesh or cloud with the triangles that have no other, and all else it has."""
+    faces = mesh.faces
+    if faces is None:
+        vertices = mesh.vertices[kept]
+    else:
+        vertices, faces = without_vertices(mesh.vertices, faces, kept)
+    colours = None if mesh.colours is None else mesh.colours[kept]
+    return Mesh(vertices, faces, mesh.landmarks, mesh.name, colours, mesh.notes)
+
+
 def rms_size(points: FloatArray) -> float:
     """Return the RMS distance of `points` (N, 3) from their mean."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))

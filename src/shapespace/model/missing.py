@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import without_vertices
+from shapespace.geometry.surface import part_of
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.pca import PrincipalComponents, checked_modes, fix_signs, modes_for_variance, principal_components
 from shapespace.model.ppca import Ppca, ppca
@@ -79,7 +79,7 @@ class Kept:
             )
         if kept.all():
             return Kept(meshes, kept)
-        cut = [_cut(mesh, kept) for mesh in meshes]
+        cut = [part_of(mesh, kept) for mesh in meshes]
         return Kept(cut, kept)
 
     def regions(self, regions: Mapping[str, IntArray]) -> dict[str, IntArray]:
@@ -100,12 +100,6 @@ class Kept:
         chosen = np.asarray(vertices)
         number = (np.cumsum(self.vertices) - 1).astype(np.int32)
         return number[chosen[self.vertices[chosen]]]
-
-
-def _cut(mesh: Mesh, kept: BoolArray) -> Mesh:
-    if mesh.faces is None:
-        return Mesh(mesh.vertices[kept], None, mesh.landmarks, mesh.name)
-    return Mesh(*without_vertices(mesh.vertices, mesh.faces, kept), mesh.landmarks, mesh.name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_vertices, without_vertices
+from shapespace.geometry.surface import boundary_vertices, part_of
 from shapespace.late import late
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
@@ -270,7 +270,7 @@ class _Target:
         """Return the same of the vertices `kept` (V,) alone."""
         if kept.all():
             return self
-        shape = _cut(self.shape, kept)
+        shape = part_of(self.shape, kept)
         seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
         if self.is_scan:
             return _Target(shape, seen, self.surface, self.engine, True)
@@ -284,13 +284,7 @@ def _shown(shape: Mesh, seen: IntArray) -> Mesh:
         return shape
     kept = np.zeros(len(shape.vertices), dtype=np.bool_)
     kept[seen] = True
-    return _cut(shape, kept)
-
-
-def _cut(shape: Mesh, kept: BoolArray) -> Mesh:
-    if shape.faces is None:
-        return Mesh(shape.vertices[kept], None, name=shape.name)
-    return Mesh(*without_vertices(shape.vertices, shape.faces, kept), name=shape.name)
+    return part_of(shape, kept)
 
 
 @dataclass(frozen=True)
@@ -476,7 +470,7 @@ def measure_quality(
     whole = representation_named(settings.representation, settings.control_points).takes_holes
     kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
     if not kept.all():
-        meshes, unseen = [_cut(mesh, kept) for mesh in meshes], [_cut(mesh, kept) for mesh in unseen]
+        meshes, unseen = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in unseen]
     shapes = Shapes(meshes, scans, settings)
     return _of_meshes(shapes, unseen, on_step, run, left_out=int((~kept).sum()))
 
