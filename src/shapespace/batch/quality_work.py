@@ -16,6 +16,7 @@ from shapespace.batch.executors import Serial
 from shapespace.batch.where import Where
 from shapespace.errors import FitError
 from shapespace.io.archives import read_arrays
+from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder
 from shapespace.model.quality import Part, QualitySettings, Shapes
 from shapespace.types import FloatArray, Mesh
@@ -109,8 +110,7 @@ class QualityWork:
                 arrays[f"{kind}.{number}.name"] = np.array(mesh.name)
                 if mesh.faces is not None and (kind == "scan" or number == 0):
                     arrays[f"{kind}.{number}.faces"] = mesh.faces
-        with self.file.open("wb") as stream:
-            np.savez(stream, **cast(dict[str, Any], arrays))
+        write_arrays(self.file, arrays)
 
     def _load(self) -> Shapes:
         arrays = read_arrays(self.file, _AGAIN)

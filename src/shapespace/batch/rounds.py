@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,8 @@ from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
 from shapespace.errors import FileError
 from shapespace.io.archives import read_arrays
-from shapespace.io.files import atomic_path, make_folder
+from shapespace.io.arrays import write_arrays
+from shapespace.io.files import make_folder
 from shapespace.io.hdf5 import content_hash
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
@@ -150,8 +151,7 @@ class RoundWork:
         models |= {} if bench.guide is None else {"guide": bench.guide}
         parts = {"bench": _bench_arrays(bench)} | {name: _model_arrays(model) for name, model in models.items()}
         arrays = {f"{part}.{name}": array for part, told in parts.items() for name, array in told.items()}
-        with atomic_path(self.file) as path, path.open("wb") as stream:
-            np.savez(stream, **cast(dict[str, Any], arrays))
+        write_arrays(self.file, arrays)
 
     def _bench(self) -> Workbench:
         if self.file not in _benches:
@@ -249,8 +249,7 @@ def _write(file: Path, placed: Placed) -> None:
             **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in told.items()}
-    with atomic_path(file) as path, path.open("wb") as stream:
-        np.savez(stream, **cast(dict[str, Any], arrays))
+    write_arrays(file, arrays)
 
 
 def _read(file: Path, index: int) -> Placed | None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.landmarks import LANDMARK_FORMATS, csv_text
 
 FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
 """Of the files that hold the landmarks of a fit, after NAME."""
@@ -36,7 +34,7 @@ def fiducial_texts(found: Found) -> dict[str, str]:
 
 def _table(found: Found) -> str:
     header = ["name", *_AXES, *(f"stddev_{axis}_mm" for axis in _AXES)]
-    return _csv([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
+    return csv_text([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
 
 
 def _markups(found: Found) -> str:
@@ -52,7 +50,7 @@ def _fcsv(found: Found) -> str:
         [str(number), *_told(one["at"]), "0", "0", "0", "1", "1", "1", "0", name, _described(one["stddev_mm"]), ""]
         for number, (name, one) in enumerate(found.items(), 1)
     ]
-    return _FCSV + _csv(rows)
+    return _FCSV + csv_text(rows)
 
 
 def _told(numbers: Sequence[float] | None) -> list[str]:
@@ -61,9 +59,3 @@ def _told(numbers: Sequence[float] | None) -> list[str]:
 
 def _described(stddev_mm: Sequence[float] | None) -> str:
     return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"
-
-
-def _csv(rows: Sequence[Sequence[str]]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()

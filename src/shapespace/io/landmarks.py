@@ -143,7 +143,7 @@ def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
-    write_text(Path(path), _csv_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
+    write_text(Path(path), csv_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
 
 
 def _format(path: Path, verb: str) -> LandmarkFormat:
@@ -365,7 +365,8 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     return out
 
 
-def _csv_text(rows: Iterable[Iterable[str]]) -> str:
+def csv_text(rows: Iterable[Iterable[str]]) -> str:
+    """Return `rows` as CSV, each ended by a line feed."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
@@ -373,7 +374,7 @@ def _csv_text(rows: Iterable[Iterable[str]]) -> str:
 
 def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
     rows = [[name, *map(repr, _numbers(point))] for name, point in landmarks.items()]
-    return _csv_text([["name", "x", "y", "z"], *rows])
+    return csv_text([["name", "x", "y", "z"], *rows])
 
 
 def _text_lines(data: bytes) -> list[str]:
@@ -437,7 +438,7 @@ def _write_fcsv(landmarks: Mapping[str, FloatArray]) -> str:
         [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, "", ""]
         for i, (name, point) in enumerate(landmarks.items(), start=1)
     )
-    return head + _csv_text(rows)
+    return head + csv_text(rows)
 
 
 def _read_tps(data: bytes, path: Path) -> Pairs:
