@@ -3,14 +3,15 @@
 import gzip
 import io
 import struct
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hand_made import las, pcd
 
+from refusals import refusal_of
 from shapespace.commands.look import check
-from shapespace.errors import FileFormatError
 from shapespace.io import limits
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import MESH_ENDINGS, ending_of, read_mesh, stem_of, write_mesh
@@ -20,12 +21,7 @@ POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32).astype
 NAN = float("nan")
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(FileFormatError) as caught:
-        read_mesh(path)
-    text = str(caught.value)
-    assert path.name in text and text.endswith(".") and "\n" not in text
-    return text
+refusal = partial(refusal_of, read_mesh)
 
 
 def rows(*more: float, separator: str = " ") -> str:

@@ -1,21 +1,16 @@
 """Landmarks of 3D Slicer, tps programs, scalismo and plain rows, in files as those programs write them."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hand_made import FCSV, TPS
 
-from shapespace.errors import FileFormatError
+from refusals import refusal_of
 from shapespace.io.landmarks import read_landmarks, write_landmarks
 
-
-def refusal(path: Path) -> str:
-    with pytest.raises(FileFormatError) as caught:
-        read_landmarks(path)
-    text = str(caught.value)
-    assert path.name in text and text.endswith(".") and "\n" not in text
-    return text
+refusal = partial(refusal_of, read_landmarks)
 
 
 def test_fiducials_in_ras_are_turned_to_lps(write):

@@ -1,9 +1,11 @@
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from refusals import refusal_of
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.landmarks import (
     LANDMARK_FORMATS,
@@ -21,13 +23,7 @@ POINTS = {
 }
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(FileFormatError) as caught:
-        read_landmarks(path)
-    text = str(caught.value)
-    assert path.name in text
-    assert text.endswith(".") and "\n" not in text
-    return text
+refusal = partial(refusal_of, read_landmarks)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -1,12 +1,12 @@
 """Templates of MeshMonk and others in MATLAB files, written by scipy as MATLAB has them."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.io import savemat
 
-from shapespace.errors import FileFormatError
+from refusals import refusal_of
 from shapespace.io.folders import mesh_files
 from shapespace.io.meshes import MESH_ENDINGS, NAMED_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
@@ -15,12 +15,7 @@ VERTICES = np.random.default_rng(0).normal(size=(9, 3))
 FACES = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 8], [6, 7, 8]])
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(FileFormatError) as caught:
-        read_mesh(path)
-    text = str(caught.value)
-    assert path.name in text and text.endswith(".") and "\n" not in text
-    return text
+refusal = partial(refusal_of, read_mesh)
 
 
 def test_the_structure_with_vertices_and_faces_is_the_mesh(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from hand_made import gltf_tree, vtk_5_1
 from test_fuzz_readers import MESHES
 
-from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from refusals import refusal_of
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
@@ -17,12 +19,7 @@ MARK = b"\xef\xbb\xbf"
 BINARY = (".stl", ".glb", ".bnt", ".las")
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(FileFormatError) as caught:
-        read_mesh(path)
-    text = str(caught.value)
-    assert path.name in text and text.endswith(".") and "\n" not in text
-    return text
+refusal = partial(refusal_of, read_mesh)
 
 
 def globe(size: float = 100.0) -> Mesh:
