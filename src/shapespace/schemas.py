@@ -647,24 +647,96 @@ class MeshesPart(Part, frozen=True, kw_only=True, tag="meshes"):
 
 
 class Series(Struct, frozen=True, kw_only=True):
-    """One line of a curve."""
+    """One line of a curve, with a band around it where there is one; `points` are dots without a line."""
 
     x: tuple[float, ...]
     y: tuple[float, ...]
     label: str = ""
+    low: tuple[float | None, ...] | None = None
+    high: tuple[float | None, ...] | None = None
+    points: bool = False
 
 
 class CurvePart(Part, frozen=True, kw_only=True, tag="curve"):
-    """One measure against another; `x` and `y` say what they are."""
+    """One measure against another; `x` and `y` say what they are.
+
+    On a `probit` scale shares stand at their normal deviates, as in a DET curve; `diagonal` draws y = x.
+    """
 
     series: tuple[Series, ...]
     x: str = "x"
     y: str = "y"
+    x_scale: Literal["linear", "log", "probit"] = "linear"
+    y_scale: Literal["linear", "log", "probit"] = "linear"
+    diagonal: bool = False
+
+
+class SurfaceMapPart(Part, frozen=True, kw_only=True, tag="surface_map"):
+    """A surface in an .npz file with a number a vertex, seen from several sides.
+
+    Args:
+        arrays: the file; the next three are names of arrays in it.
+        vertices: (V, 3) mm.
+        faces: (F, 3); empty where the surface has none.
+        values: (V,); NaN where there is none.
+        mask: name of a (V,) boolean array, outside which the colour is pale; empty for none.
+        unit: of the numbers.
+        signed: whether two colours part at zero.
+        limit: where the colours end, in `unit`; None for what 98 % of the numbers stay below.
+    """
+
+    arrays: str
+    vertices: str = "vertices"
+    faces: str = "faces"
+    values: str = "values"
+    mask: str = ""
+    unit: str = "mm"
+    signed: bool = True
+    limit: float | None = None
+
+
+class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
+    """Two shapes in correspondence in an .npz file, between which a slider moves.
+
+    Args:
+        arrays: the file; the next three are names of arrays in it.
+        low: (V, 3) mm.
+        high: (V, 3) mm.
+        faces: (F, 3).
+        low_label: what `low` is.
+        high_label: what `high` is.
+        times: by how much the difference is exaggerated in both; 1 is as it is.
+    """
+
+    arrays: str
+    low: str = "low"
+    high: str = "high"
+    faces: str = "faces"
+    low_label: str = "low"
+    high_label: str = "high"
+    times: float = 1.0
+
+
+class Counts(Struct, frozen=True, kw_only=True):
+    """How many values fall between each pair of `edges` of a histogram."""
+
+    counts: tuple[float, ...]
+    label: str = ""
+
+
+class HistogramPart(Part, frozen=True, kw_only=True, tag="histogram"):
+    """How values are spread; `observed` is a line at one of them, such as a statistic among its permutations."""
+
+    edges: tuple[float, ...]
+    series: tuple[Counts, ...]
+    x: str = "value"
+    observed: float | None = None
+    observed_label: str = ""
 
 
 _PARTS = (
     TextPart | TablePart | ConfusionPart | CalibrationPart | LearningCurvePart | ModesPart | FaceMapPart | LinesPart
-    | MeshesPart | CurvePart
+    | MeshesPart | CurvePart | SurfaceMapPart | MorphPart | HistogramPart
 )  # fmt: skip
 PARTS: Mapping[str, type[Part]] = {str(kind.__struct_config__.tag): kind for kind in get_args(_PARTS)}
 """What a part is, by its kind."""
@@ -710,3 +782,19 @@ class Recognition(Struct, frozen=True, kw_only=True):
         for part in study.parts:
             read_part(part, where, again)
         return study
+
+
+# analysis.json
+
+
+class Analysis(Recognition, frozen=True, kw_only=True):
+    """An analysis.json: an answer about a cohort, by the command in `question`, as parts like those of a study."""
+
+    CALLED: ClassVar = "the result of an analysis"
+    FORMAT: ClassVar = "shapespace analysis"
+    VERSION: ClassVar = 1
+    FILE: ClassVar = "analysis.json"
+
+    format: str = FORMAT
+    question: str = ""
+    notes: tuple[str, ...] = ()

@@ -29,7 +29,7 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
-from shapespace.commands.corresponding import json_of
+from shapespace.store.corresponding import json_of
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel

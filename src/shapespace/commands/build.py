@@ -15,7 +15,6 @@ from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.results import read_record
 from shapespace.commands.about import ABOUT, read_about
-from shapespace.commands.corresponding import surface_files
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
@@ -28,6 +27,7 @@ from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.scans import NEUTRAL
+from shapespace.store.corresponding import surface_files
 from shapespace.store.results import is_result, mesh_at
 from shapespace.types import MM_PER_UNIT, Mesh, common_faces
 from shapespace.version import __version__

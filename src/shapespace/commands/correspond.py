@@ -18,7 +18,6 @@ from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.batch.where import Where
-from shapespace.commands.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
@@ -42,6 +41,7 @@ from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
+from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.types import Mesh
 from shapespace.version import __version__
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from shapespace.batch.fit_work import naming
 from shapespace.batch.results import read_record
-from shapespace.commands.corresponding import json_of
 from shapespace.errors import FileError, ShapespaceError
 from shapespace.geometry.doctor import examine
 from shapespace.geometry.surface import faces_of
@@ -21,6 +20,7 @@ from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
+from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
 
 

@@ -13,7 +13,6 @@ from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.quality_work import QualityElsewhere
 from shapespace.batch.where import Where
-from shapespace.commands.corresponding import SURFACE, surface_files
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
@@ -24,6 +23,7 @@ from shapespace.model.quality import Curve, ModelQuality, QualitySettings, Runne
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
+from shapespace.store.corresponding import SURFACE, surface_files
 from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 

@@ -1,0 +1,1 @@
+"""The commands that answer questions about cohorts: each module holds the arguments of one, and what runs it."""

@@ -1,0 +1,71 @@
+"""What the commands about cohorts share: their arguments, the cohort that these name, and how an answer is told."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shapespace.cli.printing import say, show, show_json
+
+if TYPE_CHECKING:
+    from shapespace.cohort.cohort import Cohort
+    from shapespace.geometry.procrustes import Gauge
+    from shapespace.statistics.answer import Answer
+
+
+def add_cohort(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments that name a cohort, and where the answer is written."""
+    sub.add_argument("data", type=Path, metavar="DATA",
+                     help="a CSV table whose column file, scan, name or id names a shape in each row; or a folder of "
+                     "fits, whose metadata are the table")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
+    sub.add_argument("--shapes", type=Path, metavar="DIR",
+                     help="results of fits, or meshes in correspondence (default: the folder of DATA)")  # fmt: skip
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits, where it was moved")
+    sub.add_argument("--surfaces", choices=("coefficients", "fitted", "dense"), default="coefficients",
+                     help="what of a fit stands for its shape (default: coefficients)")  # fmt: skip
+    sub.add_argument("--doubtful", action="store_true", help="take doubtful fits too (default: left out and counted)")
+    sub.add_argument("--drop-missing", action="store_true",
+                     help="leave out shapes of which something is missing in the table (default: refused)")  # fmt: skip
+
+
+def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
+    """Add the choice between shapes and forms."""
+    sub.add_argument("--gauge", choices=("form", "shape"), default=default,
+                     help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
+
+
+def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None) -> Cohort:
+    """Return the cohort that `add_cohort` asked for; `gauge` stands for `add_gauge` where a command has no choice."""
+    from shapespace.batch.progress import progress
+    from shapespace.cohort.read import CohortOptions, read_cohort
+
+    options = CohortOptions(
+        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful
+    )
+    with progress(None, "reading", "shape", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return read_cohort(arguments.data, options, on_shape=step)
+
+
+def finish(answer: Answer, arguments: argparse.Namespace) -> int:
+    """Write the answer and its report, and tell of it."""
+    from shapespace.commands.answers import keep_answer
+    from shapespace.schemas import to_json
+
+    report, notes = keep_answer(answer, arguments.output, quiet=arguments.quiet)
+    for note in notes:
+        say(note)
+    if arguments.json:
+        told = to_json(answer.analysis())
+        show_json({"folder": str(arguments.output), "report": None if report is None else str(report), **told})
+        return 0
+    for sentence in answer.summary:
+        show(sentence)
+    show(f"The report is {report}" if report is not None else f"All numbers are in {arguments.output}")
+    return 0

@@ -1,0 +1,306 @@
+"""A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of what is known of them.
+
+Squared distances of coefficients are those of the shapes, so what sums over vertices (Procrustes distance, sums of
+squares) needs the coefficients alone, whatever the number of vertices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.table import Table, named, numbers_as_text
+from shapespace.errors import CorrespondenceError, InputError
+from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, IntArray, Mesh, read_only
+
+_ORTHONORMAL = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What the fits of a cohort tell beside its shapes.
+
+    Args:
+        model: they are by.
+        b: (N, K) coefficients, mm.
+        b_stddev: (N, K) standard deviations of them, mm.
+        status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
+        folder: of the results, as it was given.
+    """
+
+    model: ShapeModel
+    b: FloatArray
+    b_stddev: FloatArray
+    status: tuple[str, ...]
+    folder: str
+
+    @cached_property
+    def z(self) -> FloatArray:
+        """(N, K) coefficients in standard deviations of the model."""
+        return read_only(self.model.to_z(self.b))
+
+    def take(self, rows: Sequence[int]) -> Fitted:
+        """Return those of some rows."""
+        at = np.asarray(rows, dtype=np.intp)
+        return replace(
+            self,
+            b=read_only(self.b[at]),
+            b_stddev=read_only(self.b_stddev[at]),
+            status=tuple(self.status[row] for row in rows),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Cohort:
+    """N shapes in correspondence; shape i has the vertices reference + coefficients[i] basis, in one frame.
+
+    Args:
+        names: of the shapes.
+        reference: (V, 3) mm, from which coefficients are counted; not the mean of these shapes.
+        basis: (K, 3V) orthonormal rows.
+        coefficients: (N, K) mm, norms over all vertices.
+        sizes_mm: (N,) centroid sizes of the objects themselves; NaN where not known. In the `shape` gauge they are
+            divided out of the coefficients.
+        table: what is known of each, N rows in this order.
+        gauge: `shape` or `form`.
+        faces: (F, 3) triangles; None for points.
+        landmarks: name -> vertex.
+        fitted: of fits; None for other surfaces.
+        notes: who was left out and why, a sentence each.
+    """
+
+    names: tuple[str, ...]
+    reference: FloatArray
+    basis: FloatArray
+    coefficients: FloatArray
+    sizes_mm: FloatArray
+    table: Table
+    gauge: Gauge = "shape"
+    faces: IntArray | None = None
+    landmarks: Mapping[str, int] | None = None
+    fitted: Fitted | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        agree = (
+            self.coefficients.shape == (n, len(self.basis))
+            and self.basis.shape[1] == self.reference.size
+            and self.sizes_mm.shape == (n,)
+            and len(self.table) == n
+        )
+        if not agree:
+            raise InputError("A cohort needs a row of coefficients, a size and a row of the table for each shape.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, V."""
+        return len(self.reference)
+
+    def vertices(self, shape: int | FloatArray) -> FloatArray:
+        """Return the vertices (V, 3), mm, of a shape by its number, or of coefficients (K,)."""
+        own = self.coefficients[shape] if isinstance(shape, int) else shape
+        return self.reference + (own @ self.basis).reshape(-1, 3)
+
+    def mesh(self, shape: int | FloatArray, name: str = "") -> Mesh:
+        """Return the same as a mesh."""
+        called = name or (self.names[shape] if isinstance(shape, int) else "shape")
+        return Mesh(self.vertices(shape), self.faces, name=called)
+
+    def displacements(self, vertices: slice) -> FloatArray:
+        """Return the (N, m, 3) displacements, mm, of some vertices from the reference, in all shapes."""
+        chosen = self.basis.reshape(len(self.basis), -1, 3)[:, vertices]
+        return np.tensordot(self.coefficients, chosen, axes=1)
+
+    def take(self, rows: Sequence[int], *notes: str) -> Cohort:
+        """Return the cohort of some of its shapes, in their order, with further notes."""
+        at = np.asarray(rows, dtype=np.intp)
+        return replace(
+            self,
+            names=tuple(self.names[row] for row in rows),
+            coefficients=read_only(self.coefficients[at]),
+            sizes_mm=read_only(self.sizes_mm[at]),
+            table=self.table.take(rows),
+            fitted=None if self.fitted is None else self.fitted.take(rows),
+            notes=(*self.notes, *notes),
+        )
+
+    def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
+        """Return the cohort of the shapes of which all `columns` are known.
+
+        Args:
+            columns: of the table.
+            drop_missing: leave out the others, and say so in a note.
+
+        Raises:
+            InputError: there is no such column, something is missing and `drop_missing` is not set, or nobody is left.
+        """
+        missing = self.table.missing(columns)
+        if not missing:
+            return self
+        who = named([self.names[row] for row in missing])
+        if not drop_missing:
+            raise InputError(
+                f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "
+                f"({who}); fill it in, or leave them out with --drop-missing."
+            )
+        if len(missing) == len(self):
+            raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
+        lost = set(missing)
+        note = f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing ({who})."
+        return self.take([row for row in range(len(self)) if row not in lost], note)
+
+    @staticmethod
+    def of_shapes(
+        shapes: FloatArray,
+        columns: Mapping[str, Sequence[object]],
+        *,
+        names: Sequence[str] | None = None,
+        faces: IntArray | None = None,
+        gauge: Gauge = "shape",
+        align: bool = True,
+        landmarks: Mapping[str, int] | None = None,
+    ) -> Cohort:
+        """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
+
+        Args:
+            shapes: (N, V, 3) mm.
+            columns: name -> N values, of the table; None and NaN are missing.
+            names: of the shapes; None numbers them.
+            faces: (F, 3) triangles.
+            gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
+            align: False takes them as they stand.
+            landmarks: name -> vertex.
+
+        Raises:
+            InputError: fewer than two shapes, values that are not finite, columns of another length, or two shapes
+                that are the same.
+        """
+        shapes = np.array(shapes, dtype=np.float64)
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < 2 or not np.isfinite(shapes).all():
+            raise InputError(f"A cohort needs two or more finite shapes (N, V, 3), not {shapes.shape}.")
+        called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
+        cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
+        sizes = read_only([centroid_size(shape) for shape in shapes])
+        if align:
+            align_in_place(shapes, gauge)
+            if gauge == "shape":
+                scale_to_tangent(shapes)
+        reference = shapes.mean(axis=0)
+        basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
+        cohort = Cohort(
+            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks
+        )
+        refuse_twice(cohort)
+        return cohort
+
+    @staticmethod
+    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape") -> Cohort:
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes.
+
+        Raises:
+            CorrespondenceError: meshes that differ in vertices or triangles.
+            InputError: as `of_shapes`.
+        """
+        first = meshes[0]
+        for mesh in meshes[1:]:
+            if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
+                raise CorrespondenceError(
+                    f"{mesh.name} has other vertices or triangles than {first.name}; only meshes in correspondence "
+                    "can be compared, so bring the scans to it with shapespace correspond."
+                )
+        shapes = np.stack([mesh.vertices for mesh in meshes])
+        names = [mesh.name for mesh in meshes]
+        return replace(Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge), table=table)
+
+    @staticmethod
+    def of_fits(
+        fitted: Fitted, names: Sequence[str], table: Table, sizes_mm: FloatArray, gauge: Gauge = "shape"
+    ) -> Cohort:
+        """Return the cohort of fits: in the model's frame, where their poses are divided out already.
+
+        Args:
+            fitted: the coefficients.
+            names: N.
+            table: N rows.
+            sizes_mm: (N,) centroid sizes of the objects, mm.
+            gauge: `form` brings each to its own size.
+
+        Raises:
+            InputError: the `form` gauge, and a size that is not known; two fits that are the same.
+        """
+        model = fitted.model
+        modes = fitted.b.shape[1]
+        rows = model.vertex_basis[:, :modes].T
+        b = fitted.b
+        reference = model.mean_vertices
+        if gauge == "form":
+            if not np.isfinite(sizes_mm).all():
+                lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
+                raise InputError(
+                    f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                    "or compare shapes with --gauge shape."
+                )
+            shapes = [reference + (row @ rows).reshape(-1, 3) for row in b]
+            scales = sizes_mm / np.array([centroid_size(shape) for shape in shapes])
+            b = np.column_stack([b * scales[:, None], scales - scales.mean()])
+            rows = np.vstack([rows, reference.reshape(1, -1)])
+            reference = reference * float(scales.mean())
+        basis, coefficients = _in_basis(rows, b)
+        cohort = Cohort(
+            tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
+            dict(model.landmarks), fitted,
+        )  # fmt: skip
+        refuse_twice(cohort)
+        return cohort
+
+
+def refuse_twice(cohort: Cohort) -> None:
+    """Check that no two shapes are the same, as of a scan that was copied.
+
+    Raises:
+        InputError: two are; the sentence names them.
+    """
+    first: dict[bytes, str] = {}
+    for name, row in zip(cohort.names, cohort.coefficients, strict=True):
+        known = first.setdefault(row.tobytes(), name)
+        if known != name:
+            raise InputError(f"{known} and {name} are the same to the last digit; leave out one of them.")
+
+
+def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:
+    """Return the cohort with further columns of numbers (N,) in its table."""
+    told = {name: numbers_as_text(values) for name, values in columns.items()}
+    table = replace(cohort.table, columns={**cohort.table.columns, **told})
+    return replace(cohort, table=table)
+
+
+def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return an orthonormal basis (K, D) of `rows` (N, D), and their coefficients (N, K) in it."""
+    q, r = np.linalg.qr(rows.T)
+    return read_only(q.T), read_only(r.T)
+
+
+def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the same for combinations `coefficients` (N, K) of `rows` (K, D), which stay as they are if they can."""
+    if np.abs(rows @ rows.T - np.eye(len(rows))).max() <= _ORTHONORMAL:
+        return read_only(rows), read_only(coefficients)
+    q, r = np.linalg.qr(rows.T)
+    return read_only(q.T), read_only(coefficients @ r.T)
+
+
+def _same_faces(one: npt.NDArray[np.int32] | None, other: npt.NDArray[np.int32] | None) -> bool:
+    return (one is None and other is None) or (one is not None and other is not None and np.array_equal(one, other))
+
+
+def _cell(value: object) -> str:
+    return "" if value is None or value != value else str(value)

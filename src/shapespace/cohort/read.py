@@ -1,0 +1,288 @@
+"""Cohorts from files: results of fits, or surfaces in correspondence, with a table of what is known of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.table import Table, named, read_table
+from shapespace.errors import InputError
+from shapespace.geometry.procrustes import Gauge
+from shapespace.io.meshes import stem_of
+from shapespace.model.shape_model import ShapeModel
+from shapespace.store.corresponding import SURFACE, surface_files
+from shapespace.store.results import ENDINGS, Results, mesh_at, modes_of
+from shapespace.store.rows import META
+from shapespace.types import FloatArray, Mesh, read_only
+
+Surfaces: TypeAlias = Literal["coefficients", "fitted", "dense"]
+SURFACES: tuple[Surfaces, ...] = ("coefficients", "fitted", "dense")
+"""What of a fit stands for its shape: the model's coefficients, or a surface beside its record."""
+
+_USED = ("converged", "max_iterations")
+_ENDINGS = (*ENDINGS.values(), SURFACE)
+
+
+@dataclass(frozen=True)
+class CohortOptions:
+    """Which shapes, and how they are made comparable.
+
+    Args:
+        shapes: folder of the results of fits, or of meshes in correspondence; None for that of the table.
+        model: file of the model of the fits; None goes by their records.
+        surfaces: one of `SURFACES`.
+        gauge: `shape` divides size out, `form` keeps it.
+        doubtful: take doubtful fits too.
+    """
+
+    shapes: Path | None = None
+    model: Path | None = None
+    surfaces: Surfaces = "coefficients"
+    gauge: Gauge = "shape"
+    doubtful: bool = False
+
+
+def read_cohort(
+    data: Path | str, options: CohortOptions | None = None, *, on_shape: Callable[[int, int], None] | None = None
+) -> Cohort:
+    """Return the shapes of the rows of a table, or of all fits in a folder with what their records know.
+
+    Doubtful and failed fits are left out, counted and said in the notes, as are rows without a shape and shapes
+    without a row.
+
+    Args:
+        data: a CSV table whose column `file`, `scan`, `name` or `id` names a shape in each row (coefficients.csv is
+            one), or a folder of results of fits, whose metadata are the table.
+        options: which shapes; None for the defaults.
+        on_shape: called with (done, total) as surfaces are read.
+
+    Raises:
+        FileError: something cannot be read.
+        FileFormatError: something is damaged, or the table is none.
+        InputError: no row has a shape, fits of different models, the same scan twice, or fewer than two shapes.
+        CorrespondenceError: meshes that are not in correspondence.
+    """
+    data, options = Path(data), options or CohortOptions()
+    table, keys = (None, ()) if data.is_dir() else read_table(data)
+    folder = options.shapes or (data if table is None else data.parent)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder} is no folder; give the results of fits, or meshes in correspondence, with --shapes."
+        )
+    results = Results(folder)
+    if len(results):
+        return _of_results(results, table, keys, options, on_shape)
+    if table is None:
+        raise InputError(
+            f"{folder} holds no results of fits; give a CSV table of its meshes, and the folder as --shapes."
+        )
+    return _of_surfaces(folder, table, keys, options, on_shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    name: str
+    status: str
+    scan_name: str
+    scan_hash: str
+    model_hash: str
+    b: FloatArray
+    b_stddev: FloatArray
+    size_mm: float
+    mm_per_unit: float
+    known: Mapping[str, str]
+
+
+def _rows(results: Results) -> list[_Row]:
+    modes = range(1, modes_of(results) + 1)
+    known = sorted(column for column in results.column_names() if column.startswith(META))
+    texts = ("scan", "status", "scan_name", "scan_hash", "model_hash")
+    columns = (*texts, "centroid_size_mm", "mm_per_scan_unit", "modes", *known)
+    numbers = [*(f"b{k}" for k in modes), *(f"b{k}_stddev" for k in modes)]
+    found: list[_Row] = []
+    for part in results.iter_rows((*columns, *numbers)):
+        values = np.array([part[column] for column in numbers], dtype=np.float64).reshape(2, len(modes), -1)
+        for at in range(len(part["scan"])):
+            own = int(part["modes"][at] or 0)
+            found.append(
+                _Row(
+                    str(part["scan"][at] or ""),
+                    str(part["status"][at] or ""),
+                    str(part["scan_name"][at] or ""),
+                    str(part["scan_hash"][at] or ""),
+                    str(part["model_hash"][at] or ""),
+                    values[0, :own, at],
+                    values[1, :own, at],
+                    _number(part["centroid_size_mm"][at]),
+                    _number(part["mm_per_scan_unit"][at]),
+                    {column.removeprefix(META): str(part[column][at] or "").strip() for column in known},
+                )
+            )
+    return sorted(found, key=lambda row: row.name)
+
+
+def _of_results(
+    results: Results,
+    table: Table | None,
+    keys: Sequence[str],
+    options: CohortOptions,
+    on_shape: Callable[[int, int], None] | None,
+) -> Cohort:
+    rows = _rows(results)
+    notes = list(results.problems)
+    used = (*_USED, "doubtful") if options.doubtful else _USED
+    if table is None:
+        heads = dict.fromkeys(head for row in rows for head in row.known)
+        cells = {head: tuple(row.known.get(head, "") for row in rows) for head in heads}
+        table = Table(cells, tuple(row.name for row in rows), str(results.folder))
+        pairs = [(row, at) for at, row in enumerate(rows)]
+    else:
+        by_key = _by_key(rows)
+        pairs = [(by_key[key], at) for at, key in enumerate(keys) if key in by_key]
+        _tell_unmatched(
+            notes, table, keys, by_key, [row.name for row, _ in pairs], [row.name for row in rows], results.folder
+        )
+    kept = [(row, at) for row, at in pairs if row.status in used]
+    for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
+        who = named([row.name for row, _ in pairs if row.status == status])
+        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
+    if len(kept) < 2:
+        raise InputError(
+            f"{results.folder}: {len(kept)} of its fits can be used, and two are the least; "
+            + (notes[-1] if notes else "fit more scans.")
+        )
+    fits = [row for row, _ in kept]
+    _refuse_mixed(fits, results.folder)
+    model = _model_of(results, fits[0], options.model)
+    stated = table.take([at for _, at in kept])
+    names = tuple(row.name for row in fits)
+    sizes = read_only([row.size_mm for row in fits])
+    width = max(len(row.b) for row in fits)
+    fitted = Fitted(
+        model,
+        read_only([np.pad(row.b, (0, width - len(row.b))) for row in fits]),
+        read_only([np.pad(row.b_stddev, (0, width - len(row.b_stddev))) for row in fits]),
+        tuple(row.status for row in fits),
+        str(results.folder),
+    )
+    if options.surfaces == "coefficients":
+        cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
+    else:
+        lacking = [name for name in names if not results.has(name, options.surfaces)]
+        if lacking:
+            raise InputError(f"{results.folder} holds no {options.surfaces} surface of {named(lacking)}; fit them again"
+                             f"{' with --dense' if options.surfaces == 'dense' else ''}.")  # fmt: skip
+        meshes: list[Mesh] = []
+        for at, row in enumerate(fits):
+            mesh = results.surface(row.name, options.surfaces)
+            ratio = row.mm_per_unit if np.isfinite(row.mm_per_unit) else 1.0
+            meshes.append(replace(mesh.with_vertices(mesh.vertices * ratio), name=row.name))
+            if on_shape is not None:
+                on_shape(at + 1, len(fits))
+        cohort = replace(
+            Cohort.of_meshes(meshes, stated, options.gauge), fitted=fitted, landmarks=dict(model.landmarks)
+        )
+    return replace(cohort, notes=(*notes, *cohort.notes))
+
+
+def _of_surfaces(
+    folder: Path,
+    table: Table,
+    keys: Sequence[str],
+    options: CohortOptions,
+    on_shape: Callable[[int, int], None] | None,
+) -> Cohort:
+    found = surface_files([folder])
+    notes = list(found.notes)
+    if options.gauge == "form":
+        found.refuse_mixed_units()
+    files = {_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
+    kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
+    _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
+    if len(kept) < 2:
+        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and two are the least.")
+    meshes: list[Mesh] = []
+    for done, (file, _) in enumerate(kept, 1):
+        mesh = mesh_at(file)
+        ratio = found.unit_ratios.get(file, 1.0)
+        meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=_stem(file)))
+        if on_shape is not None:
+            on_shape(done, len(kept))
+    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge)
+    return replace(cohort, notes=(*notes, *cohort.notes))
+
+
+def _tell_unmatched(
+    notes: list[str],
+    table: Table,
+    keys: Sequence[str],
+    there: Mapping[str, Any],
+    used: Sequence[str],
+    names: Sequence[str],
+    folder: Path,
+) -> None:
+    """Add a note on rows without a shape and shapes without a row.
+
+    Raises:
+        InputError: no row has a shape.
+    """
+    unknown = [key for key in keys if key not in there]
+    if len(unknown) == len(keys):
+        raise InputError(
+            f"{folder} holds no shape of {table.where} (such as {named(unknown)}; there is {named(names)}); give the "
+            "folder of its shapes with --shapes."
+        )
+    if unknown:
+        notes.append(
+            f"{len(unknown)} of {len(keys)} rows of {table.where} are left out, whose shape is not in "
+            f"{folder} ({named(unknown)})."
+        )
+    rest = sorted(set(names) - set(used))
+    if rest:
+        notes.append(f"{len(rest)} of {len(names)} shapes in {folder} have no row in {table.where} ({named(rest)}).")
+
+
+def _by_key(rows: Sequence[_Row]) -> dict[str, _Row]:
+    """Return fits by the names of their scans, and by their own, which count for more."""
+    scans = Counter(stem_of(row.scan_name) for row in rows)
+    by_scan = {stem_of(row.scan_name): row for row in rows if scans[stem_of(row.scan_name)] == 1}
+    return by_scan | {row.name: row for row in rows}
+
+
+def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
+    hashes = sorted({row.model_hash for row in fits})
+    if len(hashes) > 1:
+        raise InputError(
+            f"{folder} holds fits of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:3])}), whose "
+            "coefficients cannot be compared; fit all scans with one model."
+        )
+    first: dict[str, str] = {}
+    for row in fits:
+        known = first.setdefault(row.scan_hash or row.name, row.name)
+        if known != row.name:
+            raise InputError(f"{known} and {row.name} are fits of the same scan; leave one of them out of the table.")
+
+
+def _model_of(results: Results, fit: _Row, given: Path | None) -> ShapeModel:
+    source: dict[str, Any] = results.record(fit.name)["model"]
+    path = given or results.folder / str(source.get("path") or source.get("name", ""))
+    if given is None and not path.is_file():
+        raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
+    model = ShapeModel.load(path)
+    if model.content_hash != fit.model_hash:
+        raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
+    return model
+
+
+def _stem(file: Path) -> str:
+    return next((file.name.removesuffix(end) for end in _ENDINGS if file.name.endswith(end)), stem_of(file))
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)

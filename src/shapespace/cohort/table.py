@@ -1,0 +1,179 @@
+"""A table of what is known of shapes, such as subject, sex and age: one row each, read from CSV."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Literal
+
+import numpy as np
+
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.files import read_bytes
+from shapespace.io.json_files import check_file
+from shapespace.io.meshes import stem_of
+from shapespace.io.tables import CHECKSUM, table_rows
+from shapespace.types import FloatArray, read_only
+
+NAMES = ("file", "scan", "name", "id")
+"""The columns that may name the shape of a row; the first that is there does."""
+
+_META = "meta_"
+_MISSING = frozenset({"", "na", "nan", "n/a", "null", "none"})
+_LARGEST_BYTES = 2**28
+_NAMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What is known of N shapes, as text.
+
+    Args:
+        columns: name -> N cells; a cell that says nothing is empty.
+        rows: what each row is called in messages, N of them.
+        where: what the table is called in messages.
+
+    Raises:
+        InputError: columns of another length.
+    """
+
+    columns: Mapping[str, tuple[str, ...]]
+    rows: tuple[str, ...]
+    where: str = "The table"
+
+    def __post_init__(self) -> None:
+        for name, cells in self.columns.items():
+            if len(cells) != len(self.rows):
+                raise InputError(
+                    f"{self.where}: the column {name!r} has {len(cells)} cells for {len(self.rows)} rows; give one "
+                    "for each."
+                )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def texts(self, column: str) -> tuple[str, ...]:
+        """Return the N cells of a column; one that says nothing is empty.
+
+        Raises:
+            InputError: there is no such column.
+        """
+        if column not in self.columns:
+            there = ", ".join(self.columns) or "no other columns"
+            raise InputError(f"{self.where} has no column {column!r}; it has {there}.")
+        return self.columns[column]
+
+    def kind(self, column: str) -> Literal["number", "text"]:
+        """Return whether a column holds numbers or classes; one of nothing but missing cells holds classes.
+
+        Raises:
+            InputError: there is no such column, or most of its cells are numbers and some are not.
+        """
+        cells = {row: cell for row, cell in zip(self.rows, self.texts(column), strict=True) if cell}
+        odd = [row for row, cell in cells.items() if not _is_number(cell)]
+        if len(odd) * 2 >= len(cells):
+            return "text"
+        if odd:
+            raise InputError(
+                f"{self.where}: {column!r} holds numbers but {cells[odd[0]][:40]!r} at {odd[0]}"
+                f"{_more(len(odd) - 1)}; write a number there, or leave it empty."
+            )
+        return "number"
+
+    def numbers(self, column: str) -> FloatArray:
+        """Return the (N,) numbers of a column; NaN where a cell says nothing.
+
+        Raises:
+            InputError: there is no such column, or a cell is no finite number.
+        """
+        cells = self.texts(column)
+        for row, cell in zip(self.rows, cells, strict=True):
+            if cell and not _is_number(cell):
+                raise InputError(f"{self.where}: {column!r} is {cell[:40]!r} at {row}, which is no number.")
+        return read_only([float(cell) if cell else math.nan for cell in cells])
+
+    def missing(self, columns: Sequence[str]) -> list[int]:
+        """Return the rows in which one of `columns` says nothing.
+
+        Raises:
+            InputError: there is no such column.
+        """
+        found = [self.texts(column) for column in columns]
+        return [row for row in range(len(self)) if not all(cells[row] for cells in found)]
+
+    def take(self, rows: Sequence[int]) -> Table:
+        """Return the table of some rows, in their order."""
+        chosen = {name: tuple(cells[row] for row in rows) for name, cells in self.columns.items()}
+        return Table(chosen, tuple(self.rows[row] for row in rows), self.where)
+
+
+def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
+    """Return a CSV table, and the name of the shape of each row, without folder and ending.
+
+    The shape stands in the column `file`, `scan`, `name` or `id`, the first that is there. Columns of a
+    coefficients.csv that came with the list of its scans lose their `meta_`.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is no such table, or two of its rows are of one shape.
+    """
+    check_file(path, _LARGEST_BYTES, "give a smaller table")
+    try:
+        lines = table_rows(read_bytes(path))
+        heads = [head.strip() for head in next(lines)]
+        rows = [[_plain(cell) for cell in line] for line in lines]
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; write it as CSV with a header.") from error
+    names = next((head for head in NAMES if head in heads), None)
+    if names is None or not rows:
+        raise FileFormatError(f"{path} is no table of shapes; it needs rows, and a column {' or '.join(NAMES)}.")
+    places = [PurePath(row[heads.index(names)].replace("\\", "/")) for row in rows]
+    # Scans of one name in different folders are called by their folders too, as their fits are.
+    several = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
+    keys = tuple(_with_folders(place) if stem_of(place) in several else stem_of(place) for place in places)
+    twice = [key for key, count in Counter(keys).items() if count > 1]
+    if twice:
+        raise FileFormatError(
+            f"{path} has {'two or more rows' if twice[0] else 'a row without a name, or more,'} "
+            f"{'of ' + repr(twice[0][:80]) if twice[0] else ''}{_more(len(twice) - 1)}; keep one row for each shape."
+        )
+    columns: dict[str, tuple[str, ...]] = {}
+    for at, head in enumerate(heads):
+        if head and head not in (CHECKSUM, names):
+            called = head.removeprefix(_META)
+            columns[head if called in heads or not called else called] = tuple(row[at] for row in rows)
+    return Table(columns, keys, str(path)), keys
+
+
+def _with_folders(place: PurePath) -> str:
+    return "_".join((*(part for part in place.parent.parts if part not in (".", "/")), stem_of(place)))
+
+
+def _plain(cell: str) -> str:
+    # The writer of coefficients.csv puts an apostrophe before what a spreadsheet would run.
+    text = (cell[1:] if cell[:1] == "'" and cell[1:2] in tuple("=+-@\t\r") else cell).strip()
+    return "" if text.lower() in _MISSING else "".join(c if c.isprintable() else " " for c in text)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell)) and "_" not in cell
+    except ValueError:
+        return False
+
+
+def _more(count: int) -> str:
+    return f" and {count} more" if count > 0 else ""
+
+
+def named(names: Sequence[str]) -> str:
+    """Return the first of `names` in words, and how many more there are."""
+    return ", ".join(names[:_NAMED]) + _more(len(names) - _NAMED)
+
+
+def numbers_as_text(values: FloatArray) -> tuple[str, ...]:
+    """Return cells that read back as the same numbers; NaN is an empty one."""
+    return tuple("" if np.isnan(value) else repr(float(value)) for value in values)
