@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import math
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, cast
+
+import msgspec
 
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes, read_error
@@ -68,28 +71,32 @@ def plain_json(text: bytes | str) -> Any:
         ValueError: it is not JSON, is nested too deep, or holds a whole number of more than 64 bits.
     """
     try:
-        value: object = json.loads(text)
+        value: object = _decoded(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
-    return _plain(value, 0)
+    held = [value]
+    _make_plain(held, 0)
+    return held[0]
 
 
-def _plain(value: object, depth: int) -> object:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, int):
-        if not -_LARGEST_INT <= value < _LARGEST_INT:
-            raise ValueError("it holds a number that is too large")
-        return value
-    if depth > _DEEPEST:
+def _make_plain(held: dict[Any, object] | list[object], depth: int) -> None:
+    """Check what a container holds, in place, since a large file is larger still in memory."""
+    if depth > _DEEPEST + 1:
         raise ValueError("it is nested too deep")
-    # In place, since a large file is larger still in memory.
-    if isinstance(value, list):
-        items = cast(list[object], value)
-        for at, item in enumerate(items):
-            items[at] = _plain(item, depth + 1)
-    elif isinstance(value, dict):
-        known = cast(dict[str, object], value)
-        for key, item in known.items():
-            known[key] = _plain(item, depth + 1)
-    return cast(object, value)
+    for at, item in cast(Iterable[tuple[Any, object]], held.items() if isinstance(held, dict) else enumerate(held)):
+        kind = item.__class__  # nearly all there is are numbers and words, for which a call would take longest
+        if kind is float:
+            if not math.isfinite(cast(float, item)):
+                held[at] = None
+        elif kind is list or kind is dict:
+            _make_plain(cast(list[object], item), depth + 1)
+        elif kind is int and not -_LARGEST_INT <= cast(int, item) < _LARGEST_INT:
+            raise ValueError("it holds a number that is too large")
+
+
+def _decoded(text: bytes | str) -> object:
+    """Return the value in `text`; what is not strict JSON, such as NaN, is left to the slower reader that takes it."""
+    try:
+        return msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return json.loads(text)
