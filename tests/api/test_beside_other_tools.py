@@ -53,6 +53,38 @@ def same(a: ss.Mesh, b: ss.Mesh) -> bool:
     return bool(np.array_equal(a.vertices, b.vertices) and faces)
 
 
+def coloured(mesh: ss.Mesh) -> ss.Mesh:
+    at = np.arange(len(mesh.vertices))
+    return replace(mesh, colours=np.stack([at % 256, at * 7 % 256, 255 - at % 256], axis=1).astype(np.uint8))
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_colours_go_to_another_tool_and_back(mesh: ss.Mesh, tool: str) -> None:
+    pytest.importorskip(tool)
+    if tool == "menpo":
+        pytest.skip("menpo's own meshes have no colours")
+    for there in (coloured(mesh), replace(coloured(mesh), faces=None)):
+        assert np.array_equal(ss.as_mesh(getattr(there, f"to_{tool}")()).colours, there.colours)  # type: ignore[arg-type]
+
+
+def test_colours_are_taken_as_each_tool_keeps_them_or_not_at_all(mesh: ss.Mesh) -> None:
+    shares = np.linspace(0.0, 1.0, 600).reshape(200, 3)
+    bytes_ = np.rint(255 * shares).astype(np.uint8)
+    known = {"points": mesh.vertices, "n_points": 200, "trilist": mesh.faces}
+    solid = {"vertices": mesh.vertices, "triangles": mesh.faces}
+    for there in (
+        SimpleNamespace(**known, colours=shares), SimpleNamespace(**solid, vertex_colors=shares),
+        SimpleNamespace(**solid, vertex_colors=np.column_stack([bytes_, np.full(200, 255, np.uint8)])),
+        SimpleNamespace(points=mesh.vertices, n_points=200, point_data={"RGB": bytes_}),
+    ):  # fmt: skip
+        assert np.array_equal(ss.as_mesh(there).colours, bytes_)  # type: ignore[arg-type]
+    for there in (
+        SimpleNamespace(**solid, vertex_colors=shares[:5]), SimpleNamespace(**solid, vertex_colors=np.zeros((0, 3))),
+        SimpleNamespace(**known, colours=shares * np.nan), SimpleNamespace(**known, point_data={"red": bytes_[:, 0]}),
+    ):  # fmt: skip
+        assert ss.as_mesh(there).colours is None
+
+
 @pytest.mark.parametrize("tool", TOOLS)
 def test_a_mesh_goes_to_another_tool_and_back_as_it_was(mesh: ss.Mesh, tool: str) -> None:
     pytest.importorskip(tool)

@@ -212,3 +212,12 @@ def test_many_targets_on_one_array_are_refused_before_they_are_made(tmp_path: Pa
     path.write_text(json.dumps(tree))
     with pytest.raises(ShapespaceError, match="unfold to more than"):
         Gltf().read(path)
+
+
+def test_regions_that_another_format_has_no_place_for_are_said_to_be_left_out(tmp_path: Path) -> None:
+    model = dataclasses.replace(blob_model(), regions={"tip": np.arange(9, dtype=np.int32)})
+    model.save(tmp_path / "m.h5")
+    notes = convert(tmp_path / "m.h5", tmp_path / "m.glb", to=None, mm=None)[2]
+    assert any("region tip" in note and "no place" in note for note in notes)
+    assert not any("region" in note for note in convert(tmp_path / "m.h5", tmp_path / "n.h5", to=None, mm=None)[2])
+    assert "tip" in ShapeModel.load(tmp_path / "n.h5").regions

@@ -39,6 +39,11 @@ def convert(
         model.save(output)
     else:
         notes += target.write(linear, output)
+        if regions := sorted((model if isinstance(model, ShapeModel) else model.shape).regions):
+            notes.append(
+                f"Left out: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} "
+                "has no place for."
+            )
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
         notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
     return of, OWN[0] if target is None else target.title, notes

@@ -12,7 +12,7 @@ import numpy as np
 from shapespace.errors import InputError, MeshError
 from shapespace.io.meshes import read_mesh
 from shapespace.late import other_package
-from shapespace.types import IntArray, Mesh
+from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
 """What `as_mesh` takes: a mesh, a path, or a mesh of another tool."""
@@ -21,7 +21,8 @@ MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
 def as_mesh(x: MeshLike, name: str = "") -> Mesh:
     """Return `x` as a mesh, its vertices in their order and own unit, its polygons in triangles.
 
-    Colours, textures and what else other tools keep are left out; landmarks are those of a `Mesh` alone.
+    Colours of vertices come along; textures and what else other tools keep are left out, and landmarks are those of a
+    `Mesh` alone.
 
     Args:
         x: a `Mesh`, which is returned as it is; the path of a mesh file; an object of trimesh, PyVista, Open3D, meshio
@@ -38,13 +39,21 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
     if isinstance(x, str | os.PathLike):
         return read_mesh(Path(cast("str | os.PathLike[str]", x)))
     called = name or _name_of(x)
-    vertices, faces = _parts(x, called)
+    held = _held(x)
+    vertices, faces = _parts(held, called)
     try:
-        return Mesh(np.array(vertices, dtype=np.float64), faces, name=called)
+        return Mesh(np.array(vertices, dtype=np.float64), faces, name=called, colours=_colours_of(held, len(vertices)))
     except (TypeError, ValueError) as error:
         if isinstance(error, MeshError):
             raise
         raise InputError(f"{called}: its vertices are no numbers of the shape (V, 3).") from error
+
+
+def _held(x: Any) -> Any:
+    """Return the mesh that an object of another tool stands for."""
+    if hasattr(x, "to_legacy"):  # Open3D's tensors
+        return x.to_legacy()
+    return x.to_mesh() if hasattr(x, "geometry") and hasattr(x, "to_mesh") else x  # a scene of trimesh
 
 
 def _parts(x: Any, called: str) -> tuple[Any, Any]:
@@ -63,10 +72,6 @@ def _pair(x: Sequence[Any], called: str) -> tuple[Any, Any]:
 
 
 def _parts_of_object(x: Any, called: str) -> tuple[Any, Any]:
-    if hasattr(x, "to_legacy"):  # Open3D's tensors
-        x = x.to_legacy()
-    if hasattr(x, "geometry") and hasattr(x, "to_mesh"):  # a scene of trimesh
-        x = x.to_mesh()
     if hasattr(x, "points") and hasattr(x, "cells") and hasattr(x, "cells_dict"):  # meshio
         return x.points, _of_cells(x.cells_dict, called)
     if hasattr(x, "points") and hasattr(x, "trilist"):  # menpo
@@ -108,6 +113,38 @@ def _of_pyvista(x: Any, called: str) -> tuple[Any, Any]:
     return x.points, np.asarray(x.faces).reshape(-1, 4)[:, 1:]
 
 
+def _colours_of(x: Any, count: int) -> ByteArray | None:
+    """Return the colours (V, 3) of the vertices of an object of another tool, where it has some for each."""
+    told: Any = None
+    if getattr(getattr(x, "visual", None), "kind", None) == "vertex":  # trimesh
+        told = x.visual.vertex_colors
+    elif hasattr(x, "colors"):  # trimesh's and Open3D's clouds
+        told = x.colors
+    elif hasattr(x, "vertex_colors"):  # Open3D
+        told = x.vertex_colors
+    elif hasattr(x, "colours"):  # menpo
+        told = x.colours
+    elif hasattr(x, "point_data"):  # PyVista, and meshio with the columns of PLY
+        named = {str(name).lower(): name for name in x.point_data}
+        if "rgb" in named or "rgba" in named:
+            told = x.point_data[named.get("rgb", named.get("rgba"))]
+        elif {"red", "green", "blue"} <= set(named):
+            told = np.column_stack([np.asarray(x.point_data[named[one]]) for one in ("red", "green", "blue")])
+    try:
+        colours = np.asarray([] if told is None else told)
+    except ValueError:
+        return None
+    if colours.ndim != 2 or len(colours) != count or colours.shape[1] not in (3, 4):
+        return None
+    colours = colours[:, :3]
+    if colours.dtype.kind == "f":
+        if not np.isfinite(colours).all():
+            return None
+        # As Open3D and menpo have them, from 0 to 1.
+        colours = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
+    return np.clip(colours, 0, 255).astype(np.uint8)
+
+
 def _name_of(x: Any) -> str:
     told: Any = getattr(x, "path", None) or getattr(getattr(x, "source", None), "file_name", None)
     metadata: Any = getattr(x, "metadata", None)
@@ -122,34 +159,49 @@ def to_trimesh(mesh: Mesh) -> Any:
     """Return a `trimesh.Trimesh`, or a `trimesh.PointCloud` without triangles; vertices keep their order."""
     trimesh = other_package("trimesh", "Mesh.to_trimesh")
     told = {"name": mesh.name}
+    colours = None if mesh.colours is None else mesh.colours.copy()
     if mesh.faces is None:
-        return trimesh.PointCloud(mesh.vertices.copy(), metadata=told)
-    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False, metadata=told)
+        return trimesh.PointCloud(mesh.vertices.copy(), colors=colours, metadata=told)
+    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=colours, process=False, metadata=told)
 
 
 def to_pyvista(mesh: Mesh) -> Any:
     """Return a `pyvista.PolyData`."""
     pyvista = other_package("pyvista", "Mesh.to_pyvista")
     if mesh.faces is None:
-        return pyvista.PolyData(mesh.vertices.copy())
-    counted = np.insert(mesh.faces.astype(np.int64), 0, 3, axis=1)
-    return pyvista.PolyData(mesh.vertices.copy(), counted.ravel())
+        out = pyvista.PolyData(mesh.vertices.copy())
+    else:
+        counted = np.insert(mesh.faces.astype(np.int64), 0, 3, axis=1)
+        out = pyvista.PolyData(mesh.vertices.copy(), counted.ravel())
+    if mesh.colours is not None:
+        out.point_data["RGB"] = mesh.colours.copy()
+    return out
 
 
 def to_open3d(mesh: Mesh) -> Any:
     """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` without triangles."""
     open3d = other_package("open3d", "Mesh.to_open3d")
     points = open3d.utility.Vector3dVector(mesh.vertices.copy())
+    colours = None if mesh.colours is None else open3d.utility.Vector3dVector(mesh.colours / 255.0)
     if mesh.faces is None:
-        return open3d.geometry.PointCloud(points)
-    return open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(mesh.faces.copy()))
+        out = open3d.geometry.PointCloud(points)
+        if colours is not None:
+            out.colors = colours
+        return out
+    out = open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(mesh.faces.copy()))
+    if colours is not None:
+        out.vertex_colors = colours
+    return out
 
 
 def to_meshio(mesh: Mesh) -> Any:
     """Return a `meshio.Mesh`."""
     meshio = other_package("meshio", "Mesh.to_meshio")
     cells = np.arange(len(mesh.vertices))[:, None] if mesh.faces is None else mesh.faces.copy()
-    return meshio.Mesh(mesh.vertices.copy(), [("vertex" if mesh.faces is None else "triangle", cells)])
+    told = {}
+    if mesh.colours is not None:
+        told = {name: mesh.colours[:, k].copy() for k, name in enumerate(("red", "green", "blue"))}
+    return meshio.Mesh(mesh.vertices.copy(), [("vertex" if mesh.faces is None else "triangle", cells)], point_data=told)
 
 
 def to_menpo(mesh: Mesh) -> Any:

@@ -108,7 +108,10 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
             )
         if SIGNATURE in data[: 2 * _USER_BLOCK]:
             raise damaged
-        raise FileFormatError(f"{path} is not an HDF5 file; give a model written by shapespace build.")
+        raise FileFormatError(
+            f"{path} is not an HDF5 file, nor a model of another tool; give one that shapespace build wrote, or one in "
+            "a format that shapespace convert --help names."
+        )
     if data[:_USER_BLOCK] != _user_block(memoryview(data)[_USER_BLOCK:]):
         raise damaged
     try:
