@@ -5,13 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pytest
 
+import shapespace as ss
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.paper_method import Paper
 from shapespace.fit.settings import DenseSettings, ResidualSettings, RobustSettings
 from shapespace.report.blocks import Block, Facts, Folded, Table
+from shapespace.report.evidence import EVIDENCE, evidence_facts
 from shapespace.report.settings import described, settings_told
+from synthetic_shapes import blob_model, raw_scan
 
 
 def told(blocks: Sequence[Block]) -> str:
@@ -55,3 +59,11 @@ def test_every_number_is_described(settings: type) -> None:
 @pytest.mark.parametrize("damaged", [{}, {"method": 3}, {"method": "robust", "robust": 7}, {"robust": {"levels": [1]}}])
 def test_damaged_settings_break_nothing(damaged: Mapping[str, Any]) -> None:
     assert "Method" in told(settings_told([damaged, config()], []))
+
+
+def test_all_that_the_verdict_goes_by_is_told_in_words() -> None:
+    result = ss.fit_scan(blob_model(), raw_scan(np.array([1.0, -1.0, 0.5, 0.0, 0.3]), vertices=900).scan)
+    assert set(result.evidence) <= set(EVIDENCE), "a new key needs its words in report/evidence.py"
+    told = evidence_facts({**result.evidence, "key_of_later": 2.5}, "Evidence").rows
+    assert len(told) == len(result.evidence) + 1 and told[-1] == ("key of later", "2.5")
+    assert not any("_" in what or what.endswith(" mm") for what, _ in told)

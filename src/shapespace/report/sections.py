@@ -19,9 +19,9 @@ from shapespace.report.blocks import (
     Text,
     Turning,
     Verdict,
-    facts_of,
     status,
 )
+from shapespace.report.evidence import evidence_facts
 from shapespace.report.page import Page
 from shapespace.report.saved import SavedFit
 from shapespace.report.staged import REGIONS, StagedFit, measured_mm, nice_ceiling
@@ -306,7 +306,7 @@ def fit_facts(fit: SavedFit) -> list[Block]:
     if fit.record.notes:
         out.append(Notes(fit.record.notes))
     if fit.record.evidence:
-        out.append(Folded("What the verdict goes by", [facts_of(fit.record.evidence, f"Evidence of {fit.name}")]))
+        out.append(Folded("What the verdict goes by", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
     return out
 
 
