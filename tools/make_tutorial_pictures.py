@@ -6,7 +6,6 @@ python tools/make_tutorial_pictures.py [--out docs/images]
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,10 +33,9 @@ def main() -> None:
 
 
 def spleens(folder: Path, out: Path) -> None:
-    scans, same, quality = folder / "spleens", folder / "same", folder / "quality"
+    scans, same = folder / "spleens", folder / "same"
     run("data", "organs", "-o", scans, "--count", 10)
     run("correspond", scans, "-o", same, "--vertices", 4000)
-    run("quality", same, "-o", quality)
     run("build", same, "-o", folder / "spleens.h5", "--gauge", "form")
     raw = [ss.read_mesh(path) for path in sorted(scans.glob("*.ply"))[:SHOWN]]
     model = ss.ShapeModel.load(folder / "spleens.h5")
@@ -51,7 +49,6 @@ def spleens(folder: Path, out: Path) -> None:
         ],
     }
     save(rows, out / "tutorial-spleens.png")
-    shutil.copy(quality / "quality.png", out / "tutorial-quality.png")
 
 
 def volumes(folder: Path, out: Path) -> None:

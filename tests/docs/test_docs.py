@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import inspect
 import io
+import os
 import re
 import shlex
 import shutil
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from shapespace import cli
 
@@ -162,6 +164,18 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def check_pictures(document: Path, workplace: Path) -> None:
+    """Check that each picture PAGE-NAME.png of a tutorial is the NAME.png that its run made; renew them if asked to."""
+    for name in re.findall(rf"\(images/{document.stem}-(\w+\.png)\)", document.read_text(encoding="utf-8")):
+        [made] = workplace.rglob(name)
+        kept = document.parent / "images" / f"{document.stem}-{name}"
+        if os.environ.get("SHAPESPACE_UPDATE_PICTURES"):
+            with Image.open(made) as picture:
+                picture.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(kept, optimize=True)
+        with Image.open(made) as picture, Image.open(kept) as known:
+            assert picture.size == known.size, f"{kept} is not of this run; SHAPESPACE_UPDATE_PICTURES=1 renews it"
+
+
 def has_examples(document: Path, *, needing_data: bool) -> bool:
     chosen = [b for b in blocks(document) if b.needs_data == needing_data]
     return any(b.language == "python" or any(c.startswith("shapespace") for c in commands(b)) for b in chosen)
@@ -214,6 +228,7 @@ def test_examples_run_as_they_stand(
             words = arguments(command)
             instead[command] = partial(copied, home / words[words.index("-o") + 1])
     assert run(document, with_data=False, instead=instead) > 0
+    check_pictures(document, workplace)
 
 
 @pytest.mark.long
@@ -231,6 +246,7 @@ def test_the_tutorial_on_recognition_goes_with_fewer_people(workplace: Path) -> 
     instead = {command: with_fewer(command, many) for command in typed for many in FEWER if many in command}
     assert len(instead) == len(FEWER)
     assert run(document, with_data=False, instead=instead) > 5
+    check_pictures(document, workplace)
 
 
 @pytest.mark.parametrize("document", [d for d in DOCUMENTS if has_examples(d, needing_data=True)], ids=named)
