@@ -16,6 +16,7 @@ import numpy.typing as npt
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
@@ -34,6 +35,7 @@ class Fitted:
         b_stddev: (N, K) standard deviations of them, mm.
         status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
         folder: of the results, as it was given.
+        beyond_mm: (N,) RMS of what the model left of the residuals, mm, NaN where a fit does not say; None for none.
     """
 
     model: ShapeModel
@@ -41,6 +43,7 @@ class Fitted:
     b_stddev: FloatArray
     status: tuple[str, ...]
     folder: str
+    beyond_mm: FloatArray | None = None
 
     @cached_property
     def z(self) -> FloatArray:
@@ -55,6 +58,7 @@ class Fitted:
             b=read_only(self.b[at]),
             b_stddev=read_only(self.b_stddev[at]),
             status=tuple(self.status[row] for row in rows),
+            beyond_mm=None if self.beyond_mm is None else read_only(self.beyond_mm[at]),
         )
 
 
@@ -171,6 +175,7 @@ class Cohort:
         gauge: Gauge = "shape",
         align: bool = True,
         landmarks: Mapping[str, int] | None = None,
+        onto: Cohort | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -182,18 +187,24 @@ class Cohort:
             gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
             align: False takes them as they stand.
             landmarks: name -> vertex.
+            onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
 
         Raises:
-            InputError: fewer than two shapes, values that are not finite, columns of another length, or two shapes
-                that are the same.
+            InputError: fewer than two shapes, values that are not finite, columns of another length, two shapes that
+                are the same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
-        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < 2 or not np.isfinite(shapes).all():
-            raise InputError(f"A cohort needs two or more finite shapes (N, V, 3), not {shapes.shape}.")
+        fewest = 2 if onto is None else 1
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or not np.isfinite(shapes).all():
+            least = "two" if onto is None else "one"
+            raise InputError(f"A cohort needs {least} or more finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
         sizes = read_only([centroid_size(shape) for shape in shapes])
-        if align:
+        if onto is not None:
+            gauge = onto.gauge
+            _bring_onto(shapes, onto)
+        elif align:
             align_in_place(shapes, gauge)
             if gauge == "shape":
                 scale_to_tangent(shapes)
@@ -206,8 +217,8 @@ class Cohort:
         return cohort
 
     @staticmethod
-    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape") -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes.
+    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape", onto: Cohort | None = None) -> Cohort:
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto` as of `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
@@ -228,7 +239,8 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        return replace(Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge), table=table)
+        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto)
+        return replace(found, table=table)
 
     @staticmethod
     def of_fits(
@@ -278,6 +290,22 @@ class Cohort:
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort
+
+
+def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
+    """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
+    mean = onto.vertices(onto.coefficients.mean(axis=0))
+    if shapes.shape[1:] != mean.shape:
+        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {len(mean)}.")
+    middle = mean - mean.mean(axis=0)
+    for k, shape in enumerate(shapes):
+        if centroid_size(shape) <= 0:
+            raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
+        moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
+        if onto.gauge == "shape":
+            along = float(np.vdot(moved, middle)) / float(np.vdot(middle, middle))
+            moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
+        shapes[k] = moved
 
 
 def refuse_twice(cohort: Cohort) -> None:
