@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
+from shapespace.cli.answers import score
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -32,6 +33,10 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    score.add(
+        _add(commands, "score", "where new subjects lie in a reference population: distance, percentile, map",
+             "shapespace score patients -o scored --reference controls.csv --reference-shapes fits")
+    )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
     return top
