@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
+from shapespace.cli.answers import change
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -32,6 +33,10 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    change.add(
+        _add(commands, "change", "what changed between visits of the same subjects, in mm, and what of it is noise",
+             "shapespace change visits.csv -o change --order before,after --stable forehead.csv")
+    )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
     return top

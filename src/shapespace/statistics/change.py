@@ -1,4 +1,4 @@
-"""What changed? Pairs and series of scans of a subject: signed maps in mm, volumes and landmarks, with what is noise."""
+"""What changed? Pairs and series of scans of a subject: signed maps in mm, volumes, landmarks, and what is noise."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import boundary_edges, vertex_areas
+from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.change_align import stable_vertices
 from shapespace.statistics.change_group import MapTest, difference_test, mean_test
@@ -37,9 +38,10 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 NINETY_FIVE = 1.96
 """Standard deviations that noise exceeds one time in twenty."""
+WHOLE = "whole"
+"""What the whole surface is called beside its regions."""
 _COUNTED = 0.5
 """Of the weight that it could have, from which a vertex counts as stable."""
-_FEW = 10
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class ChangeSettings:
         stable: what did not change, and so carries the alignment: `auto` finds it, `all` is the whole surface; a region
             of the model by its name; a file of vertices; `landmarks:NAME,NAME,...` and a radius in mm, for what is near
             these; or the vertices.
+        regions: name -> vertices, whose volumes are told beside that of the whole; None takes those of the model.
         group: column with two groups, whose changes are compared; None compares none.
         rate: maps over the group are in mm per unit of time, rather than last visit minus first.
         permutations: of the tests.
@@ -63,6 +66,7 @@ class ChangeSettings:
     time: str | None = None
     order: tuple[str, ...] | None = None
     stable: str | Path | Sequence[int] = "auto"
+    regions: Mapping[str, Sequence[int]] | None = None
     group: str | None = None
     rate: bool = False
     permutations: int = 1000
@@ -97,21 +101,23 @@ class Estimate:
         stddev_mm: (V,) of it.
         landmarks_mm: (L, 3) displacement of each landmark in the frame of the cohort.
         landmarks_stddev_mm: (L,) of each: root of the summed variances along the axes.
-        volume_mm3: swept volume.
-        volume_stddev_mm3: NaN where nothing is known of it.
+        volumes_mm3: (P,) volumes swept by the whole and by each region.
+        volumes_stddev_mm3: (P,) of these; NaN where nothing is known of them.
+        quantile: standard deviations that noise exceeds one time in twenty: 1.96, and more where few rescans tell them.
     """
 
     along_mm: FloatArray
     stddev_mm: FloatArray
     landmarks_mm: FloatArray
     landmarks_stddev_mm: FloatArray
-    volume_mm3: float
-    volume_stddev_mm3: float
+    volumes_mm3: FloatArray
+    volumes_stddev_mm3: FloatArray
+    quantile: float = NINETY_FIVE
 
     @property
     def beyond(self) -> BoolArray:
-        """(V,) where it exceeds 1.96 standard deviations."""
-        return np.abs(self.along_mm) > NINETY_FIVE * self.stddev_mm
+        """(V,) where it exceeds what noise alone exceeds one time in twenty."""
+        return np.abs(self.along_mm) > self.quantile * self.stddev_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +168,15 @@ class Change:
             is stable.
         repeatability: from rescans; None without.
         group: test of the mean over subjects; None of a single one.
-        group_volume: the same of the volume, one value in each array.
+        group_volumes: the same of the volumes of `parts`.
         group_landmarks: the same of the landmarks, along the normals.
         between: test of the second group against the first, where they were asked for.
-        between_volume: the same of the volume.
+        between_volumes: the same of the volumes.
         groups: names of the two groups, in order.
         before: (V, 3) mean of the first visits,
         after: and moved by the mean change.
         landmarks: name -> vertex.
+        parts: names of what volumes are told of: `whole` and the regions.
         unit: of time, as in `mm per year`; empty where times are words.
         closed: whether the surface is.
     """
@@ -181,14 +188,15 @@ class Change:
     uncertainty: Literal["rescans", "fits", "stable"]
     repeatability: Repeatability | None
     group: MapTest | None
-    group_volume: MapTest | None
+    group_volumes: MapTest | None
     group_landmarks: MapTest | None
     between: MapTest | None
-    between_volume: MapTest | None
+    between_volumes: MapTest | None
     groups: tuple[str, ...]
     before: FloatArray
     after: FloatArray
     landmarks: Mapping[str, int]
+    parts: tuple[str, ...]
     unit: str
     closed: bool
 
@@ -201,8 +209,8 @@ class Change:
         """Return a subject's surface at its first visit and, aligned to it, at its last."""
         visits = visits_of(self.cohort.table, self.settings.subject, self.settings.time, self.settings.order).of[name]
         found = aligned(self.cohort, visits, stable_vertices(self.cohort, self.settings.stable))
-        first, last = found.means[0], found.means[-1]
-        return Mesh(first, self.cohort.faces, name=f"{name} before"), Mesh(last, self.cohort.faces, name=f"{name} after")
+        faces = self.cohort.faces
+        return Mesh(found.means[0], faces, name=f"{name} before"), Mesh(found.means[-1], faces, name=f"{name} after")
 
     def answer(self) -> Answer:
         """Return what is kept of it: a report, tables, arrays and meshes."""
@@ -232,7 +240,7 @@ def change(
     """
     settings = settings or ChangeSettings()
     if cohort.gauge != "form":
-        raise InputError("Changes are in millimetres, but sizes are divided out of this cohort; read it with gauge form.")
+        raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")
     if cohort.faces is None:
         raise InputError("Changes are along normals, and points have none; give surfaces with triangles.")
     if settings.permutations < 1 or settings.seed < 0:
@@ -249,7 +257,11 @@ def change(
     groups = _groups(cohort, settings, visits, single)
     stable = stable_vertices(cohort, settings.stable)
     landmarks = dict(cohort.landmarks or {})
-    rescans = Rescans(cohort.reference, faces_in(cohort), list(landmarks.values()))
+    regions = _regions(cohort, settings)
+    parts = np.zeros((len(regions), cohort.n_vertices))
+    for row, vertices in zip(parts, regions.values(), strict=True):
+        row[vertices] = 1.0
+    rescans = Rescans(cohort.reference, faces_in(cohort), list(landmarks.values()), parts)
     drafts: list[_Draft] = []
     source: Literal["rescans", "fits", "stable"] = (
         "rescans" if visits.rescans else "fits" if cohort.fitted is not None else "stable"
@@ -260,7 +272,9 @@ def change(
         found = aligned(cohort, own, stable)
         rescans.add(found)
         if len(own) > 1:
-            drafts.append(_draft(cohort, name, found, list(landmarks.values()), source, visits.unit, closed=closed))
+            drafts.append(
+                _draft(cohort, name, found, list(landmarks.values()), parts, source, visits.unit, closed=closed)
+            )
             before += found.means[0]
             moved += found.means[-1] - found.means[0]
         if on_step is not None:
@@ -270,7 +284,7 @@ def change(
     before /= len(subjects)
     answer = Change(
         cohort, settings, subjects, single, source, repeatability, None, None, None, None, None, (), before,
-        before + moved / len(subjects), landmarks, visits.unit, closed,
+        before + moved / len(subjects), landmarks, tuple(regions), visits.unit, closed,
     )  # fmt: skip
     return _tested(answer, groups)
 
@@ -288,17 +302,19 @@ class _Draft:
     before_mm3: float
 
     def subject(self, group: str, repeatability: Repeatability | None) -> SubjectChange:
-        sums = self.sums
+        sums = list(self.sums)
         if repeatability is not None:
-            sums = tuple(
+            quantile = float(student.ppf(0.975, repeatability.freedom))
+            sums = [
                 replace(
                     one,
                     stddev_mm=factor * repeatability.within_mm,
                     landmarks_stddev_mm=factor * repeatability.landmarks_within_mm,
-                    volume_stddev_mm3=factor * repeatability.volume_within_mm3,
+                    volumes_stddev_mm3=factor * repeatability.volumes_within_mm3,
+                    quantile=quantile,
                 )
                 for one, factor in zip(sums, self.factors, strict=True)
-            )
+            ]
         rate = sums[1] if len(sums) > 1 else None
         return SubjectChange(
             self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3
@@ -310,6 +326,7 @@ def _draft(
     name: str,
     found: Aligned,
     landmarks: list[int],
+    parts: FloatArray,
     source: Literal["rescans", "fits", "stable"],
     unit: str,
     *,
@@ -319,31 +336,31 @@ def _draft(
     first = found.means[0]
     area = vertex_areas(Mesh(first, faces))
     along = found.along_mm
-    swept = np.array([swept_mm3(first, mean, faces) for mean in found.means])
+    swept = np.stack([swept_mm3(first, mean, faces) for mean in found.means]) @ parts.T
     told = tuple(
         VisitChange(
             visit.label,
             visit.at,
             len(visit.rows),
             float(np.sqrt(np.average(along[k] ** 2, weights=area))),
-            float(swept[k]),
+            float(swept[k, 0]),
         )
         for k, visit in enumerate(found.visits)
     )
     sums: list[Estimate] = []
     factors: list[float] = []
-    by_stable = known_by_stable(found, landmarks) if source == "stable" else None
+    by_stable = known_by_stable(found, landmarks, parts) if source == "stable" else None
     for rate in (False, True) if unit else (False,):
         weights = contrast(found.visits, rate=rate)
         factors.append(noise_factor(found.visits, weights))
         if by_stable is not None:
             # Its spread is that of a difference of the last visit and the first.
             share = factors[-1] / factors[0]
-            known = Known(share * by_stable.along_mm, share * by_stable.landmarks_mm, by_stable.volume_mm3)
+            known = Known(share * by_stable.along_mm, share * by_stable.landmarks_mm, by_stable.volumes_mm3)
         elif source == "fits":
-            known = known_by_fits(cohort, found, weights, landmarks)
+            known = known_by_fits(cohort, found, weights, landmarks, parts)
         else:
-            known = Known(np.zeros(len(area)), np.zeros(len(landmarks)), 0.0)
+            known = Known(np.zeros(len(area)), np.zeros(len(landmarks)), np.zeros(len(parts)))
         moved = np.tensordot(weights, found.means[:, landmarks], axes=1)
         sums.append(
             Estimate(
@@ -351,13 +368,26 @@ def _draft(
                 known.along_mm,
                 moved,
                 known.landmarks_mm,
-                float(weights @ swept),
-                known.volume_mm3,
+                weights @ swept,
+                known.volumes_mm3,
             )
         )
     stable = found.weights > _COUNTED * area
     before_mm3 = volume_mm3(first, faces) if closed else float("nan")
     return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3)
+
+
+def _regions(cohort: Cohort, settings: ChangeSettings) -> dict[str, IntArray]:
+    """Return name -> vertices of what volumes are told of: the whole, and regions.
+
+    Raises:
+        InputError: a region with vertices that the surfaces do not have.
+    """
+    asked = settings.regions
+    if asked is None:
+        asked = {} if cohort.fitted is None else {k: v.tolist() for k, v in cohort.fitted.model.regions.items()}
+    whole = {WHOLE: np.arange(cohort.n_vertices, dtype=np.int32)}
+    return whole | {name: region_vertices(own, cohort.n_vertices, name) for name, own in asked.items()}
 
 
 def _groups(cohort: Cohort, settings: ChangeSettings, visits: Visits, single: Sequence[str]) -> dict[str, str]:
@@ -392,25 +422,25 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     """Return the same with its tests over subjects."""
     settings, subjects = answer.settings, answer.subjects
     if settings.rate and not answer.unit:
-        raise InputError("Rates need times that are numbers or dates; leave out --rate, or give such a column as --time.")
+        raise InputError("Rates need times that are numbers or dates; leave out --rate, or name such a --time.")
     if len(subjects) < 2:
         return answer
     asked = [effect_of(subject, rate=settings.rate) for subject in subjects]
     maps = np.stack([one.along_mm for one in asked])
-    volumes = np.array([[one.volume_mm3] for one in asked])
+    volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
     vertices = list(answer.landmarks.values())
     run = (settings.permutations, settings.seed)
-    one, few = np.ones(1), np.ones(len(vertices))
-    names = tuple(sorted(set(groups.values())))
+    whole, few = np.ones(len(answer.parts)), np.ones(len(vertices))
+    names: tuple[str, ...] = tuple(sorted(set(groups.values())))
     second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
     return replace(
         answer,
         group=mean_test(maps, area, *run),
-        group_volume=mean_test(volumes, one, *run),
+        group_volumes=mean_test(volumes, whole, *run),
         group_landmarks=mean_test(maps[:, vertices], few, *run) if vertices else None,
         between=None if second is None else difference_test(maps, second, area, *run),
-        between_volume=None if second is None else difference_test(volumes, second, one, *run),
+        between_volumes=None if second is None else difference_test(volumes, second, whole, *run),
         groups=names,
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +51,7 @@ def stable_vertices(cohort: Cohort, stable: str | Path | Sequence[int]) -> IntAr
         return np.arange(cohort.n_vertices, dtype=np.int32)
     if text.startswith("landmarks:"):
         return _several(_near_landmarks(cohort, text), text)
-    regions = {} if cohort.fitted is None else cohort.fitted.model.regions
+    regions: Mapping[str, IntArray] = {} if cohort.fitted is None else cohort.fitted.model.regions
     if text in regions:
         return _several(regions[text], text)
     if not Path(text).is_file():

@@ -1,4 +1,4 @@
-"""Tests of maps over subjects: by sign flips against none, by permutation between two groups; the maximum over vertices.
+"""Tests of maps over subjects: by sign flips against none, by permutation between two groups; maxima over vertices.
 
 Nichols and Holmes, Human Brain Mapping 15, 2002; Winkler et al., NeuroImage 92, 2014.
 """

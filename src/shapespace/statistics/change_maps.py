@@ -72,23 +72,26 @@ def faces_in(cohort: Cohort) -> IntArray:
     return cohort.faces
 
 
-def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> float:
-    """Return the volume swept from `before` (V, 3) to `after` on straight ways, outwards positive.
+def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """Return the volume (V,) that each vertex sweeps from `before` (V, 3) to `after` on straight ways, outwards +.
 
-    It is exact, and of closed surfaces the difference of the volumes: at each moment a triangle sweeps its area vector
-    times its mean velocity, which is quadratic in time, so that Simpson's rule has no error.
+    That of a triangle counts a third for each of its corners. The sum is exact, and of closed surfaces the difference
+    of the volumes: at each moment a triangle sweeps its area vector times its mean velocity, which is quadratic in
+    time, so that Simpson's rule has no error.
     """
     moved = after - before
-    corners = moved[faces].sum(axis=1) / 3.0
+    corners: FloatArray = moved[faces].sum(axis=1) / 3.0
     half = 0.5 * (before + after)
     area = (face_vectors(before, faces) + 4.0 * face_vectors(half, faces) + face_vectors(after, faces)) / 12.0
-    return float(np.vdot(corners, area))
+    shares = np.repeat((corners * area).sum(axis=1) / 3.0, 3)
+    return np.asarray(np.bincount(faces.ravel(), shares, len(before)), dtype=np.float64)
 
 
 def volume_mm3(vertices: FloatArray, faces: IntArray) -> float:
     """Return the volume that a closed surface encloses."""
     x = vertices - vertices.mean(axis=0)
-    return float(np.vdot(face_vectors(x, faces), x[faces].sum(axis=1))) / 18.0
+    corners: FloatArray = x[faces].sum(axis=1)
+    return float(np.vdot(face_vectors(x, faces), corners)) / 18.0
 
 
 def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
@@ -114,24 +117,26 @@ class Known:
     Args:
         along_mm: (V,) along the normals.
         landmarks_mm: (L,) of the whole displacement of each landmark: root of the summed variances along the axes.
-        volume_mm3: NaN where nothing is known of it.
+        volumes_mm3: (P,) of the volume swept by each part; NaN where nothing is known of it.
     """
 
     along_mm: FloatArray
     landmarks_mm: FloatArray
-    volume_mm3: float
+    volumes_mm3: FloatArray
 
 
-def known_by_stable(subject: Aligned, landmarks: Sequence[int]) -> Known:
+def known_by_stable(subject: Aligned, landmarks: Sequence[int], parts: FloatArray) -> Known:
     """Return what the spread over the stable part says, which did not change; the same at all vertices."""
     moved = subject.means[-1] - subject.means[0]
     along = np.einsum("vd,vd->v", moved, subject.normals)
     spread_mm = _spread(along, subject.weights)
     marks = np.full(len(landmarks), _spread(np.linalg.norm(moved, axis=1), subject.weights))
-    return Known(np.full(len(along), spread_mm), marks, float("nan"))
+    return Known(np.full(len(along), spread_mm), marks, np.full(len(parts), np.nan))
 
 
-def known_by_fits(cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: Sequence[int]) -> Known:
+def known_by_fits(
+    cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: Sequence[int], parts: FloatArray
+) -> Known:
     """Return what the fits' own standard deviations say, through modes and alignment.
 
     Coefficients vary by `b_stddev`, modes move the vertices, and the alignment takes out what of that is a rigid motion
@@ -143,6 +148,7 @@ def known_by_fits(cohort: Cohort, subject: Aligned, weights: FloatArray, landmar
         subject: aligned.
         weights: (T,) of the sum over visits.
         landmarks: vertices.
+        parts: (P, V) of which volumes are swept, 1 for their vertices and 0 for the others.
     """
     fitted, faces = cohort.fitted, faces_in(cohort)
     assert fitted is not None
@@ -163,10 +169,10 @@ def known_by_fits(cohort: Cohort, subject: Aligned, weights: FloatArray, landmar
     marks = (moves[list(landmarks)] ** 2).sum(axis=1) @ variance
     vectors = np.repeat(face_vectors(subject.means.mean(axis=0), faces) / 6.0, 3, axis=0)
     outward = np.stack([np.bincount(faces.ravel(), vectors[:, d], len(centre)) for d in range(3)], axis=1)
-    volume = np.einsum("vdk,vd->k", moves, outward) ** 2 @ variance
+    volumes = (parts @ np.einsum("vdk,vd->vk", moves, outward)) ** 2 @ variance
     summed = weights @ subject.along_mm
     wider = max(1.0, _spread(summed / np.sqrt(np.maximum(along, 1e-18)), subject.weights))
-    return Known(wider * np.sqrt(along), wider * np.sqrt(marks), wider * float(np.sqrt(volume)))
+    return Known(wider * np.sqrt(along), wider * np.sqrt(marks), wider * np.sqrt(volumes))
 
 
 def _spread(values: FloatArray, weights: FloatArray) -> float:

@@ -24,18 +24,18 @@ class Repeatability:
         visits: of so many,
         freedom: degrees of freedom, scans less visits.
         within_mm: (V,) within-subject standard deviation along the normals.
-        volume_within_mm3: of the volume.
+        volumes_within_mm3: (P,) of the volume that each part sweeps, the whole first.
         landmarks_within_mm: (L,) of each landmark: root of the summed variances along the axes.
         icc: (V,) intraclass correlation of each vertex between people, all three axes; NaN without two people.
         shape_icc: of all vertices together,
-        volume_icc: and of the volume, or of that between the surface and the mean.
+        volume_icc: and of the volume between the surface and the mean.
     """
 
     scans: int
     visits: int
     freedom: int
     within_mm: FloatArray
-    volume_within_mm3: float
+    volumes_within_mm3: FloatArray
     landmarks_within_mm: FloatArray
     icc: FloatArray
     shape_icc: float
@@ -47,9 +47,9 @@ class Repeatability:
         return SMALLEST * self.within_mm
 
     @property
-    def volume_smallest_mm3(self) -> float:
-        """The same of the volume."""
-        return SMALLEST * self.volume_within_mm3
+    def volumes_smallest_mm3(self) -> FloatArray:
+        """(P,) the same of the volumes."""
+        return SMALLEST * self.volumes_within_mm3
 
     @property
     def landmarks_smallest_mm(self) -> FloatArray:
@@ -65,11 +65,13 @@ class Rescans:
         reference: (V, 3) in whose frame people are compared.
         faces: (F, 3).
         landmarks: vertices.
+        parts: (P, V) of which volumes are swept, the whole first; 1 for their vertices and 0 for the others.
     """
 
     reference: FloatArray
     faces: IntArray
     landmarks: list[int]
+    parts: FloatArray
     scans: int = 0
     visits: int = 0
     people: list[int] = field(default_factory=list[int])
@@ -77,7 +79,7 @@ class Rescans:
     def __post_init__(self) -> None:
         V = len(self.reference)
         self._area = vertex_areas(Mesh(self.reference, self.faces))
-        self._along, self._marks, self._volume = np.zeros(V), np.zeros(len(self.landmarks)), 0.0
+        self._along, self._marks, self._volume = np.zeros(V), np.zeros(len(self.landmarks)), np.zeros(len(self.parts))
         self._within, self._means, self._squares = np.zeros(V), np.zeros((V, 3)), np.zeros(V)
         self._volumes: list[FloatArray] = []
 
@@ -88,7 +90,7 @@ class Rescans:
             off = scans - scans.mean(axis=0)
             self._along += (np.einsum("nvd,vd->nv", off, subject.normals) ** 2).sum(axis=0)
             self._marks += (off[:, self.landmarks] ** 2).sum(axis=(0, 2))
-            self._volume += _squares(self._swept(subject.means[0], scans))
+            self._volume += _squares(self._swept(subject.means[0], scans) @ self.parts.T)
             self.scans += len(scans)
             self.visits += 1
         if chosen:
@@ -103,11 +105,11 @@ class Rescans:
         self._means += len(scans) * off
         self._squares += len(scans) * (off**2).sum(axis=1)
         posed = np.stack([T.apply(scan) for scan in scans])
-        self._volumes.append(self._swept(self.reference, posed))
+        self._volumes.append(self._swept(self.reference, posed).sum(axis=1, keepdims=True))
         self.people.append(len(scans))
 
     def _swept(self, before: FloatArray, scans: FloatArray) -> FloatArray:
-        return np.array([swept_mm3(before, scan, self.faces) for scan in scans])
+        return np.stack([swept_mm3(before, scan, self.faces) for scan in scans])
 
     def told(self) -> Repeatability | None:
         """Return what they tell; None where there are none."""
@@ -116,17 +118,17 @@ class Rescans:
             return None
         between = self._squares - (self._means**2).sum(axis=1) / sum(self.people)
         volumes = np.concatenate(self._volumes)
-        within_volume = sum(_squares(own) for own in self._volumes)
+        within_volume = np.sum([_squares(own) for own in self._volumes], axis=0)
         return Repeatability(
             self.scans,
             self.visits,
             freedom,
             np.sqrt(self._along / freedom),
-            float(np.sqrt(self._volume / freedom)),
+            np.sqrt(self._volume / freedom),
             np.sqrt(self._marks / freedom),
             _icc(between, self._within, self.people),
             float(_icc(between.sum(keepdims=True), self._within.sum(keepdims=True), self.people)[0]),
-            float(_icc(np.array([_squares(volumes) - within_volume]), np.array([within_volume]), self.people)[0]),
+            float(_icc(_squares(volumes) - within_volume, within_volume, self.people)[0]),
         )
 
 
@@ -141,5 +143,5 @@ def _icc(between: FloatArray, within: FloatArray, sizes: list[int]) -> FloatArra
     return np.divide(b - w, total, out=np.full(len(b), np.nan), where=total > 0)
 
 
-def _squares(values: FloatArray) -> float:
-    return float(((values - values.mean()) ** 2).sum())
+def _squares(values: FloatArray) -> FloatArray:
+    return np.asarray(((values - values.mean(axis=0)) ** 2).sum(axis=0), dtype=np.float64)
