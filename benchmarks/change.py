@@ -4,9 +4,9 @@
     python benchmarks/change.py --quick   few subjects, one seed: a minute or two
 
 Models (gauge form) are made of other people and organs. Each subject is scanned twice before (rescans) and once after
-each change, with triangles, pose, noise of 0.2 mm and holes of its own each time; sizes are kept. Faces get a smooth bump on the
-nose or on a cheek, 10 mm wide (standard deviation), outwards, of 1, 2 and 3 mm; organs grow thicker, which makes 2, 5
-and 10 % of volume. The truth is known at each vertex. Told are, for faces:
+each change, with triangles, pose, noise of 0.2 mm and holes of its own each time; sizes are kept. Faces get a smooth
+bump on the nose or on a cheek, 10 mm wide (standard deviation), outwards, of 1, 2 and 3 mm; organs grow thicker, which
+makes 2, 5 and 10 % of volume. The truth is known at each vertex. Told are, for faces:
 
     peak        mm that came back at the peak, by a fit of the true bump to the map: mean and standard deviation
     volume      swept where the bump is above a twentieth of its peak, off the true one
@@ -103,7 +103,7 @@ def face_plan(plan: Plan) -> dict[str, FloatArray]:
     """Write training meshes and scans of people, and return subject -> the true bump (V,) of 1 mm."""
     faces, home = load_faces(), plan.folder
     for part in ("training", "scans"):
-        (home / part).mkdir(parents=True)
+        (home / part).mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([plan.seed, 0])
     for k in range(plan.training):
         person = faces.cut_to_face(faces.face(faces.draw_person(rng)))
@@ -147,7 +147,7 @@ def face_rows(plan: Plan, truth: dict[str, FloatArray]) -> list[dict[str, Any]]:
                 for one, other, is_large in zip(by_rescans.subjects, by_fits.subjects, large, strict=True):
                     bump, area = truth[one.name], one.area_mm2
                     core, none = bump > 0.5, bump < 0.01
-                    at = other.parts.index(one.name)
+                    at = by_fits.parts.index(one.name)
                     for name, value in {
                         "peak": float(area * bump @ other.change.along_mm / (area * bump @ bump)),
                         "elsewhere": float(np.sqrt(np.average(other.change.along_mm[none] ** 2, weights=area[none]))),
@@ -200,7 +200,7 @@ def organ_plan(plan: Plan) -> dict[str, list[float]]:
     """Write training meshes and scans of organs, and return subject -> shares that its volume truly grows by."""
     home = plan.folder
     for part in ("training", "scans"):
-        (home / part).mkdir(parents=True)
+        (home / part).mkdir(parents=True, exist_ok=True)
     for k in range(plan.training):
         organ = Organ.draw(np.random.default_rng([plan.seed, 2, k]))
         write_mesh(home / "training" / f"t{k:03d}.ply", organ_mesh(organ))
@@ -274,7 +274,8 @@ def tell(rows: Sequence[dict[str, Any]]) -> None:
         mean = {name: float(np.mean(value)) for name, value in row.items() if isinstance(value, list)}
         spread = {name: float(np.std(row[name], ddof=1)) for name in ("peak", "volume")}
         print(
-            f"| {row['surfaces']} | {row['stable']} | {row['change']:g} | {mean['peak']:.2f} ± {spread['peak']:.2f} | {mean['elsewhere']:.2f} | {100 * mean['volume']:+.0f} ± {100 * spread['volume']:.0f} % "
+            f"| {row['surfaces']} | {row['stable']} | {row['change']:g} | {mean['peak']:.2f} ± {spread['peak']:.2f} "
+            f"| {mean['elsewhere']:.2f} | {100 * mean['volume']:+.0f} ± {100 * spread['volume']:.0f} % "
             f"| {100 * mean['core_rescans']:.0f} %, {100 * mean['none_rescans']:.0f} % "
             f"| {100 * mean['core_fits']:.0f} %, {100 * mean['none_fits']:.0f} % | {100 * mean['found']:.0f} % "
             f"| {100 * mean['false']:.0f} % | {mean['smallest']:.2f} |"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi
@@ -21,7 +22,9 @@ KEPT_SHARE = 0.4
 """Share of the surface that must be unchanged for it to be found."""
 NEAR_MM = 10.0
 """How near to a landmark vertices are taken, where nothing else is said."""
-_PATCHES, _PATCH_SHARE, _STEPS = 24, 0.15, 20
+_PATCHES, _PATCH_SHARE = 24, 0.15
+_FIRST_STEPS, _GO_ON, _STEPS = 3, 4, 20
+"""All starts take a few steps, and the best of them go on."""
 _FEWEST = 3
 _CUTOFF = 5.5
 """Residuals beyond so many standard deviations count nothing: Tukey's biweight, 95 % efficient in three dimensions."""
@@ -126,11 +129,8 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
     else:
         p, q, a = moving, fixed, area
     a = a / a.sum()
-    best, T = np.inf, Similarity.identity()
-    for start in _starts(q):
-        found, squares = _trimmed(p, q, a, start)
-        if squares < best:
-            best, T = squares, found
+    ends = sorted((_trimmed(p, q, a, start, _FIRST_STEPS) for start in _starts(q)), key=lambda end: end.squares)
+    T = min((_trimmed(p, q, a, end.chosen, _STEPS) for end in ends[:_GO_ON]), key=lambda end: end.squares).T
     residual = np.linalg.norm(T.apply(p) - q, axis=1)
     size_mm = float(np.linalg.norm(np.ptp(fixed, axis=0)))
     spread_mm = max(_quantile(residual, a, KEPT_SHARE) / float(chi.ppf(KEPT_SHARE, 3)), _SMALLEST * size_mm)
@@ -156,10 +156,18 @@ def _starts(points: FloatArray) -> list[IntArray]:
     return starts
 
 
-def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray) -> tuple[Similarity, float]:
-    """Return where fits to the nearest `KEPT_SHARE` end from the points `chosen`, and their mean squared distance."""
+class _End(NamedTuple):
+    """A rigid motion, the points that it brings nearest, and their mean squared distance."""
+
+    T: Similarity
+    chosen: IntArray
+    squares: float
+
+
+def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, steps: int) -> _End:
+    """Return where fits to the nearest `KEPT_SHARE` of the points end, from those `chosen`."""
     T, squares = Similarity.identity(), np.inf
-    for _ in range(_STEPS):
+    for _ in range(steps):
         try:
             T = fit_similarity(p[chosen], q[chosen], area[chosen], with_scale=False)
         except InputError:  # a patch on a line determines no rotation
@@ -171,7 +179,7 @@ def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray) -
         if now >= squares:
             break
         squares, chosen = now, nearest
-    return T, squares
+    return _End(T, chosen, squares)
 
 
 def _quantile(values: FloatArray, weights: FloatArray, share: float) -> float:
