@@ -249,7 +249,8 @@ def fitted_pairs(subjects: int, stddev_mm: float, stated_mm: float) -> Cohort:
 
 def test_standard_deviations_of_fits_are_the_spread_that_their_coefficients_make() -> None:
     found = asked(fitted_pairs(150, 4.0, 4.0), stable="landmarks:back,100", permutations=1)
-    assert found.uncertainty == "fits"
+    assert found.uncertainty == "fits" and found.model_only
+    assert any("--surfaces dense" in note for note in found.answer().notes)
     observed = np.sqrt(np.mean([one.change.along_mm**2 for one in found.subjects], axis=0))
     told = np.sqrt(np.mean([one.change.stddev_mm**2 for one in found.subjects], axis=0))
     largest = told > 0.3 * told.max()
@@ -358,6 +359,7 @@ def test_treatment_against_control_is_found_where_it_is() -> None:
     arms = ["treated"] * 5 + ["control"] * 5
     cohort = pairs([(1.0 if arm == "treated" else 0.0) * bump() for arm in arms], noise_mm=0.1, arm=arms)
     found = asked(cohort, group="arm", permutations=300)
+    assert not found.model_only
     assert found.groups == ("control", "treated") and found.between is not None and found.between_volumes is not None
     assert found.between.effect[TIP] == pytest.approx(1.0, abs=0.2)
     assert found.between.p[TIP] <= 0.05 and found.between.omnibus_p <= 0.02 and found.between_volumes.p[0] <= 0.02

@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_edges, vertex_areas
 from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.answer import Answer
@@ -40,6 +41,8 @@ NINETY_FIVE = 1.96
 """Standard deviations that noise exceeds one time in twenty."""
 WHOLE = "whole"
 """What the whole surface is called beside its regions."""
+_ROUNDING = 1e-4
+"""Share of the size by which surfaces in files are rounded, at most."""
 _COUNTED = 0.5
 """Of the weight that it could have, from which a vertex counts as stable."""
 
@@ -179,6 +182,7 @@ class Change:
         parts: names of what volumes are told of: `whole` and the regions.
         unit: of time, as in `mm per year`; empty where times are words.
         closed: whether the surface is.
+        model_only: whether the surfaces hold nothing but what the model of the fits can make.
     """
 
     cohort: Cohort
@@ -199,6 +203,7 @@ class Change:
     parts: tuple[str, ...]
     unit: str
     closed: bool
+    model_only: bool
 
     @cached_property
     def by_name(self) -> Mapping[str, SubjectChange]:
@@ -284,9 +289,17 @@ def change(
     before /= len(subjects)
     answer = Change(
         cohort, settings, subjects, single, source, repeatability, None, None, None, None, None, (), before,
-        before + moved / len(subjects), landmarks, tuple(regions), visits.unit, closed,
+        before + moved / len(subjects), landmarks, tuple(regions), visits.unit, closed, _model_only(cohort),
     )  # fmt: skip
     return _tested(answer, groups)
+
+
+def _model_only(cohort: Cohort) -> bool:
+    if cohort.fitted is None:
+        return False
+    own, there = cohort.fitted.model.reconstruct(cohort.fitted.b[0]), cohort.vertices(0)
+    off = np.linalg.norm(fit_similarity(own, there).apply(own) - there, axis=1).max()
+    return bool(off < _ROUNDING * np.linalg.norm(np.ptp(there, axis=0)))
 
 
 @dataclass(frozen=True, eq=False)

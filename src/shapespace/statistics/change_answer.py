@@ -167,7 +167,7 @@ def _of_group(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]
         ),
         MorphPart(
             title="From before to after", arrays=ARRAYS, low="before", high="after", low_label="mean first visit",
-            high_label="with the mean change",
+            high_label="mean with its change",
         ),
     ]  # fmt: skip
     if change.group_volumes is not None and len(change.parts) > 1:
@@ -276,15 +276,27 @@ def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]
 
 
 def _of_subjects(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    header, rows = _subject_rows(change)
-    chosen = (0, 1, 2, 3, 4, 6, 7, 8, 9)
-    kinds = ("text", "text", "text", "text", "mm", "percent", "number", "number", "number")
-    columns = tuple(TableColumn(name=header[at], kind=kind) for at, kind in zip(chosen, kinds, strict=True))  # type: ignore[arg-type]
-    more = f" The first {LISTED} of {len(rows)}; all are in subjects.csv." if len(rows) > LISTED else ""
+    every = len(change.subjects)
+    more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
+    columns = [
+        TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
+        TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
+        TableColumn(name="volume, ml", kind="number"), TableColumn(name="stddev, ml", kind="number"),
+    ]  # fmt: skip
+    if change.closed:
+        columns.append(TableColumn(name="of the volume before", kind="percent"))
+    if change.groups:
+        columns.append(TableColumn(name="group"))
+    rows: list[tuple[Any, ...]] = []
+    for one in change.subjects[:LISTED]:
+        volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
+        row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
+        row += [volume / _MM3_PER_ML, _or_none(stddev / _MM3_PER_ML)]
+        row += [volume / one.before_mm3] if change.closed else []
+        rows.append((*row, *([one.group] if change.groups else [])))
     parts: list[Part] = [
         TablePart(
-            title="Subjects", level=2, columns=columns,
-            rows=tuple(tuple(row[at] for at in chosen) for row in rows[:LISTED]),
+            title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
             note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
         )
     ]  # fmt: skip
@@ -444,6 +456,11 @@ def _notes(change: Change) -> list[str]:
     if not change.unit and len(ends) > 1:
         told = named([f"{first} to {last}" for first, last in sorted(ends)])
         notes.append(f"Not all subjects have the same first and last visit ({told}).")
+    if change.model_only:
+        notes.append(
+            "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
+            "give --surfaces dense."
+        )
     return notes
 
 

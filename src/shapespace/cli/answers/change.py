@@ -20,6 +20,9 @@ def add(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--stable", default="auto", metavar="WHAT",
                      help="what did not change: auto finds it, all, a region of the model, a file of vertices, or "
                      "landmarks:NAME,NAME and a radius in mm (default: auto)")  # fmt: skip
+    sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
+                     help="a part whose volume is told too: a CSV file of vertices; can be repeated (default: the "
+                     "regions of the model)")  # fmt: skip
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
                      help="CSV of name,vertex (default: those of the model)")  # fmt: skip
     sub.add_argument("--group", metavar="COLUMN", help="two groups whose changes are compared")
@@ -32,20 +35,22 @@ def add(sub: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Answer, and write the report."""
     from shapespace.batch.progress import progress
+    from shapespace.io.regions import read_region
     from shapespace.statistics.change import ChangeSettings, change
 
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:
         cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
     settings = ChangeSettings(
-        arguments.subject,
-        arguments.time,
-        arguments.order,
-        arguments.stable,
-        arguments.group,
-        arguments.rate,
-        arguments.permutations,
-        arguments.seed,
+        subject=arguments.subject,
+        time=arguments.time,
+        order=arguments.order,
+        stable=arguments.stable,
+        regions={name: read_region(path) for name, path in arguments.region} or None,
+        group=arguments.group,
+        rate=arguments.rate,
+        permutations=arguments.permutations,
+        seed=arguments.seed,
     )
     columns = [column for column in (arguments.subject, arguments.group) if column]
     if arguments.drop_missing:
@@ -74,6 +79,13 @@ def _landmarks(path: Path, n_vertices: int) -> dict[str, int]:
             "landmarks of these surfaces."
         )
     return found
+
+
+def _named_file(text: str) -> tuple[str, Path]:
+    name, equals, path = text.partition("=")
+    if not (equals and name.strip() and path):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FILE")
+    return name.strip(), Path(path)
 
 
 def _words(text: str) -> Any:
