@@ -105,14 +105,14 @@ def _summary(change: Change) -> list[str]:
     if change.group is not None and change.group_volumes is not None:
         volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects]) / _MM3_PER_ML
         low, high = interval_of_mean(volumes)
-        told.append(_of_test(change, change.group, "The mean change is"))
+        told.append(_of_test(change, change.group, "the mean change", "none"))
         told.append(
             f"The volume changed by {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to "
             f"{high:+.2f}), {_p(float(change.group_volumes.p[0]))}."
         )
     if change.between is not None and change.between_volumes is not None:
         first, second = change.groups
-        told.append(_of_test(change, change.between, f"The change of {second} beside that of {first} is"))
+        told.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
         told.append(
             f"The volume of {second} changed by {change.between_volumes.effect[0] / _MM3_PER_ML:+.2f} ml{_per(change)} "
             f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
@@ -122,15 +122,15 @@ def _summary(change: Change) -> list[str]:
     else:
         known, smallest = change.repeatability, change.repeatability.smallest_mm
         told.append(
-            f"By {known.scans} scans of {known.visits} visits with rescans, the smallest "
-            f"detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the surface; "
-            f"{smallest.max():.2f} mm at most), and {known.volumes_smallest_mm3[0] / _MM3_PER_ML:.2f} ml of "
+            f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
+            f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
+            f"surface; {smallest.max():.2f} mm at most), and {known.volumes_smallest_mm3[0] / _MM3_PER_ML:.2f} ml of "
             "volume; less is noise."
         )
     return told
 
 
-def _of_test(change: Change, test: MapTest, what: str) -> str:
+def _of_test(change: Change, test: MapTest, what: str, other: str) -> str:
     at = int(np.abs(test.t).argmax())
     found = test.p <= _LEVEL
     where = (
@@ -139,7 +139,11 @@ def _of_test(change: Change, test: MapTest, what: str) -> str:
         if found.any()
         else f"with the error over all vertices held it lies nowhere (smallest p = {test.p[at]:.3g})"
     )
-    return f"{what} {'there' if test.omnibus_p <= _LEVEL else 'not shown'} as a whole ({_p(test.omnibus_p)}); {where}."
+    differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
+    few = (
+        f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
+    )
+    return f"As a whole {what} {differs} {other} ({_p(test.omnibus_p)}); {where}{few}."
 
 
 def _p(p: float) -> str:
@@ -155,15 +159,17 @@ def _of_group(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]
     arrays |= {"mean": test.effect, "mean_t": test.t, "mean_p": test.p, "mean_found": test.p <= _LEVEL}
     least = 1 / test.permutations
     note = (
-        f"Mean of {test.n[0]} subjects along the normals, outwards positive. In full colour where the family-wise p is "
+        f"Mean of {test.n[0]} subjects along the normals, outwards positive. No p can be below {least:.2g} with so few, "
+        "so that nothing is marked."
+        if least > _LEVEL
+        else f"Mean of {test.n[0]} subjects along the normals, outwards positive. In full colour where the family-wise p is "
         f"at most {_LEVEL:g}, by the maximum over vertices of |t| in {test.permutations} sign flips"
-        f"{' (all there are)' if test.every else ''}; no p can be below {least:.2g}"
-        + (", so none can be significant with so few subjects." if least > _LEVEL else ".")
+        f"{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
     )
     parts: list[Part] = [
         SurfaceMapPart(
-            title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean", mask="mean_found",
-            unit=unit, note=note,
+            title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
+            mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
         ),
         MorphPart(
             title="From before to after", arrays=ARRAYS, low="before", high="after", low_label="mean first visit",
@@ -259,9 +265,9 @@ def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]
     few = f" {found.freedom} degrees of freedom are few, so these are rough." if found.freedom < _FEW else ""
     return [
         SurfaceMapPart(
-            title="What is noise: the smallest detectable change", level=2, arrays=ARRAYS, vertices="before",
+            title="What is noise", level=2, arrays=ARRAYS, vertices="before",
             values="smallest_mm", signed=False,
-            note=f"1.96 sqrt(2) times the within-subject standard deviation of {found.scans} scans of {found.visits} "
+            note=f"The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of {found.scans} scans of {found.visits} "
             f"visits. A change of one scan against another that is smaller is noise.{few}",
         ),
         TablePart(
@@ -440,6 +446,7 @@ def _maps(change: Change) -> dict[str, npt.NDArray[Any]]:
         "change_mm": np.stack([one.change.along_mm for one in change.subjects]).astype(np.float32),
         "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
     }
+    found["beyond"] = np.stack([one.change.beyond for one in change.subjects])
     if change.unit:
         rates = [effect_of(one, rate=True) for one in change.subjects]
         found["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
