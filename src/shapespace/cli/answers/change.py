@@ -1,0 +1,92 @@
+"""`shapespace change`: what changed between the visits of each subject."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from shapespace.cli.answers.common import add_cohort, cohort_of, finish
+
+
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_cohort(sub)
+    sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whose scan it is (default: subject)")
+    sub.add_argument("--time", metavar="COLUMN",
+                     help="when: numbers, dates (2026-05-31) or words (default: time, visit or date)")  # fmt: skip
+    sub.add_argument("--order", type=_words, metavar="LIST", help="of times that are words, such as before,after")
+    sub.add_argument("--stable", default="auto", metavar="WHAT",
+                     help="what did not change: auto finds it, all, a region of the model, a file of vertices, or "
+                     "landmarks:NAME,NAME and a radius in mm (default: auto)")  # fmt: skip
+    sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
+                     help="a part whose volume is told too: a CSV file of vertices; can be repeated (default: the "
+                     "regions of the model)")  # fmt: skip
+    sub.add_argument("--landmarks", type=Path, metavar="FILE",
+                     help="CSV of name,vertex (default: those of the model)")  # fmt: skip
+    sub.add_argument("--group", metavar="COLUMN", help="two groups whose changes are compared")
+    sub.add_argument("--rate", action="store_true", help="mm per unit of time in the group, not last minus first")
+    sub.add_argument("--permutations", type=int, default=1000, metavar="N", help="of the tests (default 1000)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the tests (default 0)")
+    sub.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Answer, and write the report."""
+    from shapespace.batch.progress import progress
+    from shapespace.io.regions import read_region
+    from shapespace.statistics.change import ChangeSettings, change
+
+    cohort = cohort_of(arguments, "form")
+    if arguments.landmarks is not None:
+        cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
+    settings = ChangeSettings(
+        subject=arguments.subject,
+        time=arguments.time,
+        order=arguments.order,
+        stable=arguments.stable,
+        regions={name: read_region(path) for name, path in arguments.region} or None,
+        group=arguments.group,
+        rate=arguments.rate,
+        permutations=arguments.permutations,
+        seed=arguments.seed,
+    )
+    columns = [column for column in (arguments.subject, arguments.group) if column]
+    if arguments.drop_missing:
+        from shapespace.statistics.change_visits import time_column
+
+        cohort = cohort.complete([*columns, time_column(cohort.table, arguments.time)], drop_missing=True)
+    with progress(None, "comparing", "subject", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        answer = change(cohort, settings, on_step=step).answer()
+    return finish(answer, arguments)
+
+
+def _landmarks(path: Path, n_vertices: int) -> dict[str, int]:
+    from shapespace.errors import InputError
+    from shapespace.io.landmarks import read_landmark_indices
+
+    found = read_landmark_indices(path)
+    far = next((name for name, vertex in found.items() if vertex >= n_vertices), None)
+    if far is not None:
+        raise InputError(
+            f"{path}: landmark {far[:40]!r} is at vertex {found[far]}, but the surfaces have {n_vertices}; give "
+            "landmarks of these surfaces."
+        )
+    return found
+
+
+def _named_file(text: str) -> tuple[str, Path]:
+    name, equals, path = text.partition("=")
+    if not (equals and name.strip() and path):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FILE")
+    return name.strip(), Path(path)
+
+
+def _words(text: str) -> Any:
+    return tuple(word.strip() for word in text.split(","))

@@ -1,0 +1,187 @@
+"""Rigid alignment of a surface to itself at another time, by what did not change: named, or found robustly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.regions import read_region
+from shapespace.model.shape_model import region_vertices
+from shapespace.types import FloatArray, IntArray, Similarity
+
+SEARCHED = 1500
+"""Vertices among which the stable part is searched."""
+KEPT_SHARE = 0.4
+"""Share of the surface that must be unchanged for it to be found."""
+NEAR_MM = 10.0
+"""How near to a landmark vertices are taken, where nothing else is said."""
+_PATCHES, _PATCH_SHARE = 24, 0.15
+_FIRST_STEPS, _GO_ON, _STEPS = 3, 4, 20
+"""All starts take a few steps, and the best of them go on."""
+_FEWEST = 3
+_CUTOFF = 5.5
+"""Residuals beyond so many standard deviations count nothing: Tukey's biweight, 95 % efficient in three dimensions."""
+_ROUNDS = 10
+_SMALLEST = 1e-9
+
+
+def stable_vertices(cohort: Cohort, stable: str | Path | Sequence[int]) -> IntArray | None:
+    """Return the vertices that carry the alignment, each once; None where they are to be found.
+
+    Args:
+        cohort: whose surfaces they are of.
+        stable: `auto` finds them, `all` takes all; the name of a region of the model; a file of vertices;
+            `landmarks:NAME,NAME,...`, which may end in a radius in mm, for the vertices near these; or the vertices.
+
+    Raises:
+        FileError: the file cannot be read.
+        FileFormatError: it is no list of vertices.
+        InputError: there is no such region, landmark, file or vertex, or fewer than three vertices.
+    """
+    if not isinstance(stable, (str, Path)):
+        return _several(region_vertices(stable, cohort.n_vertices, "stable"), "those given")
+    text = str(stable)
+    if text == "auto":
+        return None
+    if text == "all":
+        return np.arange(cohort.n_vertices, dtype=np.int32)
+    if text.startswith("landmarks:"):
+        return _several(_near_landmarks(cohort, text), text)
+    regions: Mapping[str, IntArray] = {} if cohort.fitted is None else cohort.fitted.model.regions
+    if text in regions:
+        return _several(regions[text], text)
+    if not Path(text).is_file():
+        known = f"the model's regions are {', '.join(regions)}" if regions else "there is no model with regions"
+        raise InputError(
+            f"There is no stable region {text!r} ({known}), and no such file; give auto, all, a file of vertices, or "
+            "landmarks:NAME,NAME."
+        )
+    return _several(region_vertices(read_region(text), cohort.n_vertices, text), text)
+
+
+def _near_landmarks(cohort: Cohort, text: str) -> IntArray:
+    words = [word.strip() for word in text.removeprefix("landmarks:").split(",")]
+    radius_mm = NEAR_MM
+    if len(words) > 1 and words[-1].replace(".", "", 1).isdecimal():
+        radius_mm = float(words.pop())
+    known = dict(cohort.landmarks or {})
+    lacking = next((word for word in words if word not in known), None)
+    if lacking is not None:
+        there = ", ".join(sorted(known)) or "none"
+        raise InputError(f"There is no landmark {lacking[:40]!r} to align by; the surfaces have {there}.")
+    marks = cohort.reference[[known[word] for word in words]]
+    away = np.linalg.norm(cohort.reference[:, None] - marks, axis=2).min(axis=1)
+    return np.flatnonzero(away <= radius_mm).astype(np.int32)
+
+
+def _several(vertices: IntArray, name: str) -> IntArray:
+    if len(vertices) < _FEWEST:
+        raise InputError(f"The stable region {name} has {len(vertices)} vertices, and three are the least.")
+    return vertices
+
+
+def align_by(moving: FloatArray, fixed: FloatArray, area: FloatArray, stable: IntArray | None) -> tuple[
+    Similarity, FloatArray
+]:  # fmt: skip
+    """Return the rigid motion of `moving` onto `fixed` by what is stable, and the weights (V,) that it went by.
+
+    Args:
+        moving: (V, 3) mm.
+        fixed: (V, 3) mm, in correspondence.
+        area: (V,) of each vertex.
+        stable: vertices that are; None finds them (`align_robustly`).
+
+    Raises:
+        InputError: the stable vertices lie on a line.
+    """
+    if stable is None:
+        return align_robustly(moving, fixed, area)
+    weights = np.zeros(len(fixed))
+    weights[stable] = area[stable]
+    return fit_similarity(moving, fixed, weights, with_scale=False), weights
+
+
+def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> tuple[Similarity, FloatArray]:
+    """Return the rigid motion of `moving` onto `fixed` by the part that keeps its shape, and the weights it went by.
+
+    Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Discovery 12, 2006): from the whole
+    surface and from patches of it, fits and the `KEPT_SHARE` of the surface that they bring nearest take turns; the
+    start that ends nearest wins. From there on Tukey's biweight with the spread found takes in all that is unchanged.
+
+    Args:
+        moving: (V, 3) mm.
+        fixed: (V, 3) mm, in correspondence.
+        area: (V,) of each vertex, with which it counts.
+
+    Raises:
+        InputError: the vertices lie on a line.
+    """
+    if len(fixed) > SEARCHED:
+        some = np.random.default_rng(0).choice(len(fixed), SEARCHED, replace=False, p=area / area.sum())
+        p, q, a = moving[some], fixed[some], np.ones(SEARCHED)
+    else:
+        p, q, a = moving, fixed, area
+    a = a / a.sum()
+    ends = sorted((_trimmed(p, q, a, start, _FIRST_STEPS) for start in _starts(q)), key=lambda end: end.squares)
+    T = min((_trimmed(p, q, a, end.chosen, _STEPS) for end in ends[:_GO_ON]), key=lambda end: end.squares).T
+    residual = np.linalg.norm(T.apply(p) - q, axis=1)
+    size_mm = float(np.linalg.norm(np.ptp(fixed, axis=0)))
+    spread_mm = max(_quantile(residual, a, KEPT_SHARE) / float(chi.ppf(KEPT_SHARE, 3)), _SMALLEST * size_mm)
+    weights = area
+    for _ in range(_ROUNDS):
+        residual = np.linalg.norm(T.apply(moving) - fixed, axis=1)
+        weights = area * np.clip(1 - (residual / (_CUTOFF * spread_mm)) ** 2, 0.0, None) ** 2
+        T = fit_similarity(moving, fixed, weights, with_scale=False)
+    return T, weights
+
+
+def _starts(points: FloatArray) -> list[IntArray]:
+    """Return the whole of `points` (n, 3), and patches about some that lie far apart."""
+    count = max(round(_PATCH_SHARE * len(points)), _FEWEST + 1)
+    seed = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
+    away = np.full(len(points), np.inf)
+    starts = [np.arange(len(points), dtype=np.int32)]
+    for _ in range(_PATCHES):
+        distance = np.linalg.norm(points - points[seed], axis=1)
+        starts.append(np.argsort(distance, kind="stable")[:count].astype(np.int32))
+        away = np.minimum(away, distance)
+        seed = int(away.argmax())
+    return starts
+
+
+class _End(NamedTuple):
+    """A rigid motion, the points that it brings nearest, and their mean squared distance."""
+
+    T: Similarity
+    chosen: IntArray
+    squares: float
+
+
+def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, steps: int) -> _End:
+    """Return where fits to the nearest `KEPT_SHARE` of the points end, from those `chosen`."""
+    T, squares = Similarity.identity(), np.inf
+    for _ in range(steps):
+        try:
+            T = fit_similarity(p[chosen], q[chosen], area[chosen], with_scale=False)
+        except InputError:  # a patch on a line determines no rotation
+            break
+        residual = ((T.apply(p) - q) ** 2).sum(axis=1)
+        order = np.argsort(residual, kind="stable")
+        nearest = order[: int(np.searchsorted(np.cumsum(area[order]), KEPT_SHARE)) + 1].astype(np.int32)
+        now = float(area[nearest] @ residual[nearest] / area[nearest].sum())
+        if now >= squares:
+            break
+        squares, chosen = now, nearest
+    return _End(T, chosen, squares)
+
+
+def _quantile(values: FloatArray, weights: FloatArray, share: float) -> float:
+    order = np.argsort(values, kind="stable")
+    return float(values[order][np.searchsorted(np.cumsum(weights[order]), share)])

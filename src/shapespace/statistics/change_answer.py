@@ -1,0 +1,475 @@
+"""What changed, as a report: sentences, maps, tables, and the change as a morph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.table import named
+from shapespace.schemas import (
+    CurvePart,
+    MorphPart,
+    Part,
+    Series,
+    SurfaceMapPart,
+    TableColumn,
+    TablePart,
+    TextPart,
+)
+from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.change import Change, SubjectChange, effect_of, interval_of_mean
+from shapespace.statistics.change_group import MapTest
+from shapespace.types import Mesh
+
+ARRAYS, MAPS = "change.npz", "subjects.npz"
+SHOWN = 6
+"""Subjects whose maps the report draws."""
+LISTED, CURVES = 50, 12
+_LEVEL = 0.05
+_MM3_PER_ML = 1000.0
+_FEW = 10
+_SOURCES = {
+    "rescans": "Standard deviations are those of rescans.",
+    "fits": "Standard deviations are those that the fits state of their coefficients, carried through modes and "
+    "alignment, and widened where the stable part spreads more; what the model cannot make is not in them.",
+    "stable": "Standard deviations are the spread over the stable part, one for the whole surface; of volumes nothing "
+    "is known.",
+}
+
+
+def answer_of(change: Change) -> Answer:
+    """Return the report, tables, arrays and meshes of what changed."""
+    settings = change.settings
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "before": change.before,
+        "after": change.after,
+        "faces": np.asarray(change.cohort.faces),
+        "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
+    }
+    parts: list[Part] = []
+    if change.group is not None:
+        parts += _of_group(change, change.group, arrays)
+    if change.between is not None:
+        parts += _between(change, change.between, arrays)
+    parts += _of_noise(change, arrays)
+    parts += _of_subjects(change, arrays)
+    parts += _over_time(change)
+    parts.append(
+        SurfaceMapPart(
+            title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
+            unit="share of subjects", signed=False, limit=1.0,
+            note=f"Asked for: {settings.stable if isinstance(settings.stable, str) else 'vertices of a list'}. The "
+            "scans of a subject were brought to each other rigidly by these vertices.",
+        )
+    )  # fmt: skip
+    stable = settings.stable
+    return Answer(
+        "change",
+        "What changed?",
+        tuple(_summary(change)),
+        tuple(parts),
+        tables=_tables(change),
+        arrays={ARRAYS: arrays, MAPS: _maps(change)},
+        meshes={
+            "before.ply": Mesh(change.before, change.cohort.faces, name="before"),
+            "after.ply": Mesh(change.after, change.cohort.faces, name="after"),
+        },
+        notes=(*change.cohort.notes, *_notes(change)),
+        settings={
+            "subject": settings.subject,
+            "time": settings.time,
+            "order": settings.order,
+            "stable": str(stable) if isinstance(stable, str) or not isinstance(stable, Sequence) else list(stable),
+            "group": settings.group,
+            "rate": settings.rate,
+            "permutations": settings.permutations,
+            "seed": settings.seed,
+            "uncertainty": change.uncertainty,
+        },
+        model_hashes=() if change.cohort.fitted is None else (change.cohort.fitted.model.content_hash,),
+    )
+
+
+def _summary(change: Change) -> list[str]:
+    subjects = change.subjects
+    rms = float(np.median([subject.rms_mm for subject in subjects]))
+    share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
+    who = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
+    told = [
+        f"{who} changed by {rms:.2f} mm (RMS along the normals{'' if len(subjects) == 1 else ', median'}), and on "
+        f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
+    ]
+    if change.group is not None and change.group_volumes is not None:
+        volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects]) / _MM3_PER_ML
+        low, high = interval_of_mean(volumes)
+        told.append(_of_test(change, change.group, "the mean change", "none"))
+        told.append(
+            f"The volume changed by {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to "
+            f"{high:+.2f}), {_p(float(change.group_volumes.p[0]))}."
+        )
+    if change.between is not None and change.between_volumes is not None:
+        first, second = change.groups
+        told.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
+        told.append(
+            f"The volume of {second} changed by {change.between_volumes.effect[0] / _MM3_PER_ML:+.2f} ml{_per(change)} "
+            f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
+        )
+    if change.repeatability is None:
+        told.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
+    else:
+        known, smallest = change.repeatability, change.repeatability.smallest_mm
+        told.append(
+            f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
+            f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
+            f"surface; {smallest.max():.2f} mm at most), and {known.volumes_smallest_mm3[0] / _MM3_PER_ML:.2f} ml of "
+            "volume; less is noise."
+        )
+    return told
+
+
+def _of_test(change: Change, test: MapTest, what: str, other: str) -> str:
+    at = int(np.abs(test.t).argmax())
+    found = test.p <= _LEVEL
+    where = (
+        f"with the error over all vertices held it lies on {100 * found.mean():.0f} % of the vertices, up to "
+        f"{test.effect[found][np.abs(test.effect[found]).argmax()]:+.2f} mm{_per(change)}"
+        if found.any()
+        else f"with the error over all vertices held it lies nowhere (smallest p = {test.p[at]:.3g})"
+    )
+    differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
+    few = (
+        f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
+    )
+    return f"As a whole {what} {differs} {other} ({_p(test.omnibus_p)}); {where}{few}."
+
+
+def _p(p: float) -> str:
+    return f"p = {p:.3g}"
+
+
+def _per(change: Change) -> str:
+    return f" per {change.unit}" if change.settings.rate else ""
+
+
+def _of_group(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    unit = f"mm{_per(change)}"
+    arrays |= {"mean": test.effect, "mean_t": test.t, "mean_p": test.p, "mean_found": test.p <= _LEVEL}
+    least = 1 / test.permutations
+    note = (
+        f"Mean of {test.n[0]} subjects along the normals, outwards positive. No p can be below {least:.2g} with so few, "
+        "so that nothing is marked."
+        if least > _LEVEL
+        else f"Mean of {test.n[0]} subjects along the normals, outwards positive. In full colour where the family-wise p is "
+        f"at most {_LEVEL:g}, by the maximum over vertices of |t| in {test.permutations} sign flips"
+        f"{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
+    )
+    parts: list[Part] = [
+        SurfaceMapPart(
+            title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
+            mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
+        ),
+        MorphPart(
+            title="From before to after", arrays=ARRAYS, low="before", high="after", low_label="mean first visit",
+            high_label="mean with its change",
+        ),
+    ]  # fmt: skip
+    if change.group_volumes is not None and len(change.parts) > 1:
+        parts.append(_region_table(change, change.group_volumes))
+    if change.group_landmarks is not None:
+        header, rows = _group_landmarks(change, change.group_landmarks)
+        kinds = ("text", "mm", "mm", "mm", "mm", "p")
+        columns = tuple(TableColumn(name=name, kind=kind) for name, kind in zip(header, kinds, strict=True))  # type: ignore[arg-type]
+        parts.append(
+            TablePart(
+                title="Landmarks", columns=columns, rows=tuple(tuple(row) for row in rows),
+                note=f"Along the normals, {unit}, with the 95 % interval of the mean; p with the error over all held.",
+            )
+        )  # fmt: skip
+    return parts
+
+
+def _region_table(change: Change, test: MapTest) -> Part:
+    rows: list[tuple[Any, ...]] = []
+    for at, name in enumerate(change.parts):
+        own = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[at] for one in change.subjects])
+        low, high = interval_of_mean(own / _MM3_PER_ML)
+        rows.append((name, float(own.mean() / _MM3_PER_ML), low, high, float(test.p[at])))
+    return TablePart(
+        title="Volumes swept",
+        columns=(
+            TableColumn(name="of"),
+            *(TableColumn(name=name, kind="number") for name in ("mean, ml", "low", "high")),
+            TableColumn(name="p", kind="p"),
+        ),
+        rows=tuple(rows),
+        note="With the 95 % interval of the mean; p with the error over all parts held.",
+    )
+
+
+def _group_landmarks(change: Change, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
+    rows: list[list[Any]] = []
+    for at, (name, vertex) in enumerate(change.landmarks.items()):
+        values = np.array([effect_of(one, rate=change.settings.rate).along_mm[vertex] for one in change.subjects])
+        low, high = interval_of_mean(values)
+        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[at]])
+    return ("landmark", "mean", "stddev", "low", "high", "p"), rows
+
+
+def _between(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    first, second = change.groups
+    arrays |= {"difference": test.effect, "difference_p": test.p, "difference_found": test.p <= _LEVEL}
+    note = (
+        f"Mean change of {second} ({test.n[1]} subjects) less that of {first} ({test.n[0]}). In full colour where the "
+        f"family-wise p is at most {_LEVEL:g}, by {test.permutations} permutations of subjects"
+        f"{' (all there are)' if test.every else ''}."
+    )
+    return [
+        SurfaceMapPart(
+            title=f"{second} beside {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
+            mask="difference_found", unit=f"mm{_per(change)}", note=note,
+        )
+    ]  # fmt: skip
+
+
+def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    found = change.repeatability
+    if found is None:
+        text = f"There are no rescans: nobody was scanned twice at a time. {_SOURCES[change.uncertainty]}"
+        return [TextPart(title="What is noise", level=2, text=text)]
+    arrays |= {"smallest_mm": found.smallest_mm, "icc": found.icc}
+    rows: list[tuple[Any, ...]] = [
+        (
+            "surface (mm, median)",
+            *(float(np.median(of)) for of in (found.within_mm, found.smallest_mm)),
+            found.shape_icc,
+        ),
+        *(
+            (
+                f"volume of {name} (mm3)",
+                float(found.volumes_within_mm3[at]),
+                float(found.volumes_smallest_mm3[at]),
+                found.volume_icc if at == 0 else None,
+            )
+            for at, name in enumerate(change.parts)
+        ),
+        *(
+            (f"{name} (mm)", float(within), float(smallest), float(found.icc[vertex]))
+            for (name, vertex), within, smallest in zip(
+                change.landmarks.items(), found.landmarks_within_mm, found.landmarks_smallest_mm, strict=True
+            )
+        ),
+    ]
+    few = f" {found.freedom} degrees of freedom are few, so these are rough." if found.freedom < _FEW else ""
+    return [
+        SurfaceMapPart(
+            title="What is noise", level=2, arrays=ARRAYS, vertices="before",
+            values="smallest_mm", signed=False,
+            note=f"The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of {found.scans} scans of {found.visits} "
+            f"visits. A change of one scan against another that is smaller is noise.{few}",
+        ),
+        TablePart(
+            title="Repeatability",
+            columns=(
+                TableColumn(name="of"), TableColumn(name="within-subject stddev", kind="number"),
+                TableColumn(name="smallest detectable change", kind="number"), TableColumn(name="ICC", kind="number"),
+            ),
+            rows=tuple(rows),
+        ),
+    ]  # fmt: skip
+
+
+def _of_subjects(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    every = len(change.subjects)
+    more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
+    columns = [
+        TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
+        TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
+        TableColumn(name="volume, ml", kind="number"), TableColumn(name="stddev, ml", kind="number"),
+    ]  # fmt: skip
+    if change.closed:
+        columns.append(TableColumn(name="of the volume before", kind="percent"))
+    if change.groups:
+        columns.append(TableColumn(name="group"))
+    rows: list[tuple[Any, ...]] = []
+    for one in change.subjects[:LISTED]:
+        volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
+        row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
+        row += [volume / _MM3_PER_ML, _or_none(stddev / _MM3_PER_ML)]
+        row += [volume / one.before_mm3] if change.closed else []
+        rows.append((*row, *([one.group] if change.groups else [])))
+    parts: list[Part] = [
+        TablePart(
+            title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
+            note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
+        )
+    ]  # fmt: skip
+    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:SHOWN]
+    for number, subject in enumerate(most, 1):
+        before, after = change.surfaces(subject.name)
+        key = f"subject{number}"
+        arrays |= {
+            f"{key}_before": before.vertices,
+            f"{key}_after": after.vertices,
+            f"{key}_change": subject.change.along_mm,
+            f"{key}_beyond": subject.change.beyond,
+        }
+        parts.append(
+            SurfaceMapPart(
+                title=f"{subject.name}, {subject.visits[0].label} to {subject.visits[-1].label}", arrays=ARRAYS,
+                vertices=f"{key}_before", values=f"{key}_change", mask=f"{key}_beyond",
+                note=f"Outwards positive; in full colour where it exceeds {subject.change.quantile:.2f} standard "
+                f"deviations (median of these {np.median(subject.change.stddev_mm):.2f} mm).",
+            )
+        )  # fmt: skip
+        if number == 1:
+            parts.append(
+                MorphPart(
+                    title=f"{subject.name} from before to after", arrays=ARRAYS, low=f"{key}_before",
+                    high=f"{key}_after", low_label=subject.visits[0].label, high_label=subject.visits[-1].label,
+                )
+            )  # fmt: skip
+    if len(change.subjects) > SHOWN:
+        parts.append(TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}."))
+    return parts
+
+
+def _over_time(change: Change) -> list[Part]:
+    if not change.unit or all(len(one.visits) < 3 for one in change.subjects):
+        return []
+    series = tuple(
+        Series(
+            label=one.name,
+            x=tuple(visit.at for visit in one.visits),
+            y=tuple(visit.volume_mm3 / _MM3_PER_ML for visit in one.visits),
+        )
+        for one in change.subjects[:CURVES]
+    )
+    every = len(change.subjects)
+    more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
+    return [
+        CurvePart(
+            title="Over time", level=2, series=series, x=change.unit, y="volume since the first visit, ml",
+            note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
+        )
+    ]  # fmt: skip
+
+
+def _subject_rows(change: Change) -> tuple[list[str], list[list[Any]]]:
+    header = [
+        "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
+        "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
+    ]  # fmt: skip
+    if change.unit:
+        header += ["rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit"]
+    rows: list[list[Any]] = []
+    for one in change.subjects:
+        row: list[Any] = [
+            one.name,
+            one.group,
+            one.visits[0].label,
+            one.visits[-1].label,
+            one.rms_mm,
+            float(one.change.along_mm[np.abs(one.change.along_mm).argmax()]),
+            one.beyond_share,
+            float(one.change.volumes_mm3[0]),
+            _or_none(one.change.volumes_stddev_mm3[0]),
+            _or_none(one.change.volumes_mm3[0] / one.before_mm3),
+            len(one.visits),
+            sum(visit.scans for visit in one.visits),
+            float(np.median(one.change.stddev_mm)),
+        ]
+        if one.rate is not None:
+            row += [
+                float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
+                float(one.rate.volumes_mm3[0]),
+                _or_none(one.rate.volumes_stddev_mm3[0]),
+                change.unit,
+            ]
+        rows.append(row)
+    return header, rows
+
+
+def _tables(change: Change) -> dict[str, Rows]:
+    tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
+    tables["visits.csv"] = (
+        ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
+        [
+            (one.name, visit.label, visit.at, visit.scans, visit.rms_mm, visit.volume_mm3)
+            for one in change.subjects
+            for visit in one.visits
+        ],
+    )
+    if len(change.parts) > 1:
+        tables["regions.csv"] = (
+            ("subject", "region", "volume_change_mm3", "stddev_mm3"),
+            [
+                (one.name, name, float(one.change.volumes_mm3[at]), _or_none(one.change.volumes_stddev_mm3[at]))
+                for one in change.subjects
+                for at, name in enumerate(change.parts)
+            ],
+        )
+    if change.landmarks:
+        tables["landmarks.csv"] = (
+            ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
+             "along_normal_stddev_mm", "smallest_detectable_mm"),
+            [row for one in change.subjects for row in _landmark_rows(change, one)],
+        )  # fmt: skip
+        if change.group_landmarks is not None:
+            tables["group_landmarks.csv"] = _group_landmarks(change, change.group_landmarks)
+    return tables
+
+
+def _landmark_rows(change: Change, subject: SubjectChange) -> list[Sequence[object]]:
+    found, known = subject.change, change.repeatability
+    smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
+    return [
+        (
+            subject.name,
+            name,
+            *map(float, found.landmarks_mm[at]),
+            float(np.linalg.norm(found.landmarks_mm[at])),
+            float(found.landmarks_stddev_mm[at]),
+            float(found.along_mm[vertex]),
+            float(found.stddev_mm[vertex]),
+            smallest[at],
+        )
+        for at, (name, vertex) in enumerate(change.landmarks.items())
+    ]
+
+
+def _maps(change: Change) -> dict[str, npt.NDArray[Any]]:
+    found = {
+        "subjects": np.array([one.name for one in change.subjects]),
+        "change_mm": np.stack([one.change.along_mm for one in change.subjects]).astype(np.float32),
+        "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
+    }
+    found["beyond"] = np.stack([one.change.beyond for one in change.subjects])
+    if change.unit:
+        rates = [effect_of(one, rate=True) for one in change.subjects]
+        found["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
+        found["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
+    return found
+
+
+def _notes(change: Change) -> list[str]:
+    notes: list[str] = []
+    if change.single:
+        alone, every = len(change.single), len(change.subjects) + len(change.single)
+        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({named(change.single)}).")
+    ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
+    if not change.unit and len(ends) > 1:
+        told = named([f"{first} to {last}" for first, last in sorted(ends)])
+        notes.append(f"Not all subjects have the same first and last visit ({told}).")
+    if change.model_only:
+        notes.append(
+            "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
+            "give --surfaces dense."
+        )
+    return notes
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

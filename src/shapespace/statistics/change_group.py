@@ -1,0 +1,154 @@
+"""Tests of maps over subjects: by sign flips against none, by permutation between two groups; maxima over vertices.
+
+Nichols and Holmes, Human Brain Mapping 15, 2002; Winkler et al., NeuroImage 92, 2014.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.types import BoolArray, FloatArray
+
+_BLOCK = 64
+_TIE = 1e-10
+"""Share by which a statistic that is the same in other words may differ by rounding."""
+_FLOOR = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class MapTest:
+    """What a test of maps says.
+
+    Args:
+        effect: (V,) mean, or difference of the means of two groups.
+        t: (V,) Student's t.
+        p: (V,) with the error over all vertices held, by the permutation maximum of |t|.
+        omnibus_p: of any change at all.
+        permutations: that were made, the data's own among them.
+        every: whether these are all there are.
+        n: subjects, or subjects of each group.
+    """
+
+    effect: FloatArray
+    t: FloatArray
+    p: FloatArray
+    omnibus_p: float
+    permutations: int
+    every: bool
+    n: tuple[int, ...]
+
+
+def mean_test(
+    maps: FloatArray,
+    area: FloatArray,
+    permutations: int,
+    seed: int,
+    on_step: Callable[[int, int], None] | None = None,
+) -> MapTest:
+    """Return whether the mean of `maps` (N, V) differs from none, each as likely with the other sign if it does not.
+
+    Args:
+        maps: of N subjects, 2 or more.
+        area: (V,) with which vertices count in the omnibus test: that of the mean's square.
+        permutations: at most; all sign flips where they are no more.
+        seed: of random ones.
+        on_step: called with (done, total) permutations.
+    """
+    n = len(maps)
+    every = 2 ** (n - 1) <= permutations
+    count = 2 ** (n - 1) if every else permutations
+    squares = (maps**2).sum(axis=0)
+
+    def t_of(sums: FloatArray) -> FloatArray:
+        within = np.maximum(squares - sums**2 / n, _FLOOR * squares) / (n - 1)
+        return _ratio(sums / n, np.sqrt(within / n))
+
+    def draws() -> Iterator[FloatArray]:
+        if every:
+            yield from (np.array((1.0, *signs)) for signs in itertools.product((1.0, -1.0), repeat=n - 1))
+            return
+        rng = np.random.default_rng(seed)
+        yield np.ones(n)
+        yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
+
+    t, p, omnibus_p = _permuted(maps, area, draws(), count, t_of, on_step)
+    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,))
+
+
+def difference_test(
+    maps: FloatArray,
+    second: BoolArray,
+    area: FloatArray,
+    permutations: int,
+    seed: int,
+    on_step: Callable[[int, int], None] | None = None,
+) -> MapTest:
+    """Return whether the mean of `maps` (N, V) differs between subjects that are `second` (N,) and those that are not.
+
+    Subjects change places between the groups, and arguments are those of `mean_test`; each group has two or more.
+    """
+    n, of_second = len(maps), int(second.sum())
+    of_first = n - of_second
+    every = math.comb(n, of_second) <= permutations
+    count = math.comb(n, of_second) if every else permutations
+    centred = maps - maps.mean(axis=0)
+    squares = (centred**2).sum(axis=0)
+
+    def contrast(chosen: BoolArray) -> FloatArray:
+        return np.where(chosen, 1.0 / of_second, -1.0 / of_first)
+
+    def t_of(difference: FloatArray) -> FloatArray:
+        between = difference**2 * of_first * of_second / n
+        within = np.maximum(squares - between, _FLOOR * squares) / (n - 2)
+        return _ratio(difference, np.sqrt(within * (1.0 / of_first + 1.0 / of_second)))
+
+    def draws() -> Iterator[FloatArray]:
+        yield contrast(second)
+        if every:
+            own = tuple(np.flatnonzero(second))
+            for chosen in itertools.combinations(range(n), of_second):
+                if chosen != own:
+                    yield contrast(np.isin(np.arange(n), chosen))
+            return
+        rng = np.random.default_rng(seed)
+        yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
+
+    t, p, omnibus_p = _permuted(centred, area, draws(), count, t_of, on_step)
+    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second))
+
+
+def _permuted(
+    maps: FloatArray,
+    area: FloatArray,
+    draws: Iterator[FloatArray],
+    count: int,
+    t_of: Callable[[FloatArray], FloatArray],
+    on_step: Callable[[int, int], None] | None,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return t of the first of `draws`, its p (V,) against the maxima of all, and the p of the omnibus test."""
+    gram = (maps * area) @ maps.T
+    observed, own = np.zeros(maps.shape[1]), 0.0
+    maxima: list[float] = []
+    as_large = 0
+    while block := list(itertools.islice(draws, _BLOCK)):
+        weights = np.stack(block)
+        t = t_of(weights @ maps)
+        overall = np.einsum("pn,nm,pm->p", weights, gram, weights)
+        if not maxima:
+            observed, own = t[0], float(overall[0])
+        maxima += list(np.abs(t).max(axis=1))
+        as_large += int((overall >= own * (1 - _TIE)).sum())
+        if on_step is not None:
+            on_step(len(maxima), count)
+    ordered = np.sort(maxima)
+    below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))
+    return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima)
+
+
+def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
+    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)

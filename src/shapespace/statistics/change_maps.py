@@ -1,0 +1,179 @@
+"""What a surface did from visit to visit: displacement along its normals, volume swept, and what is known of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.geometry.similarity import fit_similarity, small_poses
+from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
+from shapespace.statistics.change_align import align_by
+from shapespace.statistics.change_visits import Visit
+from shapespace.types import FloatArray, IntArray, Mesh
+
+_RIGID = 6
+"""Of the poses: turns and shifts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """The scans of one subject, aligned on what is stable.
+
+    Args:
+        visits: of the subject.
+        scans: for each visit the (n, V, 3) surfaces of its scans, mm.
+        means: (T, V, 3) their mean at each visit.
+        normals: (V, 3) of the first of these.
+        weights: (V,) by which the last scan was aligned.
+    """
+
+    visits: tuple[Visit, ...]
+    scans: tuple[FloatArray, ...]
+    means: FloatArray
+    normals: FloatArray
+    weights: FloatArray
+
+    @property
+    def along_mm(self) -> FloatArray:
+        """(T, V) displacements from the first visit, along its normals."""
+        return np.einsum("tvd,vd->tv", self.means - self.means[0], self.normals)
+
+
+def aligned(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) -> Aligned:
+    """Return the scans of one subject, all brought to the first by what is stable.
+
+    Raises:
+        InputError: the stable vertices lie on a line.
+    """
+    faces = faces_in(cohort)
+    fixed = cohort.vertices(visits[0].rows[0])
+    area = vertex_areas(Mesh(fixed, faces))
+    weights = area
+    scans: list[FloatArray] = []
+    for visit in visits:
+        own: list[FloatArray] = []
+        for row in visit.rows:
+            x = fixed
+            if row != visits[0].rows[0]:
+                T, weights = align_by(cohort.vertices(row), fixed, area, stable)
+                x = T.apply(cohort.vertices(row))
+            own.append(x)
+        scans.append(np.stack(own))
+    means = np.stack([own.mean(axis=0) for own in scans])
+    return Aligned(tuple(visits), tuple(scans), means, vertex_normals(Mesh(means[0], faces)), weights)
+
+
+def faces_in(cohort: Cohort) -> IntArray:
+    """Return the triangles of a cohort that has some."""
+    assert cohort.faces is not None
+    return cohort.faces
+
+
+def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+    """Return the volume (V,) that each vertex sweeps from `before` (V, 3) to `after` on straight ways, outwards +.
+
+    That of a triangle counts a third for each of its corners. The sum is exact, and of closed surfaces the difference
+    of the volumes: at each moment a triangle sweeps its area vector times its mean velocity, which is quadratic in
+    time, so that Simpson's rule has no error.
+    """
+    moved = after - before
+    corners: FloatArray = moved[faces].sum(axis=1) / 3.0
+    half = 0.5 * (before + after)
+    area = (face_vectors(before, faces) + 4.0 * face_vectors(half, faces) + face_vectors(after, faces)) / 12.0
+    shares = np.repeat((corners * area).sum(axis=1) / 3.0, 3)
+    return np.asarray(np.bincount(faces.ravel(), shares, len(before)), dtype=np.float64)
+
+
+def volume_mm3(vertices: FloatArray, faces: IntArray) -> float:
+    """Return the volume that a closed surface encloses."""
+    x = vertices - vertices.mean(axis=0)
+    corners: FloatArray = x[faces].sum(axis=1)
+    return float(np.vdot(face_vectors(x, faces), corners)) / 18.0
+
+
+def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
+    """Return (T,) with which visits sum to last minus first, or to the slope of a line by time."""
+    if rate:
+        at = np.array([visit.at for visit in visits])
+        away = at - at.mean()
+        return away / float(away @ away)
+    out = np.zeros(len(visits))
+    out[0], out[-1] = -1.0, 1.0
+    return out
+
+
+def noise_factor(visits: Sequence[Visit], weights: FloatArray) -> float:
+    """Return by how much the noise of one scan counts in the sum of visits by `weights` (T,), each a mean of scans."""
+    return float(np.sqrt(sum(w**2 / len(visit.rows) for w, visit in zip(weights, visits, strict=True))))
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Standard deviations of a sum over visits of one subject.
+
+    Args:
+        along_mm: (V,) along the normals.
+        landmarks_mm: (L,) of the whole displacement of each landmark: root of the summed variances along the axes.
+        volumes_mm3: (P,) of the volume swept by each part; NaN where nothing is known of it.
+    """
+
+    along_mm: FloatArray
+    landmarks_mm: FloatArray
+    volumes_mm3: FloatArray
+
+
+def known_by_stable(subject: Aligned, landmarks: Sequence[int], parts: FloatArray) -> Known:
+    """Return what the spread over the stable part says, which did not change; the same at all vertices."""
+    moved = subject.means[-1] - subject.means[0]
+    along = np.einsum("vd,vd->v", moved, subject.normals)
+    spread_mm = _spread(along, subject.weights)
+    marks = np.full(len(landmarks), _spread(np.linalg.norm(moved, axis=1), subject.weights))
+    return Known(np.full(len(along), spread_mm), marks, np.full(len(parts), np.nan))
+
+
+def known_by_fits(
+    cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: Sequence[int], parts: FloatArray
+) -> Known:
+    """Return what the fits' own standard deviations say, through modes and alignment.
+
+    Coefficients vary by `b_stddev`, modes move the vertices, and the alignment takes out what of that is a rigid motion
+    of the stable part. Where displacements there, which should be none, are larger than that, all is widened by the
+    same factor.
+
+    Args:
+        cohort: of fits.
+        subject: aligned.
+        weights: (T,) of the sum over visits.
+        landmarks: vertices.
+        parts: (P, V) of which volumes are swept, 1 for their vertices and 0 for the others.
+    """
+    fitted, faces = cohort.fitted, faces_in(cohort)
+    assert fitted is not None
+    first = subject.visits[0].rows[0]
+    modes = fitted.b.shape[1]
+    T = fit_similarity(fitted.model.reconstruct(fitted.b[first]), subject.scans[0][0])
+    turned = fitted.model.vertex_basis[:, :modes].reshape(-1, 3, modes).transpose(0, 2, 1) @ (T.scale * T.rotation.T)
+    flat = turned.transpose(0, 2, 1).reshape(-1, modes)
+    centre = subject.means[0] - subject.means[0].mean(axis=0)
+    rigid = small_poses(centre)[:, :_RIGID]
+    weighed = np.repeat(subject.weights, 3)[:, None] * rigid
+    flat = flat - rigid @ np.linalg.solve(rigid.T @ weighed, weighed.T @ flat)
+    moves = flat.reshape(-1, 3, modes)
+    variance = np.zeros(modes)
+    for w, visit in zip(weights, subject.visits, strict=True):
+        variance += (w / len(visit.rows)) ** 2 * (fitted.b_stddev[list(visit.rows)] ** 2).sum(axis=0)
+    along = np.einsum("vdk,vd->vk", moves, subject.normals) ** 2 @ variance
+    marks = (moves[list(landmarks)] ** 2).sum(axis=1) @ variance
+    vectors = np.repeat(face_vectors(subject.means.mean(axis=0), faces) / 6.0, 3, axis=0)
+    outward = np.stack([np.bincount(faces.ravel(), vectors[:, d], len(centre)) for d in range(3)], axis=1)
+    volumes = (parts @ np.einsum("vdk,vd->vk", moves, outward)) ** 2 @ variance
+    summed = weights @ subject.along_mm
+    wider = max(1.0, _spread(summed / np.sqrt(np.maximum(along, 1e-18)), subject.weights))
+    return Known(wider * np.sqrt(along), wider * np.sqrt(marks), wider * np.sqrt(volumes))
+
+
+def _spread(values: FloatArray, weights: FloatArray) -> float:
+    return float(np.sqrt(weights @ values**2 / weights.sum()))

@@ -1,0 +1,147 @@
+"""Repeatability from rescans: how far two scans of the same subject at the same time differ, and what that means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import vertex_areas
+from shapespace.statistics.change_maps import Aligned, swept_mm3
+from shapespace.types import FloatArray, IntArray, Mesh
+
+SMALLEST = 1.96 * float(np.sqrt(2.0))
+"""Of the within-subject standard deviation: the smallest detectable change of one scan against another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """What rescans tell of the noise of one scan, after the alignment that the changes have.
+
+    Args:
+        scans: that are rescanned or rescans,
+        visits: of so many,
+        freedom: degrees of freedom, scans less visits.
+        within_mm: (V,) within-subject standard deviation along the normals.
+        volumes_within_mm3: (P,) of the volume that each part sweeps, the whole first.
+        landmarks_within_mm: (L,) of each landmark: root of the summed variances along the axes.
+        icc: (V,) intraclass correlation of each vertex between people, all three axes; NaN without two people.
+        shape_icc: of all vertices together,
+        volume_icc: and of the volume between the surface and the mean.
+    """
+
+    scans: int
+    visits: int
+    freedom: int
+    within_mm: FloatArray
+    volumes_within_mm3: FloatArray
+    landmarks_within_mm: FloatArray
+    icc: FloatArray
+    shape_icc: float
+    volume_icc: float
+
+    @property
+    def smallest_mm(self) -> FloatArray:
+        """(V,) smallest detectable change, 1.96 sqrt(2) times the standard deviation."""
+        return SMALLEST * self.within_mm
+
+    @property
+    def volumes_smallest_mm3(self) -> FloatArray:
+        """(P,) the same of the volumes."""
+        return SMALLEST * self.volumes_within_mm3
+
+    @property
+    def landmarks_smallest_mm(self) -> FloatArray:
+        """(L,) the same of each landmark."""
+        return SMALLEST * self.landmarks_within_mm
+
+
+@dataclass(eq=False)
+class Rescans:
+    """Gathers rescans, a subject at a time.
+
+    Args:
+        reference: (V, 3) in whose frame people are compared.
+        faces: (F, 3).
+        landmarks: vertices.
+        parts: (P, V) of which volumes are swept, the whole first; 1 for their vertices and 0 for the others.
+    """
+
+    reference: FloatArray
+    faces: IntArray
+    landmarks: list[int]
+    parts: FloatArray
+    scans: int = 0
+    visits: int = 0
+    people: list[int] = field(default_factory=list[int])
+
+    def __post_init__(self) -> None:
+        V = len(self.reference)
+        self._area = vertex_areas(Mesh(self.reference, self.faces))
+        self._along, self._marks, self._volume = np.zeros(V), np.zeros(len(self.landmarks)), np.zeros(len(self.parts))
+        self._within, self._means, self._squares = np.zeros(V), np.zeros((V, 3)), np.zeros(V)
+        self._volumes: list[FloatArray] = []
+
+    def add(self, subject: Aligned) -> None:
+        """Take in the visits of a subject that have rescans."""
+        chosen = [scans for scans in subject.scans if len(scans) > 1]
+        for scans in chosen:
+            off = scans - scans.mean(axis=0)
+            self._along += (np.einsum("nvd,vd->nv", off, subject.normals) ** 2).sum(axis=0)
+            self._marks += (off[:, self.landmarks] ** 2).sum(axis=(0, 2))
+            self._volume += _squares(self._swept(subject.means[0], scans) @ self.parts.T)
+            self.scans += len(scans)
+            self.visits += 1
+        if chosen:
+            self._add_person(chosen[0])
+
+    def _add_person(self, scans: FloatArray) -> None:
+        """One visit of each person stands for it between people."""
+        mean = scans.mean(axis=0)
+        T = fit_similarity(mean, self.reference, self._area, with_scale=False)
+        off = T.apply(mean) - self.reference
+        self._within += ((scans - mean) ** 2).sum(axis=(0, 2))
+        self._means += len(scans) * off
+        self._squares += len(scans) * (off**2).sum(axis=1)
+        posed = np.stack([T.apply(scan) for scan in scans])
+        self._volumes.append(self._swept(self.reference, posed).sum(axis=1, keepdims=True))
+        self.people.append(len(scans))
+
+    def _swept(self, before: FloatArray, scans: FloatArray) -> FloatArray:
+        return np.stack([swept_mm3(before, scan, self.faces) for scan in scans])
+
+    def told(self) -> Repeatability | None:
+        """Return what they tell; None where there are none."""
+        freedom = self.scans - self.visits
+        if not freedom:
+            return None
+        between = self._squares - (self._means**2).sum(axis=1) / sum(self.people)
+        volumes = np.concatenate(self._volumes)
+        within_volume = np.sum([_squares(own) for own in self._volumes], axis=0)
+        return Repeatability(
+            self.scans,
+            self.visits,
+            freedom,
+            np.sqrt(self._along / freedom),
+            np.sqrt(self._volume / freedom),
+            np.sqrt(self._marks / freedom),
+            _icc(between, self._within, self.people),
+            float(_icc(between.sum(keepdims=True), self._within.sum(keepdims=True), self.people)[0]),
+            float(_icc(_squares(volumes) - within_volume, within_volume, self.people)[0]),
+        )
+
+
+def _icc(between: FloatArray, within: FloatArray, sizes: list[int]) -> FloatArray:
+    """Return ICC(1,1) from sums of squares between and within groups of `sizes` (Shrout and Fleiss 1979)."""
+    groups, n = len(sizes), sum(sizes)
+    if groups < 2:
+        return np.full(len(between), np.nan)
+    k = (n - sum(size**2 for size in sizes) / n) / (groups - 1)
+    b, w = between / (groups - 1), within / (n - groups)
+    total = b + (k - 1) * w
+    return np.divide(b - w, total, out=np.full(len(b), np.nan), where=total > 0)
+
+
+def _squares(values: FloatArray) -> FloatArray:
+    return np.asarray(((values - values.mean(axis=0)) ** 2).sum(axis=0), dtype=np.float64)

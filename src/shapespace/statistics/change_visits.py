@@ -1,0 +1,146 @@
+"""Visits of subjects from a table: who was scanned when, in which order, and which scans repeat another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+
+from shapespace.cohort.table import Table, named
+from shapespace.errors import InputError
+
+TIMES = ("time", "visit", "date")
+"""The columns that may tell the time; the first that is there does."""
+RESCAN = "rescan"
+_NOT_MARKED = frozenset({"", "0", "0.0", "no", "false"})
+_DAYS_IN_A_YEAR = 365.25
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One time of one subject.
+
+    Args:
+        at: the time in units of `Visits.unit`, or the place in the order of words.
+        label: as the table tells it.
+        rows: of its scans; more than one are rescans.
+    """
+
+    at: float
+    label: str
+    rows: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """The visits of all subjects in a table.
+
+    Args:
+        of: subject -> visits, in order.
+        unit: of time, such as "year", for rates; empty where times are words.
+        column: that tells the times.
+    """
+
+    of: Mapping[str, tuple[Visit, ...]]
+    unit: str
+    column: str
+
+    @property
+    def rescans(self) -> int:
+        """Scans beside the first of their visit."""
+        return sum(len(visit.rows) - 1 for visits in self.of.values() for visit in visits)
+
+
+def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str] | None) -> Visits:
+    """Return the visits in a table of which no subject and no time is missing.
+
+    Args:
+        table: a row for each scan.
+        subject: the column that tells whose it is.
+        time: the column that tells when; None takes the first of `TIMES` that is there.
+        order: of times that are words, the earliest first; None for numbers and dates.
+
+    Raises:
+        InputError: no such column, times that are neither numbers nor dates without an order, a time that is not in
+            it, or two scans of one visit of which the column `rescan` marks none.
+    """
+    column = time_column(table, time)
+    places, unit = _places(table, column, order)
+    subjects, labels = table.texts(subject), table.texts(column)
+    marks = table.columns.get(RESCAN)
+    rows: dict[str, dict[float, list[int]]] = {}
+    for row, (who, at) in enumerate(zip(subjects, places, strict=True)):
+        rows.setdefault(who, {}).setdefault(at, []).append(row)
+    if marks is not None:
+        for who, times in rows.items():
+            for scans in times.values():
+                plain = [row for row in scans if marks[row].lower() in _NOT_MARKED]
+                if len(plain) > 1:
+                    raise InputError(
+                        f"{table.where}: {who} has {len(plain)} scans at {labels[plain[0]]} "
+                        f"({named([table.rows[row] for row in plain])}) that the column {RESCAN} does not mark as "
+                        "rescans; mark all but one, or correct their times."
+                    )
+    found = {
+        who: tuple(Visit(at, labels[scans[0]], tuple(scans)) for at, scans in sorted(times.items()))
+        for who, times in rows.items()
+    }
+    return Visits(found, unit, column)
+
+
+def time_column(table: Table, time: str | None) -> str:
+    """Return the column that tells the time.
+
+    Raises:
+        InputError: none of `TIMES` is there, and none was named.
+    """
+    if time is not None:
+        return time
+    there = next((name for name in TIMES if name in table.columns), None)
+    if there is None:
+        raise InputError(
+            f"{table.where} has no column {', '.join(TIMES[:-1])} or {TIMES[-1]}; name the one that tells when each "
+            "scan was taken with --time."
+        )
+    return there
+
+
+def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[list[float], str]:
+    cells = table.texts(column)
+    if order is not None:
+        known = {word: float(place) for place, word in enumerate(order)}
+        if len(known) < max(len(order), 2):
+            raise InputError(f"The order {','.join(order)} needs two or more words, each once.")
+        odd = next((row for row, cell in enumerate(cells) if cell not in known), None)
+        if odd is not None:
+            raise InputError(
+                f"{table.where}: {column!r} is {cells[odd][:40]!r} at {table.rows[odd]}, which is not in the order "
+                f"{','.join(order)}; add it, or leave out the row."
+            )
+        return [known[cell] for cell in cells], ""
+    days = [_day(cell) for cell in cells]
+    if any(day is not None for day in days):
+        odd = next((row for row, day in enumerate(days) if day is None), None)
+        if odd is not None:
+            raise InputError(
+                f"{table.where}: {column!r} holds dates but {cells[odd][:40]!r} at {table.rows[odd]}; write it as "
+                "2026-05-31."
+            )
+        return [day / _DAYS_IN_A_YEAR for day in days if day is not None], "year"
+    if table.kind(column) == "text":
+        words = list(dict.fromkeys(cells))
+        raise InputError(
+            f"{table.where}: {column!r} holds words ({named(words)}), which have no order of their own; give it, the "
+            "earliest first, as with --order before,after."
+        )
+    return [float(value) for value in table.numbers(column)], f"unit of {column}"
+
+
+def _day(cell: str) -> int | None:
+    # Plain years and numbers such as 20260531 are numbers.
+    if "-" not in cell[1:]:
+        return None
+    try:
+        return date.fromisoformat(cell[:10]).toordinal()
+    except ValueError:
+        return None
