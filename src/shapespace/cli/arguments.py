@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
+from shapespace.cli.answers import asymmetry
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -32,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    asymmetry.add(commands, _add, _natural)
     _add_export(commands)
     _add_convert(commands)
     return top
