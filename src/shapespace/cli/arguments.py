@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
-from shapespace.cli.answers import asymmetry
+from shapespace.cli.answers import asymmetry, regress
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -33,7 +33,14 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
-    asymmetry.add(commands, _add, _natural)
+    asymmetry.add(
+        _add(commands, "asymmetry", "how symmetric are they: scores and maps, directional and fluctuating asymmetry",
+             "shapespace asymmetry people.csv --shapes fits --surfaces dense -o asymmetry")
+    )  # fmt: skip
+    regress.add(
+        _add(commands, "regress", "predict a number, such as age, from shape, and say how well",
+             "shapespace regress people.csv --target age -o age --predict new.csv")
+    )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
     return top

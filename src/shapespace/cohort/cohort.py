@@ -182,12 +182,12 @@ class Cohort:
             landmarks: name -> vertex.
 
         Raises:
-            InputError: fewer than two shapes, values that are not finite, columns of another length, or two shapes
+            InputError: no shapes, values that are not finite, columns of another length, or two shapes
                 that are the same.
         """
         shapes = np.array(shapes, dtype=np.float64)
-        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < 2 or not np.isfinite(shapes).all():
-            raise InputError(f"A cohort needs two or more finite shapes (N, V, 3), not {shapes.shape}.")
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or not len(shapes) or not np.isfinite(shapes).all():
+            raise InputError(f"A cohort needs finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
         sizes = read_only([centroid_size(shape) for shape in shapes])

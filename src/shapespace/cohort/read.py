@@ -39,6 +39,7 @@ class CohortOptions:
         surfaces: one of `SURFACES`.
         gauge: `shape` divides size out, `form` keeps it.
         doubtful: take doubtful fits too.
+        least: shapes that there must be; one will do where it is compared with what is known already.
     """
 
     shapes: Path | None = None
@@ -46,6 +47,7 @@ class CohortOptions:
     surfaces: Surfaces = "coefficients"
     gauge: Gauge = "shape"
     doubtful: bool = False
+    least: int = 2
 
 
 def read_cohort(
@@ -152,9 +154,9 @@ def _of_results(
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         who = named([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
-    if len(kept) < 2:
+    if len(kept) < options.least:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and two are the least; "
+            f"{results.folder}: {len(kept)} of its fits can be used, and {options.least} is the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in kept]
@@ -205,8 +207,8 @@ def _of_surfaces(
     files = {_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
     kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
     _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
-    if len(kept) < 2:
-        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and two are the least.")
+    if len(kept) < options.least:
+        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {options.least} is the least.")
     meshes: list[Mesh] = []
     for done, (file, _) in enumerate(kept, 1):
         mesh = mesh_at(file)

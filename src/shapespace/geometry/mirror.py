@@ -174,7 +174,7 @@ def _grown(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], 
             continue
         if beyond not in found:
             found[beyond] = image
-            edges += [(q, beyond), (beyond, p)]
+            edges += [(p, beyond), (beyond, q)]
         elif found[beyond] != image:
             return None
     return found

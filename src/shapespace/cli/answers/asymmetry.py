@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
 
 
-def add(commands: Any, new: Any, natural: Any) -> None:
-    """Add the command.
-
-    Args:
-        commands: of the parser.
-        new: makes a command with what all have.
-        natural: reads a number of 0 or more.
-    """
-    sub = new(commands, "asymmetry", "how symmetric are they: scores and maps, directional and fluctuating asymmetry",
-              "shapespace asymmetry people.csv --shapes fits --surfaces dense -o asymmetry")  # fmt: skip
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     add_cohort(sub)
     add_gauge(sub, "form")
     sub.add_argument("--pairs", type=Path, metavar="PAIRS.csv",
@@ -27,8 +18,8 @@ def add(commands: Any, new: Any, natural: Any) -> None:
     sub.add_argument("--subject", metavar="COLUMN",
                      help="who a shape is of; shapes of one show the measurement error (default: subject)")  # fmt: skip
     sub.add_argument("--reference", metavar="COLUMN=VALUE", help="group that scores are compared with (default: all)")
-    sub.add_argument("--permutations", type=natural, default=999, metavar="P", help="for p (default 999)")
-    sub.add_argument("--seed", type=natural, default=0, metavar="S")
+    sub.add_argument("--permutations", type=int, default=999, metavar="P", help="for p (default 999)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S")
     sub.set_defaults(run=run)
 
 

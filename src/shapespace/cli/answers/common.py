@@ -36,13 +36,16 @@ def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
                      help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
 
 
-def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None) -> Cohort:
-    """Return the cohort that `add_cohort` asked for; `gauge` stands for `add_gauge` where a command has no choice."""
+def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None, *, least: int = 2) -> Cohort:
+    """Return the cohort of `least` or more shapes that `add_cohort` asked for.
+
+    `gauge` stands for `add_gauge` where a command has no choice.
+    """
     from shapespace.batch.progress import progress
     from shapespace.cohort.read import CohortOptions, read_cohort
 
     options = CohortOptions(
-        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful
+        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful, least
     )
     with progress(None, "reading", "shape", quiet=arguments.quiet) as bar:
 
