@@ -53,11 +53,11 @@ class Kind:
         return (x + mirrored(x, self.other)) / 2.0
 
     def difference(self, x: FloatArray) -> FloatArray:
-        """Return (V,) how far a shape stands out of its own mirror image, along the normals of its symmetric part."""
+        """Return (V,) how far a shape stands out of its own mirror image, along the normals of the mean."""
+        x = fit_similarity(x, self.mean.vertices, with_scale=False).apply(x)
         image = mirrored(x, self.other)
         image = fit_similarity(image, x, with_scale=False).apply(image)
-        normals = vertex_normals(Mesh((x + image) / 2.0, self.mean.faces))
-        return np.einsum("vd,vd->v", x - image, normals)
+        return np.einsum("vd,vd->v", x - image, vertex_normals(self.mean))
 
     def asymmetric(self, mm: float, rng: np.random.Generator) -> FloatArray:
         """Return a symmetric person to whom asymmetry of `mm` is put in."""

@@ -27,6 +27,7 @@ from shapespace.io.json_files import plain_json
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
+_ROUNDING = 1e-9
 _AGAIN = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
 _FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "level", "method")
@@ -130,12 +131,13 @@ class Predictor:
         return placed
 
     def _outside(self, value: float, away_mm: float) -> str:
-        if away_mm > self.farthest_mm:
+        if away_mm > self.farthest_mm * (1 + _ROUNDING):
             return (
                 f"its shape lies {away_mm:.2f} mm RMS from the mean, beyond all learned from "
                 f"({self.farthest_mm:.2f} mm)"
             )
-        if not self.lowest <= value <= self.highest:
+        slack = _ROUNDING * (self.highest - self.lowest)
+        if not self.lowest - slack <= value <= self.highest + slack:
             return f"{self.target} was learned between {self.lowest:g} and {self.highest:g} alone"
         return ""
 

@@ -166,8 +166,7 @@ def regress(
     p = _p_of(X, y, codes, share, outer, inner, measures["r2"].value, permutations, rng, steps)
 
     errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
-    choice = CHOICES[int(errors.argmin())]
-    predictor, effective = _predictor(cohort, target, y, share, outer, choice, level)
+    predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], level)
     centred = y - np.average(y, weights=share)
     pattern = (share * centred) @ X / float((share * centred**2).sum())
     low_at, high_at = (float(v) for v in np.percentile(y, _EDGES))
@@ -290,9 +289,11 @@ def _left_out(
 
 def _predictor(
     cohort: Cohort, target: str, y: FloatArray, share: FloatArray, outer: IndexArray, choice: Choice, level: float
-) -> tuple[Predictor, float]:
+) -> tuple[Predictor, Choice, float]:
     X = cohort.coefficients
     whole = Decomposed.of(X)
+    if choice.space == "whitened":
+        choice = Choice("whitened", min(choice.amount, len(whole.singular)))
     beta, intercept = whole.weights(y, choice)
     residuals, _, weights, intercepts = _left_out(X, y, outer, choice, X[:1])
     middle = X.mean(axis=0)
@@ -315,7 +316,7 @@ def _predictor(
         level=level,
         method=choice.words(),
     )
-    return predictor, whole.effective(choice)
+    return predictor, choice, whole.effective(choice)
 
 
 def _measures(

@@ -107,7 +107,7 @@ def _outside(learned: Predictor, told: Predictions) -> str:
 
 
 def _span(measure: Measure) -> str:
-    return f"{measure.low:.2f} to {measure.high:.2f}"
+    return f"{measure.low:.3g} to {measure.high:.3g}"
 
 
 def _observed(cohort: Cohort, target: str) -> Any:
