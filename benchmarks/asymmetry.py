@@ -10,13 +10,13 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.datasets.warp import Warp
@@ -162,9 +162,17 @@ def fits(kind: Kind, subjects: int, people: int, seed: int) -> list[tuple[str, s
     rows: list[tuple[str, str, list[str]]] = []
     for name, model in models.items():
         results = [fit_scan(model, scan, FitConfig(dense=True, unit="mm")) for scan in scans]
+        fitted = Fitted(
+            model,
+            np.stack([r.b for r in results]),
+            np.stack([r.b_stddev for r in results]),
+            tuple(r.status for r in results),
+            "",
+        )
         for stage, called in (("final", "coefficients"), ("dense", "dense")):
             shapes = [np.array(r.surface(stage=stage).vertices) for r in results]
-            found = measure_asymmetry(cohort_of(shapes, who, kind.mean.faces), pairs=kind.pairs, permutations=0)
+            cohort = replace(cohort_of(shapes, who, kind.mean.faces), fitted=fitted)
+            found = measure_asymmetry(cohort, pairs=kind.pairs, permutations=0)
             rows.append((name, called, judged(found, np.array(truth))))
     return rows
 

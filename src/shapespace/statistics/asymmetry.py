@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
-from shapespace.geometry.procrustes import align_in_place, scale_to_tangent
+from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
 from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import FloatArray, Mesh, read_only
@@ -60,7 +61,7 @@ class Scores:
 
     Args:
         mm: (n,) less measurement error where that is known, which is what two images of a subject differ by.
-        low, high: (n,) its 95 % interval; NaN where the error is not known.
+        low, high: (n,) its 95 % interval, by repeated shapes and by what fits know of themselves; NaN without either.
         raw_mm: (n,) as measured.
         error_mm: what the error alone would be taken for in one shape, RMS; NaN where it is not known.
     """
@@ -175,16 +176,17 @@ def measure_asymmetry(
 
     who = _Means(codes, counts)
     along = _along(difference, normals) if normals is not None else difference
-    scores = _scores(along, who)
-    vertex_scores = _scores(difference, who)
+    own, own_difference = who.of(along), who.of(difference)
+    told = own[..., None] * normals if normals is not None else own
+    scores = _scores(along, who, _shared(cohort, sides, mean, told, who))
+    vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
     z = _standardised(scores, group)
     steps = _Steps(permutations, on_step)
     anova = _anova(symmetric, difference, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
-    own = who.of(along)
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     p = _family_wise(own, rng, steps)
     return Asymmetry(
-        cohort, sides, names, counts, mean, normals, who.of(symmetric), who.of(difference), anova, scores,
+        cohort, sides, names, counts, mean, normals, who.of(symmetric), own_difference, anova, scores,
         vertex_scores, *z, group, read_only(directional), p, permutations, seed,
     )  # fmt: skip
 
@@ -210,6 +212,13 @@ class _Means:
 
     codes: npt.NDArray[np.intp]
     counts: npt.NDArray[np.intp]
+
+    @property
+    def shares(self) -> FloatArray:
+        """(N, n) what each shape adds to the mean of each subject."""
+        out = np.zeros((len(self.codes), len(self.counts)))
+        out[np.arange(len(self.codes)), self.codes] = 1.0 / self.counts[self.codes]
+        return out
 
     def of(self, rows: FloatArray) -> FloatArray:
         """Return the means (n, ...) over the shapes of each subject."""
@@ -296,9 +305,7 @@ def _anova(
     gram_s, gram_d = flat_s @ flat_s.T, flat_d @ flat_d.T
     off = flat_d - mean_d
     gram_off = off @ off.T
-    share = np.zeros((rows, n))
-    share[np.arange(rows), who.codes] = 1.0 / np.sqrt(who.counts[who.codes])
-    between = share @ share.T
+    between = who.shares @ (who.shares > 0).T
     # A shape and its image lie half of their difference from the symmetric part, one on either side.
     individual = 2.0 * float((between * gram_s).sum())
     side = rows * float(mean_d @ mean_d) / 2.0
@@ -375,34 +382,52 @@ def _family_wise(own: FloatArray, rng: np.random.Generator, steps: _Steps) -> Fl
     return read_only(beyond / (1 + steps.each)) if steps.each else read_only(np.full(m, np.nan))
 
 
-def _scores(fields: FloatArray, who: _Means) -> Scores:
+def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, who: _Means) -> FloatArray | None:
+    """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by what their fits know of themselves.
+
+    All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
+    """
+    fitted = cohort.fitted
+    if fitted is None:
+        return None
+    model = fitted.model.mean_vertices[sides.vertices]
+    turn = fit_similarity(model, mean, with_scale=False).rotation
+    scale = centroid_size(mean) / centroid_size(model)
+    modes = fitted.model.vertex_basis.reshape(-1, 3, fitted.model.n_modes)[sides.vertices][:, :, : fitted.b.shape[1]]
+    flat = (told @ turn).reshape(len(told), -1)
+    unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    # An asymmetric field is minus its own image, so that a mode and its image do the same to it.
+    along = 2.0 * scale * unit @ modes.reshape(unit.shape[1], -1)
+    return ((along[who.codes] * fitted.b_stddev) ** 2).sum(axis=1) @ who.shares
+
+
+def _scores(fields: FloatArray, who: _Means, shared: FloatArray | None) -> Scores:
     """Return the RMS over the vertices of the subjects' means of `fields` (N, M) or (N, M, 3), less their error.
 
     The squared length of a mean is that of the truth, and the trace of the error's covariance, and scatters with
-    variance 2 tr C^2 + 4 d C d. Solving for the truth gives its interval, as Wilson's does for shares.
+    variance 2 tr C^2 + 4 d C d. Solving for the truth gives its interval, as Wilson's does for shares. The error that
+    the scans of a subject share, of variance `shared` (n,) along d, widens the interval and is not subtracted.
     """
-    vertices = fields.shape[1]
-    flat = fields.reshape(len(fields), -1)
+    vertices, flat = fields.shape[1], fields.reshape(len(fields), -1)
     own = who.of(flat)
     squares = np.einsum("nk,nk->n", own, own)
     raw = np.sqrt(squares / vertices)
     df = len(flat) - len(own)
-    if df == 0:
-        unknown = read_only(np.full(len(own), np.nan))
-        return Scores(read_only(raw), unknown, unknown, read_only(raw), float("nan"))
-    off = flat - own[who.codes]
-    gram = off @ off.T
-    trace = float(np.trace(gram)) / df
-    # What the sample covariance squared has too much of, with df degrees of freedom (Bai and Saranadasa 1996).
-    squared = max(
-        (float((gram**2).sum()) / df**2 - trace**2 / df) * df**2 / max((df - 1) * (df + 2), 1), trace**2 / flat.shape[1]
-    )
-    along = ((own @ off.T) ** 2).sum(axis=1) / df
+    trace, squared, along = 0.0, 0.0, np.zeros(len(own))
+    if df:
+        off = flat - own[who.codes]
+        gram = off @ off.T
+        trace = float(np.trace(gram)) / df
+        # What the sample covariance squared has too much of, with df degrees of freedom (Bai and Saranadasa 1996).
+        squared = (float((gram**2).sum()) - df * trace**2) / max((df - 1) * (df + 2), 1)
+        squared = max(squared, trace**2 / flat.shape[1])
+        along = ((own @ off.T) ** 2).sum(axis=1) / df
     of_mean, of_mean_squared = trace / who.counts, squared / who.counts**2
     net = squares - of_mean
     # A mean lies partly along its own error, which scatters it less than it seems.
     steep = np.maximum(along / who.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
     steep = np.where(net > 0, np.minimum(steep, np.sqrt(of_mean_squared)), 0.0)
+    steep = steep if shared is None else steep + shared
     normal = NormalDist().inv_cdf(0.5 + LEVEL / 2) ** 2
     middle = net + 2 * normal * steep
     half = np.sqrt(np.maximum(middle**2 - net**2 + 2 * normal * of_mean_squared, 0.0))
@@ -410,7 +435,10 @@ def _scores(fields: FloatArray, who: _Means) -> Scores:
     def mm(square: FloatArray) -> FloatArray:
         return read_only(np.sqrt(np.maximum(square, 0.0) / vertices))
 
-    return Scores(mm(net), mm(middle - half), mm(middle + half), read_only(raw), float(np.sqrt(trace / vertices)))
+    known = 1.0 if df or shared is not None else np.nan
+    error = float(np.sqrt(trace / vertices)) if df else float("nan")
+    low, high = (read_only(known * mm(end)) for end in (middle - half, middle + half))
+    return Scores(mm(net), low, high, read_only(raw), error)
 
 
 def _standardised(scores: Scores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -26,7 +26,7 @@ _ALPHA = 0.05
 _SHOWN = 3
 _LISTED = 10
 _BINS = 20
-_MORPH_MM = 5.0
+_MORPH_MM = 3.0
 _FILE = "asymmetry.npz"
 _FEW_REPEATS = 10
 
@@ -88,10 +88,10 @@ def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
             "in one shape, and is subtracted."
         )
     if found.permutations:
-        share = float((found.directional_p <= _ALPHA).mean())
+        shown = int((found.directional_p <= _ALPHA).sum())
         sentences.append(
-            f"Directional asymmetry is shown at {100 * share:.0f} % of the vertices (family-wise p at most {_ALPHA})."
-            if share > 0
+            f"Directional asymmetry is shown at {shown} of {len(found.mean)} vertices (family-wise p at most {_ALPHA})."
+            if shown
             else f"No place shows directional asymmetry by itself (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
@@ -157,7 +157,9 @@ def _anova_part(found: Asymmetry) -> TablePart:
     header = ("source", "SS mm²", "df", "MS mm²", "F", "p")
     columns = tuple(TableColumn(name=name, kind=kinds.get(name, "number")) for name in header)  # pyright: ignore[reportArgumentType]
     rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in found.anova)
-    return TablePart(title="Procrustes ANOVA", columns=columns, rows=rows, note="df: of subjects times dimensions.")
+    return TablePart(
+        title="Procrustes ANOVA", columns=columns, rows=rows, note="df are those of subjects times dimensions."
+    )
 
 
 def _anova_rows(found: Asymmetry) -> Rows:
@@ -197,7 +199,7 @@ def _histogram(found: Asymmetry) -> HistogramPart:
             Counts(label=label, counts=tuple(np.histogram(found.scores.mm[who], edges)[0].astype(float).tolist()))
             for label, who in series
         ),
-        x=f"asymmetry, RMS {_direction(found)}, mm",
+        x=f"asymmetry (RMS {_direction(found)}, mm)",
     )
 
 
@@ -256,7 +258,6 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
         most = float(np.linalg.norm(part, axis=1).max())
         times = float(max(1.0, np.floor(_MORPH_MM / most))) if most > 0 else 1.0
         arrays[f"{key}_low"], arrays[f"{key}_high"] = middle - times * part, middle + times * part
-        told = note + (f" Exaggerated {times:.0f} times." if times > 1 else "")
         parts.append(
             MorphPart(
                 title=title,
@@ -266,7 +267,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
                 low_label=low,
                 high_label=high,
                 times=times,
-                note=told,
+                note=note,
             )
         )
 
@@ -279,7 +280,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
         note = (
             f"The first pattern, {100 * share:.0f} % of the fluctuating asymmetry; two standard deviations either way."
         )
-        morph("What subjects differ by most", "pattern", found.mean, pattern, note, "-2", "+2")
+        morph("What subjects differ by most", "pattern", found.mean, pattern, note, "two one way", "two the other")
     for rank, k in enumerate(shown, 1):
         name = found.subjects[k]
         arrays[f"subject_{rank}_mm"] = found.maps[k]
