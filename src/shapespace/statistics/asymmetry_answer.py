@@ -153,9 +153,8 @@ def _p(effect: Effect) -> str:
 
 
 def _anova_part(found: Asymmetry) -> TablePart:
-    kinds = {"p": "p", "source": "text"}
-    header = ("source", "SS mm²", "df", "MS mm²", "F", "p")
-    columns = tuple(TableColumn(name=name, kind=kinds.get(name, "number")) for name in header)  # pyright: ignore[reportArgumentType]
+    numbers = (TableColumn(name=name, kind="number") for name in ("SS mm²", "df", "MS mm²", "F"))
+    columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
     rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in found.anova)
     return TablePart(
         title="Procrustes ANOVA", columns=columns, rows=rows, note="df are those of subjects times dimensions."

@@ -24,6 +24,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
 from shapespace.io.json_files import plain_json
+from shapespace.statistics.smoothers import IndexArray
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
@@ -79,7 +80,7 @@ class Predictor:
     weights: FloatArray
     intercepts: FloatArray
     residuals: FloatArray
-    fold: npt.NDArray[np.intp]
+    fold: IndexArray
     share: FloatArray
     lowest: float
     highest: float
@@ -127,7 +128,7 @@ class Predictor:
         if self.gauge == "shape":
             centre = self.mean.mean(axis=0)
             own, other = placed - centre, self.mean - centre
-            placed = centre + own * (np.vdot(other, other) / np.vdot(own, other))
+            placed = centre + own * float((other**2).sum() / (own * other).sum())
         return placed
 
     def _outside(self, value: float, away_mm: float) -> str:
@@ -163,11 +164,8 @@ class Predictor:
         arrays = read_arrays(path, _AGAIN, (*_FLOATS, "fold", "facts"))
         try:
             facts = _facts(arrays)
-            made = Predictor(
-                **facts,
-                **{name: read_only(arrays[name]) for name in _FLOATS},
-                fold=np.asarray(arrays["fold"], dtype=np.intp),
-            )
+            parts = {name: read_only(arrays[name]) for name in _FLOATS}
+            made = Predictor(**facts, fold=np.asarray(arrays["fold"], dtype=np.intp), **cast(dict[str, Any], parts))
         except (KeyError, TypeError, ValueError) as error:
             raise FileFormatError(f"{path} is no predictor of shapespace, or it is damaged; {_AGAIN}.") from error
         wrong = made._wrong()
@@ -218,7 +216,7 @@ def model_hash_of(cohort: Cohort) -> str:
 
 
 def cv_plus(
-    ways: FloatArray, residuals: FloatArray, fold: npt.NDArray[np.intp], share: FloatArray, level: float
+    ways: FloatArray, residuals: FloatArray, fold: IndexArray, share: FloatArray, level: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return low and high (n,) of CV+ intervals.
 
@@ -241,8 +239,9 @@ def _weighted_quantile(values: FloatArray, share: FloatArray, past: float) -> Fl
     """Return (n,) the least of each row of `values` (n, N) up to which `share` (N,) sums to `past`."""
     order = np.argsort(values, axis=1, kind="stable")
     reached = np.cumsum(share[order], axis=1) >= past - 1e-9
-    at = np.where(reached.any(axis=1), reached.argmax(axis=1), values.shape[1] - 1)
-    return np.take_along_axis(values, np.take_along_axis(order, at[:, None], axis=1), axis=1)[:, 0]
+    reached[:, -1] = True
+    rows = np.arange(len(values))
+    return values[rows, order[rows, reached.argmax(axis=1)]]
 
 
 def refuse_known(known: tuple[str, ...], new: tuple[str, ...], where: str) -> None:

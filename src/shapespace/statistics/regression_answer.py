@@ -120,10 +120,8 @@ def _observed(cohort: Cohort, target: str) -> Any:
 
 def _measures(found: Regression) -> TablePart:
     level = f"{100 * found.level:.0f} %"
-    columns = tuple(
-        TableColumn(name=name, kind=kind)
-        for name, kind in (("measure", "text"), ("value", "number"), ("low", "number"), ("high", "number"))
-    )  # pyright: ignore[reportArgumentType]
+    numbers = (TableColumn(name=name, kind="number") for name in ("value", "low", "high"))
+    columns = (TableColumn(name="measure"), *numbers)
     rows: list[tuple[object, ...]] = []
     for name, measure in found.measures.items():
         rows.append((_CALLED[name], *(_known(v) for v in (measure.value, measure.low, measure.high))))
