@@ -23,7 +23,7 @@ from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
 from shapespace.types import FloatArray, Mesh
 
 _ALPHA = 0.05
-_SHOWN = 3
+_SHOWN = 2
 _LISTED = 10
 _BINS = 20
 _MORPH_MM = 3.0
