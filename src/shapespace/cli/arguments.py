@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
-from shapespace.cli.answers import change, score
+from shapespace.cli.answers import asymmetry, change, regress, score
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -36,6 +36,14 @@ def parser() -> argparse.ArgumentParser:
     change.add(
         _add(commands, "change", "what changed between visits of the same subjects, in mm, and what of it is noise",
              "shapespace change visits.csv -o change --order before,after --stable forehead.csv")
+    )  # fmt: skip
+    asymmetry.add(
+        _add(commands, "asymmetry", "how symmetric are they: scores and maps, directional and fluctuating asymmetry",
+             "shapespace asymmetry people.csv --shapes fits --surfaces dense -o asymmetry")
+    )  # fmt: skip
+    regress.add(
+        _add(commands, "regress", "predict a number, such as age, from shape, and say how well",
+             "shapespace regress people.csv --target age -o age --predict new.csv")
     )  # fmt: skip
     score.add(
         _add(commands, "score", "where new subjects lie in a reference population: distance, percentile, map",

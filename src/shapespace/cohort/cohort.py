@@ -176,6 +176,7 @@ class Cohort:
         align: bool = True,
         landmarks: Mapping[str, int] | None = None,
         onto: Cohort | None = None,
+        least: int = 2,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -188,16 +189,17 @@ class Cohort:
             align: False takes them as they stand.
             landmarks: name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
+            least: how many shapes there must be, where `onto` is None.
 
         Raises:
-            InputError: fewer than two shapes, values that are not finite, columns of another length, two shapes that
-                are the same, or other vertices than those of `onto`.
+            InputError: too few shapes, values that are not finite, columns of another length, two shapes that are the
+                same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
-        fewest = 2 if onto is None else 1
+        fewest = least if onto is None else 1
         if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or not np.isfinite(shapes).all():
-            least = "two" if onto is None else "one"
-            raise InputError(f"A cohort needs {least} or more finite shapes (N, V, 3), not {shapes.shape}.")
+            said = {1: "one", 2: "two"}.get(fewest, str(fewest))
+            raise InputError(f"A cohort needs {said} or more finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
         sizes = read_only([centroid_size(shape) for shape in shapes])
@@ -217,8 +219,15 @@ class Cohort:
         return cohort
 
     @staticmethod
-    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape", onto: Cohort | None = None) -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto` as of `of_shapes`.
+    def of_meshes(
+        meshes: Sequence[Mesh],
+        table: Table,
+        gauge: Gauge = "shape",
+        onto: Cohort | None = None,
+        least: int = 2,
+    ) -> Cohort:
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto` and `least` as of
+        `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
@@ -239,7 +248,7 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto)
+        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least)
         return replace(found, table=table)
 
     @staticmethod

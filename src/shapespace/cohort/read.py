@@ -39,6 +39,7 @@ class CohortOptions:
         surfaces: one of `SURFACES`.
         gauge: `shape` divides size out, `form` keeps it.
         doubtful: take doubtful fits too.
+        least: shapes that there must be; one will do where it is compared with what is known already.
     """
 
     shapes: Path | None = None
@@ -46,6 +47,7 @@ class CohortOptions:
     surfaces: Surfaces = "coefficients"
     gauge: Gauge = "shape"
     doubtful: bool = False
+    least: int = 2
 
 
 def read_cohort(
@@ -160,10 +162,10 @@ def _of_results(
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         who = named([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
-    fewest = 2 if onto is None else 1
-    if len(kept) < fewest:
+    least = options.least if onto is None else 1
+    if len(kept) < least:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and {('one is', 'two are')[fewest - 1]} the least; "
+            f"{results.folder}: {len(kept)} of its fits can be used, and {least} is the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in kept]
@@ -202,7 +204,7 @@ def _of_results(
             if on_shape is not None:
                 on_shape(at + 1, len(fits))
         cohort = replace(
-            Cohort.of_meshes(meshes, stated, options.gauge, onto),
+            Cohort.of_meshes(meshes, stated, options.gauge, onto, options.least),
             fitted=fitted,
             landmarks=dict(model.landmarks),
             sizes_mm=sizes,
@@ -225,8 +227,9 @@ def _of_surfaces(
     files = {_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
     kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
     _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
-    if len(kept) < 2 and onto is None:
-        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and two are the least.")
+    least = options.least if onto is None else 1
+    if len(kept) < least:
+        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {least} is the least.")
     meshes: list[Mesh] = []
     for done, (file, _) in enumerate(kept, 1):
         mesh = mesh_at(file)
@@ -234,7 +237,7 @@ def _of_surfaces(
         meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=_stem(file)))
         if on_shape is not None:
             on_shape(done, len(kept))
-    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto)
+    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto, options.least)
     return replace(cohort, notes=(*notes, *cohort.notes))
 
 

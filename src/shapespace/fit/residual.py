@@ -20,23 +20,19 @@ import numpy as np
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
-from shapespace.geometry.closest import build_engine
-from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry import mirror as mirror_search
+from shapespace.geometry.mirror import find_mirror
 from shapespace.geometry.surface import rms_size
 from shapespace.io.kept import keep, recall
 from shapespace.model import local_modes
 from shapespace.model.local_modes import smooth_fields, strongest_products
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Similarity
+from shapespace.types import FloatArray
 from shapespace.version import __version__
 
 _MOST_PRODUCTS = 600
 _BLOCK = 250
 _LEAST_VALUE = 1e-8
-_MIRROR_POINTS = 1_000
-_MIRROR_ITERATIONS = 30
-_MIRROR_STOP = 1e-5
-"""The search for a mirror ends when the RMS falls by less than this share of the mean's size."""
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
 
@@ -70,7 +66,7 @@ def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualMod
 
 def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     # Whatever could change the modes is in the name, and so is the recipe itself.
-    recipe = b"".join(Path(file).read_bytes() for file in (__file__, local_modes.__file__))
+    recipe = b"".join(Path(file).read_bytes() for file in (__file__, local_modes.__file__, mirror_search.__file__))
     made_of = f"{model.content_hash} {settings} {__version__} ".encode() + recipe
     name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
     arrays = recall(name)
@@ -124,36 +120,15 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
     """Return what turns fields (V, 3, k) on the mean into their mirror images; None if the mean is not symmetric."""
-    x = model.mean_vertices
     mean = model.mesh()
-    assert mean.faces is not None
-    engine, size = build_engine(mean), rms_size(x)
-    centre = x.mean(axis=0)
-    some = x[:: max(1, len(x) // _MIRROR_POINTS)] - centre
-    best = (np.inf, np.eye(3), Similarity.identity())
-    for axis in np.linalg.svd(x - centre, full_matrices=False)[2]:
-        flip = np.eye(3) - 2.0 * np.outer(axis, axis)
-        flipped = some @ flip.T + centre
-        T, near, rms = Similarity.identity(), engine.query(flipped), np.inf
-        for _ in range(_MIRROR_ITERATIONS):
-            if rms - near.rms < _MIRROR_STOP * size:
-                break
-            rms = near.rms
-            T = fit_similarity(flipped, near.points, with_scale=False)
-            near = engine.query(T.apply(flipped), near)
-        if near.rms < best[0]:
-            best = (near.rms, flip, T)
-    rms, flip, T = best
-    if rms > _SYMMETRIC_SHARE * size:
+    found = find_mirror(mean)
+    if found.off_share > _SYMMETRIC_SHARE:
         return None
-    at = engine.query(T.apply((x - centre) @ flip.T + centre))
-    assert at.triangle is not None and at.barycentric is not None
-    corners, weights = mean.faces[at.triangle], at.barycentric.astype(np.float32)
-    turn = (T.rotation @ flip).astype(np.float32)
+    corners, weights, turn = found.corners, found.weights.astype(np.float32), found.turn.astype(np.float32)
 
     def mirrored(field: Float32Array) -> Float32Array:
         out = np.empty_like(field)
-        for rows in _blocks(len(x)):
+        for rows in _blocks(len(corners)):
             there = sum(weights[rows, c, None, None] * field[corners[rows, c]] for c in range(3))
             np.matmul(turn.T, there, out=out[rows])
         return out

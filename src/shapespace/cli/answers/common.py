@@ -36,19 +36,22 @@ def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
                      help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
 
 
-def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None) -> Cohort:
+def cohort_of(
+    arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None, *, least: int = 2
+) -> Cohort:
     """Return the cohort that `add_cohort` asked for.
 
     Args:
         arguments: with what `add_cohort` added.
         gauge: stands for `add_gauge` where a command has no choice.
         onto: a cohort that it is to be compared with.
+        least: how many shapes there must be, where `onto` is None.
     """
     from shapespace.batch.progress import progress
     from shapespace.cohort.read import CohortOptions, read_cohort
 
     options = CohortOptions(
-        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful
+        arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful, least
     )
     with progress(None, "reading", "shape", quiet=arguments.quiet) as bar:
 

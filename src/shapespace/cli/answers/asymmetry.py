@@ -1,0 +1,58 @@
+"""`shapespace asymmetry`: how symmetric are the objects of a cohort?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
+
+
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_cohort(sub)
+    add_gauge(sub, "form")
+    sub.add_argument("--pairs", type=Path, metavar="PAIRS.csv",
+                     help="two columns of vertices or landmarks that mirror each other, one on the plane beside itself "
+                     "(default: found on the mean)")  # fmt: skip
+    sub.add_argument("--subject", metavar="COLUMN",
+                     help="who a shape is of; shapes of one show the measurement error (default: subject)")  # fmt: skip
+    sub.add_argument("--reference", metavar="COLUMN=VALUE", help="group that scores are compared with (default: all)")
+    sub.add_argument("--permutations", type=int, default=999, metavar="P", help="for p (default 999)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S")
+    sub.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure the asymmetry of a cohort, and keep the answer."""
+    from shapespace.batch.progress import progress
+    from shapespace.errors import InputError
+    from shapespace.statistics.asymmetry import SUBJECT, measure_asymmetry
+    from shapespace.statistics.asymmetry_answer import asymmetry_answer
+    from shapespace.statistics.sides import read_pairs
+
+    column, equals, value = (arguments.reference or "").partition("=")
+    if arguments.reference and not (column and equals and value):
+        raise InputError(f"--reference is {arguments.reference!r}; write COLUMN=VALUE, such as group=control.")
+    cohort = cohort_of(arguments)
+    subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
+    wanted = [name for name in (subject, column) if name]
+    cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
+    pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
+    with progress(None, "permuting", "shape", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = measure_asymmetry(
+            cohort,
+            subject=subject,
+            pairs=pairs,
+            where=str(arguments.pairs),
+            reference=(column, value) if column else None,
+            permutations=arguments.permutations,
+            seed=arguments.seed,
+            on_step=step,
+        )
+    return finish(asymmetry_answer(found), arguments)

@@ -1,0 +1,76 @@
+"""`shapespace regress`: what number goes with a shape?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
+
+
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_cohort(sub)
+    add_gauge(sub)
+    what = sub.add_mutually_exclusive_group(required=True)
+    what.add_argument("--target", metavar="COLUMN", help="the number to learn")
+    what.add_argument("--predictor", type=Path, metavar="FILE.npz",
+                      help="predict DATA by what an earlier run learned (its predictor.npz)")  # fmt: skip
+    sub.add_argument("--predict", type=Path, metavar="NEW",
+                     help="table or folder of new shapes, of other subjects, to predict")  # fmt: skip
+    sub.add_argument("--new-shapes", type=Path, metavar="DIR", help="results or meshes of NEW (default: its folder)")
+    sub.add_argument("--subject", metavar="COLUMN", help="who a shape is of (default: subject)")
+    sub.add_argument("--folds", type=int, default=10, metavar="K", help="of the outer cross-validation (default 10)")
+    sub.add_argument("--permutations", type=int, default=199, metavar="P", help="for p (default 199)")
+    sub.add_argument("--level", type=float, default=0.9, metavar="L", help="of intervals (default 0.9)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S")
+    sub.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Learn a number from shape and predict it, and keep the answer."""
+    from shapespace.batch.progress import progress
+    from shapespace.cohort.read import CohortOptions, read_cohort
+    from shapespace.io.files import make_folder
+    from shapespace.statistics.predictor import Predictor, refuse_known
+    from shapespace.statistics.regression import SUBJECT, regress
+    from shapespace.statistics.regression_answer import predicted_answer, regression_answer
+
+    if arguments.predictor is not None:
+        learned = Predictor.load(arguments.predictor)
+        cohort = cohort_of(arguments, learned.gauge, least=1)
+        return finish(predicted_answer(learned, cohort, learned.predict(cohort)), arguments)
+    cohort = cohort_of(arguments)
+    subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
+    wanted = [arguments.target, *([subject] if subject else [])]
+    cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
+    with progress(None, "learning", "fold", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = regress(
+            cohort,
+            arguments.target,
+            subject=subject,
+            folds=arguments.folds,
+            permutations=arguments.permutations,
+            level=arguments.level,
+            seed=arguments.seed,
+            on_step=step,
+        )
+    new = None
+    if arguments.predict is not None:
+        options = CohortOptions(
+            arguments.new_shapes, arguments.model, arguments.surfaces, arguments.gauge, arguments.doubtful, least=1
+        )
+        fresh = read_cohort(arguments.predict, options)
+        there = subject is not None and subject in fresh.table.columns
+        refuse_known(
+            found.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where
+        )
+        new = (fresh, found.predictor.predict(fresh))
+    make_folder(arguments.output)
+    found.predictor.save(arguments.output / "predictor.npz")
+    return finish(regression_answer(found, new), arguments)

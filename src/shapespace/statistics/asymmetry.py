@@ -1,0 +1,474 @@
+"""How symmetric objects are: Procrustes ANOVA with object symmetry, and how far each is from its own mirror image.
+
+Klingenberg, Barluenga and Meyer, Evolution 56(10), 2002; Mardia, Bookstein and Moreton, Biometrika 87(2), 2000;
+Klingenberg, Symmetry 7(2), 2015. Every shape and its mirror image in correspondence are superimposed together. Half
+their sum is the symmetric part of a shape, half their difference the asymmetric one; here the whole difference is
+told, which is how far the sides are apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import vertex_normals
+from shapespace.statistics.sides import Sides, find_sides, given_sides
+from shapespace.types import FloatArray, Mesh, read_only
+
+SUBJECT = "subject"
+"""The column that names who a shape is of, where there is one and no other is named."""
+ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
+LEVEL = 0.95
+_BLOCK = 100
+_FEWEST = 3
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A row of the Procrustes ANOVA; sums of squares over all vertices of all shapes and their images.
+
+    Args:
+        source: `individual`, `side`, `individual x side`, or the measurement error of either part; the sum of the two
+            errors is the row of Klingenberg, who takes error to be alike in all directions.
+        ss: sum of squares, mm^2.
+        df: degrees of freedom: those of the subjects times the dimensions of the shapes (Klingenberg 2002).
+        ms: ss / df.
+        f: over `individual x side`, or for that over the asymmetric error; None where there is nothing to compare with.
+        p: by permutation; None where nothing can be permuted.
+    """
+
+    source: str
+    ss: float
+    df: float
+    ms: float
+    f: float | None = None
+    p: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How far each of n subjects is from its own mirror image, RMS over the vertices.
+
+    Args:
+        mm: (n,) less measurement error where that is known, which is what two images of a subject differ by.
+        low, high: (n,) its 95 % interval, by repeated shapes and by what fits know of themselves; NaN without either.
+        raw_mm: (n,) as measured.
+        error_mm: what the error alone would be taken for in one shape, RMS; NaN where it is not known.
+    """
+
+    mm: FloatArray
+    low: FloatArray
+    high: FloatArray
+    raw_mm: FloatArray
+    error_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Asymmetry:
+    """What the sides of n subjects differ by.
+
+    Args:
+        cohort: the N shapes.
+        sides: of the object, M vertices.
+        subjects: n names.
+        counts: (n,) shapes of each.
+        mean: (M, 3) the symmetric mean, mm.
+        normals: (M, 3) of it; None for points.
+        symmetric: (n, M, 3) the symmetric part of each subject, mm.
+        difference: (n, M, 3) each subject less its mirror image, mm: twice the asymmetric part.
+        anova: individual, side, individual x side and, with repeated shapes, measurement error.
+        scores: along the normals where there are any, else over all directions.
+        vertex_scores: over all directions.
+        z: (n,) scores in standard deviations of the reference group, a member being compared with the others.
+        z_low, z_high: (n,) with the interval of the scores.
+        in_reference: (n,) who is of that group.
+        directional: (M,) mm, mean difference along the normals; its length, for points.
+        directional_p: (M,) family-wise, by flipping signs.
+        permutations: how many.
+        seed: of them.
+    """
+
+    cohort: Cohort
+    sides: Sides
+    subjects: tuple[str, ...]
+    counts: npt.NDArray[np.intp]
+    mean: FloatArray
+    normals: FloatArray | None
+    symmetric: FloatArray
+    difference: FloatArray
+    anova: tuple[Effect, ...]
+    scores: Scores
+    vertex_scores: Scores
+    z: FloatArray
+    z_low: FloatArray
+    z_high: FloatArray
+    in_reference: npt.NDArray[np.bool_]
+    directional: FloatArray
+    directional_p: FloatArray
+    permutations: int
+    seed: int
+
+    @cached_property
+    def maps(self) -> FloatArray:
+        """(n, M) mm: how far each subject stands out of its mirror image along the normals; lengths, for points."""
+        return _along(self.difference, self.normals)
+
+    @cached_property
+    def fluctuating(self) -> FloatArray:
+        """(M,) mm: standard deviation of `maps` over the subjects, about the directional asymmetry."""
+        if self.normals is None:
+            off = self.difference - self.difference.mean(axis=0)
+            return np.sqrt((off**2).sum(axis=(0, 2)) / (len(off) - 1))
+        return self.maps.std(axis=0, ddof=1)
+
+    def effect(self, source: str) -> Effect:
+        """Return the row of the ANOVA of that name."""
+        return next(effect for effect in self.anova if effect.source == source)
+
+
+def measure_asymmetry(
+    cohort: Cohort,
+    *,
+    subject: str | None = None,
+    pairs: Sequence[tuple[int, int]] | None = None,
+    where: str = "The pairs",
+    reference: tuple[str, str] | None = None,
+    permutations: int = 999,
+    seed: int = 0,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Asymmetry:
+    """Return what the sides of the objects of a cohort differ by.
+
+    Args:
+        cohort: the shapes; in the gauge `form` millimetres are those of each object.
+        subject: column that names who a shape is of; None takes `subject` where there is one, else each shape is of
+            another. Shapes of one subject show the measurement error.
+        pairs: of vertices that mirror each other, one on the plane beside itself; None finds them on the mean.
+        where: what the pairs are called in messages.
+        reference: column and value of the subjects that scores are compared with; None for all.
+        permutations: how many; 0 for no p.
+        seed: of them.
+        on_step: called with (permutations done, in all).
+
+    Raises:
+        InputError: an object without mirror symmetry, pairs that cannot be, fewer than three subjects, no such column,
+            a subject in two groups, or a reference group of fewer than three.
+    """
+    if permutations < 0 or seed < 0:
+        raise InputError("The number of permutations and the seed must be 0 or more.")
+    sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
+    names, codes = _subjects(cohort, subject)
+    group = _group(cohort, names, codes, reference)
+    symmetric, difference, mean = _split(cohort, sides)
+    counts = np.bincount(codes)
+    normals = None if sides.faces is None else vertex_normals(Mesh(mean, sides.faces))
+    rng = np.random.default_rng(seed)
+
+    who = _Means(codes, counts)
+    along = _along(difference, normals) if normals is not None else difference
+    own, own_difference = who.of(along), who.of(difference)
+    told = own[..., None] * normals if normals is not None else own
+    scores = _scores(along, who, _shared(cohort, sides, mean, told, who))
+    vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
+    z = _standardised(scores, group)
+    steps = _Steps(permutations, on_step)
+    anova = _anova(symmetric, difference, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
+    directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
+    p = _family_wise(own, rng, steps)
+    return Asymmetry(
+        cohort, sides, names, counts, mean, normals, who.of(symmetric), own_difference, anova, scores,
+        vertex_scores, *z, group, read_only(directional), p, permutations, seed,
+    )  # fmt: skip
+
+
+class _Steps:
+    """Counts permutations for whoever shows progress."""
+
+    def __init__(self, permutations: int, on_step: Callable[[int, int], None] | None) -> None:
+        self.each, self.done, self.on_step = permutations, 0, on_step
+
+    def blocks(self) -> list[int]:
+        return [min(_BLOCK, self.each - start) for start in range(0, self.each, _BLOCK)]
+
+    def add(self, count: int) -> None:
+        self.done += count
+        if self.on_step is not None:
+            self.on_step(self.done, 4 * self.each)
+
+
+@dataclass(frozen=True, eq=False)
+class _Means:
+    """Subjects by number: (N,) whose each shape is, and (n,) how many each has."""
+
+    codes: npt.NDArray[np.intp]
+    counts: npt.NDArray[np.intp]
+
+    @property
+    def shares(self) -> FloatArray:
+        """(N, n) what each shape adds to the mean of each subject."""
+        out = np.zeros((len(self.codes), len(self.counts)))
+        out[np.arange(len(self.codes)), self.codes] = 1.0 / self.counts[self.codes]
+        return out
+
+    def of(self, rows: FloatArray) -> FloatArray:
+        """Return the means (n, ...) over the shapes of each subject."""
+        if (self.counts == 1).all():
+            return rows[np.argsort(self.codes)]
+        return np.stack([rows[self.codes == k].mean(axis=0) for k in range(len(self.counts))])
+
+
+def _subjects(cohort: Cohort, column: str | None) -> tuple[tuple[str, ...], npt.NDArray[np.intp]]:
+    if column is None and SUBJECT not in cohort.table.columns:
+        names, codes = cohort.names, np.arange(len(cohort))
+    else:
+        cells = cohort.table.texts(column or SUBJECT)
+        if not all(cells):
+            lacking = cohort.names[cells.index("")]
+            raise InputError(
+                f"{cohort.table.where}: {column or SUBJECT!r} of {lacking} is missing; fill it in, or leave such "
+                "shapes out with --drop-missing."
+            )
+        names = tuple(dict.fromkeys(cells))
+        number = {name: k for k, name in enumerate(names)}
+        codes = np.array([number[cell] for cell in cells])
+    if len(names) < _FEWEST:
+        raise InputError(
+            f"{cohort.table.where}: {len(names)} subjects are too few for asymmetry; {_FEWEST} are the least."
+        )
+    return names, codes
+
+
+def _group(
+    cohort: Cohort, names: tuple[str, ...], codes: npt.NDArray[np.intp], reference: tuple[str, str] | None
+) -> npt.NDArray[np.bool_]:
+    if reference is None:
+        return np.ones(len(names), dtype=np.bool_)
+    column, value = reference
+    inside = np.array([cell == value for cell in cohort.table.texts(column)])
+    share = np.bincount(codes, weights=inside) / np.bincount(codes)
+    if ((share > 0) & (share < 1)).any():
+        torn = names[int(np.flatnonzero((share > 0) & (share < 1))[0])]
+        raise InputError(f"{cohort.table.where}: some shapes of {torn} have {column} {value} and others not; give each "
+                         "subject one.")  # fmt: skip
+    if share.sum() < _FEWEST:
+        raise InputError(
+            f"{cohort.table.where}: {int(share.sum())} subjects have {column} {value}, and a reference group needs "
+            f"{_FEWEST}."
+        )
+    return share > 0
+
+
+def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the symmetric parts and differences (N, M, 3) of shapes superimposed with their images, and the mean."""
+    n = len(cohort)
+    both = np.empty((2 * n, len(sides), 3))
+    for at in range(n):
+        both[at] = cohort.vertices(at)[sides.vertices]
+    both[n:] = sides.image(both[:n])
+    align_in_place(both, cohort.gauge)
+    if cohort.gauge == "shape":
+        scale_to_tangent(both)
+    mean = both.mean(axis=0)
+    difference = both[:n] - both[n:]
+    both[:n] -= difference / 2.0
+    return both[:n], difference, mean
+
+
+def _along(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
+    if normals is None:
+        return np.linalg.norm(difference, axis=-1)
+    return np.einsum("nvd,vd->nv", difference, normals)
+
+
+def _anova(
+    symmetric: FloatArray,
+    difference: FloatArray,
+    who: _Means,
+    dimensions: tuple[float, float],
+    rng: np.random.Generator,
+    steps: _Steps,
+) -> tuple[Effect, ...]:
+    n, rows = len(who.counts), len(who.codes)
+    flat_s = symmetric.reshape(rows, -1) - symmetric.reshape(rows, -1).mean(axis=0)
+    flat_d = difference.reshape(rows, -1)
+    mean_d = flat_d.mean(axis=0)
+    gram_s, gram_d = flat_s @ flat_s.T, flat_d @ flat_d.T
+    off = flat_d - mean_d
+    gram_off = off @ off.T
+    between = who.shares @ (who.shares > 0).T
+    # A shape and its image lie half of their difference from the symmetric part, one on either side.
+    individual = 2.0 * float((between * gram_s).sum())
+    side = rows * float(mean_d @ mean_d) / 2.0
+    both = float((between * gram_off).sum()) / 2.0
+    error_s, error_d = 2.0 * float(np.trace(gram_s)) - individual, float(np.trace(gram_off)) / 2.0 - both
+    d_sym, d_asym = dimensions
+    repeated = rows > n
+
+    sums = np.zeros((n, rows))
+    sums[who.codes, np.arange(rows)] = 1.0
+    p_side = _p_flipping(sums @ gram_d @ sums.T, rng, steps)
+    p_both = _p_permuting(gram_off, between, rng, steps) if repeated else None
+    p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else None
+
+    ms_individual, ms_side = individual / ((n - 1) * d_sym), side / d_asym
+    ms_both = both / ((n - 1) * d_asym)
+    found = [
+        Effect("individual", individual, (n - 1) * d_sym, ms_individual, _over(ms_individual, ms_both), p_individual),
+        Effect("side", side, d_asym, ms_side, _over(ms_side, ms_both), p_side),
+    ]
+    if not repeated:
+        return (*found, Effect("individual x side", both, (n - 1) * d_asym, ms_both))
+    df = rows - n
+    ms_error = error_d / (df * d_asym)
+    return (
+        *found,
+        Effect("individual x side", both, (n - 1) * d_asym, ms_both, _over(ms_both, ms_error), p_both),
+        Effect(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
+        Effect(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
+    )
+
+
+def _over(ms: float, beside: float) -> float | None:
+    return ms / beside if beside > 0 else None
+
+
+def _p_flipping(gram: FloatArray, rng: np.random.Generator, steps: _Steps) -> float | None:
+    """Return how often the mean of vectors is as long with random signs; `gram` (n, n) is theirs."""
+    observed, beyond = float(gram.sum()), 1
+    for count in steps.blocks():
+        signs = rng.choice([-1.0, 1.0], (count, len(gram)))
+        beyond += int((np.einsum("pi,pi->p", signs @ gram, signs) >= observed * (1 - 1e-12)).sum())
+        steps.add(count)
+    return beyond / (1 + steps.each) if steps.each else None
+
+
+def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> float | None:
+    """Return how often subjects differ as much when shapes are dealt out anew; `gram` (N, N) is of centred shapes."""
+    observed, beyond = float((between * gram).sum()), 1
+    for count in steps.blocks():
+        for _ in range(count):
+            order = rng.permutation(len(gram))
+            beyond += int(float((between * gram[np.ix_(order, order)]).sum()) >= observed * (1 - 1e-12))
+        steps.add(count)
+    return beyond / (1 + steps.each) if steps.each else None
+
+
+def _family_wise(own: FloatArray, rng: np.random.Generator, steps: _Steps) -> FloatArray:
+    """Return p (M,) of the mean of fields (n, M) or (n, M, 3), by the permutation maximum over random signs."""
+    n, m = own.shape[:2]
+    flat, square = own.reshape(n, -1), (own**2).reshape(n, m, -1).sum(axis=(0, 2))
+
+    def statistic(signs: FloatArray) -> FloatArray:
+        between = (signs @ flat / n) ** 2
+        between = n * between.reshape(len(signs), m, -1).sum(axis=2)
+        return between / np.maximum(square - between, 1e-30 + 1e-12 * square)
+
+    observed = statistic(np.ones((1, n)))[0]
+    beyond = np.ones(m)
+    for count in steps.blocks():
+        most = statistic(rng.choice([-1.0, 1.0], (count, n))).max(axis=1)
+        beyond += (most[:, None] >= observed * (1 - 1e-12)).sum(axis=0)
+        steps.add(count)
+    return read_only(beyond / (1 + steps.each)) if steps.each else read_only(np.full(m, np.nan))
+
+
+def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, who: _Means) -> FloatArray | None:
+    """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by what their fits know of themselves.
+
+    All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
+    """
+    fitted = cohort.fitted
+    if fitted is None:
+        return None
+    model = fitted.model.mean_vertices[sides.vertices]
+    turn = fit_similarity(model, mean, with_scale=False).rotation
+    scale = centroid_size(mean) / centroid_size(model)
+    modes = fitted.model.vertex_basis.reshape(-1, 3, fitted.model.n_modes)[sides.vertices][:, :, : fitted.b.shape[1]]
+    flat = (told @ turn).reshape(len(told), -1)
+    unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    # An asymmetric field is minus its own image, so that a mode and its image do the same to it.
+    along = 2.0 * scale * unit @ modes.reshape(unit.shape[1], -1)
+    return ((along[who.codes] * fitted.b_stddev) ** 2).sum(axis=1) @ who.shares
+
+
+def _scores(fields: FloatArray, who: _Means, shared: FloatArray | None) -> Scores:
+    """Return the RMS over the vertices of the subjects' means of `fields` (N, M) or (N, M, 3), less their error.
+
+    The squared length of a mean is that of the truth, and the trace of the error's covariance, and scatters with
+    variance 2 tr C^2 + 4 d C d. Solving for the truth gives its interval, as Wilson's does for shares. The error that
+    the scans of a subject share, of variance `shared` (n,) along d, widens the interval and is not subtracted.
+    """
+    vertices, flat = fields.shape[1], fields.reshape(len(fields), -1)
+    own = who.of(flat)
+    squares = np.einsum("nk,nk->n", own, own)
+    raw = np.sqrt(squares / vertices)
+    df = len(flat) - len(own)
+    trace, squared, along = 0.0, 0.0, np.zeros(len(own))
+    if df:
+        off = flat - own[who.codes]
+        gram = off @ off.T
+        trace = float(np.trace(gram)) / df
+        # What the sample covariance squared has too much of, with df degrees of freedom (Bai and Saranadasa 1996).
+        squared = (float((gram**2).sum()) - df * trace**2) / max((df - 1) * (df + 2), 1)
+        squared = max(squared, trace**2 / flat.shape[1])
+        along = ((own @ off.T) ** 2).sum(axis=1) / df
+    of_mean, of_mean_squared = trace / who.counts, squared / who.counts**2
+    net = squares - of_mean
+    # A mean lies partly along its own error, which scatters it less than it seems.
+    steep = np.maximum(along / who.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
+    steep = np.where(net > 0, np.minimum(steep, np.sqrt(of_mean_squared)), 0.0)
+    steep = steep if shared is None else steep + shared
+    normal = NormalDist().inv_cdf(0.5 + LEVEL / 2) ** 2
+    middle = net + 2 * normal * steep
+    half = np.sqrt(np.maximum(middle**2 - net**2 + 2 * normal * of_mean_squared, 0.0))
+
+    def mm(square: FloatArray) -> FloatArray:
+        return read_only(np.sqrt(np.maximum(square, 0.0) / vertices))
+
+    known = 1.0 if df or shared is not None else np.nan
+    error = float(np.sqrt(trace / vertices)) if df else float("nan")
+    low, high = (read_only(known * mm(end)) for end in (middle - half, middle + half))
+    return Scores(mm(net), low, high, read_only(raw), error)
+
+
+def _standardised(scores: Scores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return z, low and high (n,) of scores beside those of the group, of which nobody is compared with itself."""
+    inside = scores.mm[group]
+    n, total, square = len(inside), inside.sum(), (inside**2).sum()
+    less = group.astype(np.float64)
+    count = n - less
+    mean = (total - less * scores.mm) / count
+    variance = (square - less * scores.mm**2 - count * mean**2) / np.maximum(count - 1, 1)
+    spread = np.sqrt(np.maximum(variance, 0.0))
+
+    def z(value: FloatArray) -> FloatArray:
+        return read_only(np.divide(value - mean, spread, out=np.full(len(value), np.nan), where=spread > 0))
+
+    return z(scores.mm), z(scores.low), z(scores.high)
+
+
+def first_pattern(found: Asymmetry) -> tuple[FloatArray, float, FloatArray]:
+    """Return the first principal pattern of fluctuating asymmetry.
+
+    Returns:
+        (M, 3) mm, what one standard deviation of it adds to the difference; its share of the variance; (n,) how much
+        of it each subject has, in standard deviations.
+    """
+    off: Any = (found.difference - found.difference.mean(axis=0)).reshape(len(found.subjects), -1)
+    value, vector = np.linalg.eigh(off @ off.T)
+    if value[-1] <= 0:
+        raise InputError("All subjects are equally asymmetric, so there is no pattern of fluctuating asymmetry.")
+    spread = float(np.sqrt(value[-1] / (len(off) - 1)))
+    along = vector[:, -1] * np.sqrt(value[-1]) / spread
+    pattern = (vector[:, -1] @ off / np.sqrt(value[-1]) * spread).reshape(-1, 3)
+    return read_only(pattern), float(value[-1] / value.sum()), read_only(along)

@@ -1,0 +1,258 @@
+"""A linear predictor of a number from shape, with intervals by cross-validation, and its file.
+
+Intervals are those of CV+ (Barber, Candes, Ramdas and Tibshirani, Annals of Statistics 49(1), 2021) with folds of
+subjects, each of whom counts once however often it was scanned.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import named
+from shapespace.errors import CorrespondenceError, FileFormatError, InputError
+from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.archives import read_arrays
+from shapespace.io.arrays import write_arrays
+from shapespace.io.json_files import plain_json
+from shapespace.statistics.smoothers import IndexArray
+from shapespace.types import FloatArray, read_only
+
+FORMAT, VERSION = "shapespace predictor", 1
+_ROUNDING = 1e-9
+_AGAIN = "make it again with shapespace regress"
+_FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
+_FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "level", "method")
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """What is predicted of n shapes.
+
+    Args:
+        names: of them.
+        value: (n,).
+        low, high: (n,) interval.
+        outside: n sentences on what lies outside what was learned from; empty where nothing does.
+    """
+
+    names: tuple[str, ...]
+    value: FloatArray
+    low: FloatArray
+    high: FloatArray
+    outside: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """A number as a linear function of where the vertices lie.
+
+    Args:
+        target: what is predicted.
+        gauge: of the shapes.
+        model_hash: of the model whose fits it takes; empty for other surfaces, which it aligns itself.
+        mean: (V, 3) mm of the shapes learned from.
+        weights: (1 + F, 3V) per mm: learned from all, then without each fold.
+        intercepts: (1 + F,) what each predicts of the mean.
+        residuals: (N,) of rows, predicted without their fold; absolute.
+        fold: (N,) theirs, from 1.
+        share: (N,) how much a row counts: 1 over the rows of its subject.
+        lowest, highest: of the targets learned from.
+        farthest_mm: RMS distance from the mean of the shape learned from that lies furthest.
+        subjects: how many were learned from.
+        level: of the intervals.
+        method: in words.
+    """
+
+    target: str
+    gauge: Gauge
+    model_hash: str
+    mean: FloatArray
+    weights: FloatArray
+    intercepts: FloatArray
+    residuals: FloatArray
+    fold: IndexArray
+    share: FloatArray
+    lowest: float
+    highest: float
+    farthest_mm: float
+    subjects: int
+    level: float
+    method: str
+
+    def predict(self, cohort: Cohort) -> Predictions:
+        """Return what is predicted of the shapes of a cohort, of subjects that were not learned from.
+
+        Raises:
+            CorrespondenceError: shapes with other vertices, or fits by another model.
+            InputError: another gauge.
+        """
+        self._check(cohort)
+        off = np.stack([self._placed(cohort.vertices(at)) for at in range(len(cohort))]) - self.mean
+        all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
+        low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.level)
+        away = np.sqrt((off**2).sum(axis=2).mean(axis=1))
+        outside = tuple(self._outside(float(v), float(mm)) for v, mm in zip(all_ways[:, 0], away, strict=True))
+        return Predictions(cohort.names, read_only(all_ways[:, 0]), low, high, outside)
+
+    def _check(self, cohort: Cohort) -> None:
+        if cohort.n_vertices != len(self.mean):
+            raise CorrespondenceError(
+                f"The shapes have {cohort.n_vertices} vertices, and those that {self.target} was learned from "
+                f"{len(self.mean)}; give shapes in correspondence with those."
+            )
+        own = model_hash_of(cohort)
+        if own != self.model_hash:
+            raise CorrespondenceError(
+                f"{self.target} was learned from {'fits by another model' if self.model_hash else 'surfaces'}, and the "
+                f"new shapes are {'fits by this one' if own else 'surfaces'}; give such as it was learned from."
+            )
+        if cohort.gauge != self.gauge:
+            raise InputError(f"{self.target} was learned in the gauge {self.gauge}, not {cohort.gauge}; read the new "
+                             f"shapes with --gauge {self.gauge}.")  # fmt: skip
+
+    def _placed(self, vertices: FloatArray) -> FloatArray:
+        """Return a shape (V, 3) in the pose, and in the gauge `shape` the scale, of those learned from."""
+        if self.model_hash:
+            return vertices
+        placed = fit_similarity(vertices, self.mean, with_scale=False).apply(vertices)
+        if self.gauge == "shape":
+            centre = self.mean.mean(axis=0)
+            own, other = placed - centre, self.mean - centre
+            placed = centre + own * float((other**2).sum() / (own * other).sum())
+        return placed
+
+    def _outside(self, value: float, away_mm: float) -> str:
+        if away_mm > self.farthest_mm * (1 + _ROUNDING):
+            return (
+                f"its shape lies {away_mm:.2f} mm RMS from the mean, beyond all learned from "
+                f"({self.farthest_mm:.2f} mm)"
+            )
+        slack = _ROUNDING * (self.highest - self.lowest)
+        if not self.lowest - slack <= value <= self.highest + slack:
+            return f"{self.target} was learned between {self.lowest:g} and {self.highest:g} alone"
+        return ""
+
+    def save(self, path: Path) -> None:
+        """Write it as numbers alone, .npz.
+
+        Raises:
+            FileError: the folder cannot be written.
+        """
+        facts = {name: getattr(self, name) for name in _FACTS}
+        told = json.dumps({"format": FORMAT, "format_version": VERSION, **facts}, allow_nan=False)
+        arrays: dict[str, npt.NDArray[Any]] = {name: getattr(self, name) for name in _FLOATS}
+        write_arrays(path, {**arrays, "fold": self.fold.astype(np.int64), "facts": np.array(told)})
+
+    @staticmethod
+    def load(path: Path) -> Predictor:
+        """Return the predictor in a file, which is checked, and of which nothing is run.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is none, of another version, or damaged.
+        """
+        arrays = read_arrays(path, _AGAIN, (*_FLOATS, "fold", "facts"))
+        try:
+            facts = _facts(arrays)
+            parts = {name: read_only(arrays[name]) for name in _FLOATS}
+            made = Predictor(**facts, fold=np.asarray(arrays["fold"], dtype=np.intp), **cast(dict[str, Any], parts))
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"{path} is no predictor of shapespace, or it is damaged; {_AGAIN}.") from error
+        wrong = made._wrong()
+        if wrong:
+            raise FileFormatError(f"{path} is damaged ({wrong}); {_AGAIN}.")
+        return made
+
+    def _wrong(self) -> str:
+        ways, rows = len(self.intercepts), len(self.residuals)
+        if self.mean.ndim != 2 or self.mean.shape[1] != 3 or self.intercepts.ndim != 1 or self.residuals.ndim != 1:
+            return "its arrays have other dimensions"
+        if self.weights.shape != (ways, self.mean.size) or self.fold.shape != (rows,) or self.share.shape != (rows,):
+            return "its arrays do not fit each other"
+        if ways < 3 or not rows or self.fold.min() < 1 or self.fold.max() >= ways:
+            return "its folds do not exist"
+        if not all(np.isfinite(getattr(self, name)).all() for name in _FLOATS):
+            return "it holds numbers that are not finite"
+        if (self.residuals < 0).any() or (self.share <= 0).any() or not 0 < self.level < 1:
+            return "it holds numbers that cannot be"
+        return ""
+
+
+def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    found: object = plain_json(str(arrays["facts"]))
+    if not isinstance(found, dict):
+        raise ValueError("no facts")
+    facts = cast(dict[str, Any], found)
+    if facts.get("format") != FORMAT or facts.get("format_version") != VERSION:
+        raise ValueError("another format")
+    texts = {name: facts[name] for name in ("target", "gauge", "model_hash", "method")}
+    numbers = {name: float(facts[name]) for name in ("lowest", "highest", "farthest_mm", "level")}
+    if not all(isinstance(text, str) for text in texts.values()) or texts["gauge"] not in ("form", "shape"):
+        raise ValueError("facts of another kind")
+    if not all(map(math.isfinite, numbers.values())):
+        raise ValueError("numbers that are not finite")
+    return {**texts, **numbers, "subjects": int(facts["subjects"])}
+
+
+def model_hash_of(cohort: Cohort) -> str:
+    """Return the hash of the model whose coefficients a cohort's shapes are; empty where they are surfaces."""
+    if cohort.fitted is None:
+        return ""
+    # Coefficients are counted from the model's mean, in its own size or another; surfaces from their own mean.
+    mean, reference = cohort.fitted.model.mean_vertices, cohort.reference
+    scale = float(np.vdot(reference, mean) / np.vdot(mean, mean))
+    counted = np.allclose(reference, scale * mean, rtol=0.0, atol=1e-9 * float(np.abs(mean).max()))
+    return cohort.fitted.model.content_hash if counted else ""
+
+
+def cv_plus(
+    ways: FloatArray, residuals: FloatArray, fold: IndexArray, share: FloatArray, level: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return low and high (n,) of CV+ intervals.
+
+    Args:
+        ways: (n, F) predictions by the regression without each fold.
+        residuals: (N,) absolute, of rows predicted without their fold.
+        fold: (N,) theirs, from 0.
+        share: (N,) how much each counts; they sum to the number of subjects.
+        level: of the interval; with too few subjects for it the ends are the outermost.
+    """
+    subjects = float(share.sum())
+    past = min(level * (1.0 + 1.0 / subjects), 1.0) * subjects
+    by_row = ways[:, fold]
+    high = _weighted_quantile(by_row + residuals, share, past)
+    low = -_weighted_quantile(residuals - by_row, share, past)
+    return read_only(low), read_only(high)
+
+
+def _weighted_quantile(values: FloatArray, share: FloatArray, past: float) -> FloatArray:
+    """Return (n,) the least of each row of `values` (n, N) up to which `share` (N,) sums to `past`."""
+    order = np.argsort(values, axis=1, kind="stable")
+    reached = np.cumsum(share[order], axis=1) >= past - 1e-9
+    reached[:, -1] = True
+    rows = np.arange(len(values))
+    return values[rows, order[rows, reached.argmax(axis=1)]]
+
+
+def refuse_known(known: tuple[str, ...], new: tuple[str, ...], where: str) -> None:
+    """Refuse new shapes of subjects that were learned from.
+
+    Raises:
+        InputError: there are such.
+    """
+    both = sorted(set(known) & set(new))
+    if both:
+        raise InputError(
+            f"{where}: {named(both)} {'was' if len(both) == 1 else 'were'} learned from too, so what is predicted of "
+            "them says nothing; leave them out."
+        )

@@ -1,0 +1,399 @@
+"""Regression the other way: a number, such as age or a severity, from shape, and the shape that goes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import named
+from shapespace.errors import InputError
+from shapespace.geometry.surface import vertex_normals
+from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
+from shapespace.statistics.smoothers import CHOICES, Choice, Decomposed, IndexArray, errors_of, folds_of, nested
+from shapespace.types import FloatArray, Mesh, read_only
+
+SUBJECT = "subject"
+FEWEST, SMALL = 10, 100
+"""Subjects below which nothing is learned, and below which a sample is said to be small."""
+MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
+_BLOCK = 500
+_EDGES = (5.0, 95.0)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure of predictions on subjects left out, with its interval by drawing subjects anew; NaN where undefined."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """How well a number can be told from shape, and how.
+
+    Args:
+        cohort: the N shapes.
+        target: the number.
+        observed: (N,) of it.
+        subjects: (N,) names.
+        predicted: (N,) by nested cross-validation: neither the regression nor its choice saw the subject.
+        low, high: (N,) intervals, made likewise.
+        baseline: (N,) the mean of the training set.
+        measures: by the names in `MEASURES`; `r2` against the baseline, `slope` and `intercept` of the observed on the
+            predicted, `coverage` and `width` of the intervals. Each subject counts once.
+        baseline_rmse: of predicting the mean,
+        baseline_mae: likewise.
+        p: of R2 by permutation of the targets among subjects; None without permutations.
+        choice: made on all rows.
+        effective: its degrees of freedom.
+        predictor: learned from all rows.
+        pattern: (K,) how the coefficients change, mm, with one unit of the target.
+        low_at, high_at: the 5th and 95th percentile of the target.
+        level: of all intervals.
+        folds: of the outer cross-validation.
+        permutations: how many.
+        seed: of folds, permutations and draws.
+    """
+
+    cohort: Cohort
+    target: str
+    observed: FloatArray
+    subjects: tuple[str, ...]
+    predicted: FloatArray
+    low: FloatArray
+    high: FloatArray
+    baseline: FloatArray
+    measures: Mapping[str, Measure]
+    baseline_rmse: float
+    baseline_mae: float
+    p: float | None
+    choice: Choice
+    effective: float
+    predictor: Predictor
+    pattern: FloatArray
+    low_at: float
+    high_at: float
+    level: float
+    folds: int
+    permutations: int
+    seed: int
+
+    @property
+    def n_subjects(self) -> int:
+        """Number of subjects."""
+        return self.predictor.subjects
+
+    @property
+    def small(self) -> bool:
+        """Whether the sample is small: figures on fewer than `SMALL` subjects scatter widely from sample to sample."""
+        return self.n_subjects < SMALL
+
+    def shape_at(self, value: float) -> FloatArray:
+        """Return the mean shape (V, 3), mm, at a value of the target, by regression of shape on the target."""
+        middle = float(np.average(self.observed, weights=self.predictor.share))
+        own = np.average(self.cohort.coefficients, axis=0, weights=self.predictor.share)
+        return self.cohort.vertices(own + (value - middle) * self.pattern)
+
+    @cached_property
+    def map(self) -> FloatArray:
+        """(V,) mm along the normals of the mean for one unit of the target; lengths, for points."""
+        moved = (self.pattern @ self.cohort.basis).reshape(-1, 3)
+        if self.cohort.faces is None:
+            return np.linalg.norm(moved, axis=1)
+        mean = self.cohort.vertices(self.cohort.coefficients.mean(axis=0))
+        return np.einsum("vd,vd->v", moved, vertex_normals(Mesh(mean, self.cohort.faces)))
+
+
+def regress(
+    cohort: Cohort,
+    target: str,
+    *,
+    subject: str | None = None,
+    folds: int = 10,
+    permutations: int = 199,
+    draws: int = 2000,
+    level: float = 0.9,
+    seed: int = 0,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Regression:
+    """Learn a number from shape, and measure on subjects left out how well.
+
+    Args:
+        cohort: the shapes.
+        target: column of the number.
+        subject: column that names who a shape is of; None takes `subject` where there is one, else each shape is of
+            another. No subject stands on both sides of a fold.
+        folds: of the outer cross-validation; the inner one that chooses has five.
+        permutations: for p; 0 for none.
+        draws: of subjects, for intervals of figures.
+        level: of all intervals.
+        seed: of all chance.
+        on_step: called with (steps done, in all).
+
+    Raises:
+        InputError: no such column, values that are missing, no numbers or all the same, fewer than ten subjects, fewer
+            subjects than folds, or options that cannot be.
+    """
+    _check_options(folds, permutations, draws, level, seed)
+    y = cohort.table.numbers(target)
+    _check_target(cohort, target, y)
+    subjects = _subjects_of(cohort, subject)
+    names = tuple(dict.fromkeys(subjects))
+    number = {name: at for at, name in enumerate(names)}
+    codes = np.array([number[name] for name in subjects])
+    if len(names) < max(FEWEST, folds):
+        raise InputError(
+            f"{cohort.table.where}: {len(names)} subjects are too few to learn {target} from in {folds} folds; "
+            f"{max(FEWEST, folds)} are the least."
+        )
+    counts = np.bincount(codes)
+    share = 1.0 / counts[codes]
+    X = cohort.coefficients
+    rng = np.random.default_rng(seed)
+    outer = folds_of(codes, folds, rng)
+    inner = [folds_of(codes[outer != fold], min(5, len(names) // 2), rng) for fold in range(folds)]
+    steps = _Steps(1 + -(-permutations // _BLOCK), folds, on_step)
+    done = nested(X, y[:, None], share, outer, inner, on_fold=steps.fold)
+    predicted, baseline = done.predicted[:, 0], done.baseline[:, 0]
+    low, high = _intervals(X, y, share, outer, inner, done.chosen[:, 0], level)
+    measures = _measures(y, predicted, baseline, low, high, share, codes, draws, level, rng)
+    p = _p_of(X, y, codes, share, outer, inner, measures["r2"].value, permutations, rng, steps)
+
+    errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
+    predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], level)
+    centred = y - np.average(y, weights=share)
+    pattern = (share * centred) @ X / float((share * centred**2).sum())
+    low_at, high_at = (float(v) for v in np.percentile(y, _EDGES))
+    return Regression(
+        cohort=cohort,
+        target=target,
+        observed=read_only(y),
+        subjects=subjects,
+        predicted=read_only(predicted),
+        low=read_only(low),
+        high=read_only(high),
+        baseline=read_only(baseline),
+        measures=measures,
+        baseline_rmse=_rms(y - baseline, share),
+        baseline_mae=float(np.average(np.abs(y - baseline), weights=share)),
+        p=p,
+        choice=choice,
+        effective=effective,
+        predictor=predictor,
+        pattern=read_only(pattern),
+        low_at=low_at,
+        high_at=high_at,
+        level=level,
+        folds=folds,
+        permutations=permutations,
+        seed=seed,
+    )
+
+
+def compare_with(predictions: Predictions, observed: FloatArray) -> tuple[float, float, float]:
+    """Return R2 (against the mean of the new ones), RMSE and coverage of predictions where the target is known."""
+    off = observed - predictions.value
+    spread = float(((observed - observed.mean()) ** 2).sum())
+    inside = (observed >= predictions.low) & (observed <= predictions.high)
+    return (
+        1.0 - float((off**2).sum()) / spread if spread > 0 else float("nan"),
+        float(np.sqrt((off**2).mean())),
+        float(inside.mean()),
+    )
+
+
+class _Steps:
+    """Counts outer folds over all blocks of permutations."""
+
+    def __init__(self, blocks: int, folds: int, on_step: Callable[[int, int], None] | None) -> None:
+        self.total, self.done, self.on_step = blocks * folds, 0, on_step
+
+    def fold(self, _done: int, _folds: int) -> None:
+        self.done += 1
+        if self.on_step is not None:
+            self.on_step(self.done, self.total)
+
+
+def _check_options(folds: int, permutations: int, draws: int, level: float, seed: int) -> None:
+    if folds < 3:
+        raise InputError(f"Cross-validation needs at least 3 folds, not {folds}.")
+    if permutations < 0 or seed < 0 or draws < 1:
+        raise InputError("The number of permutations and the seed must be 0 or more, and that of draws 1 or more.")
+    if not 0.5 <= level < 1:
+        raise InputError(f"The level of intervals must lie between 0.5 and 1, not at {level}.")
+
+
+def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
+    missing = [cohort.names[at] for at in np.flatnonzero(np.isnan(y))]
+    if missing:
+        raise InputError(
+            f"{cohort.table.where}: {target} of {len(missing)} of {len(cohort)} shapes is missing ({named(missing)}); "
+            "fill it in, or leave them out with --drop-missing."
+        )
+    if np.ptp(y) == 0:
+        raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")
+
+
+def _subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
+    if column is None and SUBJECT not in cohort.table.columns:
+        return cohort.names
+    cells = cohort.table.texts(column or SUBJECT)
+    if not all(cells):
+        raise InputError(
+            f"{cohort.table.where}: {column or SUBJECT!r} of {cohort.names[cells.index('')]} is missing; fill it in, "
+            "or leave such shapes out with --drop-missing."
+        )
+    return cells
+
+
+def _intervals(
+    X: FloatArray,
+    y: FloatArray,
+    share: FloatArray,
+    outer: IndexArray,
+    inner: list[IndexArray],
+    chosen: IndexArray,
+    level: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return low and high (N,) of CV+ intervals of rows left out, by the inner folds of their training sets."""
+    low, high = np.empty_like(y), np.empty_like(y)
+    for fold, own in enumerate(inner):
+        test, train = outer == fold, outer != fold
+        residuals, ways, _, _ = _left_out(X[train], y[train], own, CHOICES[int(chosen[fold])], X[test])
+        low[test], high[test] = cv_plus(ways, residuals, own, share[train], level)
+    return low, high
+
+
+def _left_out(
+    X: FloatArray, y: FloatArray, folds: IndexArray, choice: Choice, new: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return residuals (N,) without each row's fold, predictions (n, F) of `new`, weights (F, K), intercepts (F,)."""
+    residuals = np.empty_like(y)
+    weights: list[FloatArray] = []
+    intercepts: list[float] = []
+    for fold in range(int(folds.max()) + 1):
+        test = folds == fold
+        beta, intercept = Decomposed.of(X[~test]).weights(y[~test], choice)
+        residuals[test] = np.abs(y[test] - X[test] @ beta - intercept)
+        weights.append(beta)
+        intercepts.append(intercept)
+    beta, intercept = np.stack(weights), np.array(intercepts)
+    return residuals, new @ beta.T + intercept, beta, intercept
+
+
+def _predictor(
+    cohort: Cohort, target: str, y: FloatArray, share: FloatArray, outer: IndexArray, choice: Choice, level: float
+) -> tuple[Predictor, Choice, float]:
+    X = cohort.coefficients
+    whole = Decomposed.of(X)
+    if choice.space == "whitened":
+        choice = Choice("whitened", min(choice.amount, len(whole.singular)))
+    beta, intercept = whole.weights(y, choice)
+    residuals, _, weights, intercepts = _left_out(X, y, outer, choice, X[:1])
+    middle = X.mean(axis=0)
+    all_beta, all_intercepts = np.vstack([beta, weights]), np.concatenate([[intercept], intercepts])
+    farthest = float(np.sqrt(((X - middle) ** 2).sum(axis=1).max() / cohort.n_vertices))
+    predictor = Predictor(
+        target=target,
+        gauge=cohort.gauge,
+        model_hash=model_hash_of(cohort),
+        mean=read_only(cohort.vertices(middle)),
+        weights=read_only(all_beta @ cohort.basis),
+        intercepts=read_only(all_intercepts + all_beta @ middle),
+        residuals=read_only(residuals),
+        fold=outer + 1,
+        share=read_only(share),
+        lowest=float(y.min()),
+        highest=float(y.max()),
+        farthest_mm=farthest,
+        subjects=round(float(share.sum())),
+        level=level,
+        method=choice.words(),
+    )
+    return predictor, choice, whole.effective(choice)
+
+
+def _measures(
+    y: FloatArray,
+    predicted: FloatArray,
+    baseline: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    share: FloatArray,
+    codes: IndexArray,
+    draws: int,
+    level: float,
+    rng: np.random.Generator,
+) -> dict[str, Measure]:
+    """Return all figures with their intervals, of which every draw is a weighing of subjects."""
+    n = int(codes.max()) + 1
+    times = np.vstack([np.ones(n), rng.multinomial(n, np.full(n, 1.0 / n), draws)])
+    off = y - predicted
+    inside = (y >= low) & (y <= high)
+    columns = np.column_stack([
+        np.ones(len(y)), off**2, (y - baseline) ** 2, np.abs(off), inside, high - low,
+        predicted, y, predicted**2, predicted * y,
+    ])  # fmt: skip
+    of_subject = np.zeros((n, columns.shape[1]))
+    np.add.at(of_subject, codes, share[:, None] * columns)
+    sums = times @ of_subject
+    mean = (sums / sums[:, :1]).T
+    _, square, by_mean, absolute, covered, width, m_p, m_y, m_pp, m_py = mean
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = (m_py - m_p * m_y) / (m_pp - m_p**2)
+        found = (1.0 - square / by_mean, np.sqrt(square), absolute, slope, m_y - slope * m_p, covered, width)
+    tail = 50.0 * (1.0 - level)
+
+    def measure(values: FloatArray) -> Measure:
+        drawn = values[1:][np.isfinite(values[1:])]
+        ends = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
+        return Measure(float(values[0]), float(ends[0]), float(ends[1]))
+
+    return {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+
+
+def _p_of(
+    X: FloatArray,
+    y: FloatArray,
+    codes: IndexArray,
+    share: FloatArray,
+    outer: IndexArray,
+    inner: list[IndexArray],
+    observed: float,
+    permutations: int,
+    rng: np.random.Generator,
+    steps: _Steps,
+) -> float | None:
+    """Return how often R2 is as high with the targets of subjects dealt out anew, choice and all."""
+    if not permutations:
+        return None
+    beyond = 1
+    for start in range(0, permutations, _BLOCK):
+        orders = [_dealt(codes, rng) for _ in range(min(_BLOCK, permutations - start))]
+        targets = np.stack([y[order] for order in orders], axis=1)
+        done = nested(X, targets, share, outer, inner, on_fold=steps.fold)
+        r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
+        beyond += int((r2 >= observed - 1e-12).sum())
+    return beyond / (1 + permutations)
+
+
+def _dealt(codes: IndexArray, rng: np.random.Generator) -> IndexArray:
+    """Return rows (N,) whose targets take the place of each row's: of another subject with as many rows, whole."""
+    order = np.arange(len(codes))
+    counts = np.bincount(codes)
+    rows = [np.flatnonzero(codes == subject) for subject in range(len(counts))]
+    for count in np.unique(counts):
+        alike = np.flatnonzero(counts == count)
+        for to, source in zip(alike, rng.permutation(alike), strict=True):
+            order[rows[to]] = rows[source]
+    return order
+
+
+def _rms(values: FloatArray, share: FloatArray) -> float:
+    return float(np.sqrt(np.average(values**2, weights=share)))

@@ -1,0 +1,203 @@
+"""The sides of an object: which vertices mirror which, found from the mean or given, and shapes beside their images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import named
+from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.mirror import FLIP, find_mirror, mirror_pairs
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import rms_size
+from shapespace.io.files import read_bytes
+from shapespace.io.json_files import check_file
+from shapespace.io.tables import table_rows
+from shapespace.types import FloatArray, IntArray, Mesh
+
+LARGEST_OFF = 0.02
+"""A mean that lies further (RMS, share of its size) from its mirror image about any plane is not symmetric."""
+LARGEST_PAIRED_OFF = 0.1
+"""The same where pairs are given, from vertex to vertex."""
+_LARGEST_BYTES = 2**26
+_FEWEST = 4
+_NUMBER = re.compile(r"[0-9]{1,12}")
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Which place of an object is the mirror image of which.
+
+    Args:
+        vertices: (M,) of the cohort that take part.
+        faces: (F, 3) triangles between them; None where there are none.
+        corners: (M, 3) of those M, whose mix is the other side of each.
+        weights: (M, 3) of them; where vertices pair up the first is 1.
+        paired: whether they do, so that the mirror image of the mirror image is the shape itself.
+        off_share: RMS distance of the mean from its mirror image, as a share of its size.
+        notes: what should be known of them, a sentence each.
+    """
+
+    vertices: IntArray
+    faces: IntArray | None
+    corners: IntArray
+    weights: FloatArray
+    paired: bool
+    off_share: float
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def image(self, fields: FloatArray) -> FloatArray:
+        """Return the mirror images (..., M, 3) about x = 0 of shapes, or displacements, (..., M, 3)."""
+        if self.paired:
+            return fields[..., self.corners[:, 0], :] * FLIP
+        return sum(self.weights[:, c, None] * fields[..., self.corners[:, c], :] for c in range(3)) * FLIP
+
+    @cached_property
+    def on_the_plane(self) -> float:
+        """How many vertices are their own mirror image; in shares where places are mixed."""
+        return float((self.weights * (self.corners == np.arange(len(self))[:, None])).sum())
+
+    def dimensions(self, *, scaled: bool) -> tuple[float, float]:
+        """Return how many dimensions symmetric and asymmetric variation have, poses divided out.
+
+        With l pairs and k vertices on the plane they are 3 l + 2 k less 3, and 3 l + k less 3; symmetric variation
+        loses one more where size is divided out (Klingenberg, Barluenga and Meyer 2002, table 2).
+
+        Args:
+            scaled: whether size is divided out.
+        """
+        half, plane = 1.5 * len(self), 0.5 * self.on_the_plane
+        return half + plane - (4 if scaled else 3), half - plane - 3
+
+
+def find_sides(cohort: Cohort) -> Sides:
+    """Return the sides of an object by the mean of its cohort, or the mean of the model of fits.
+
+    Raises:
+        InputError: it has no triangles, or it is not its own mirror image about any plane.
+    """
+    if cohort.faces is None:
+        raise InputError("Points without triangles show no plane of symmetry; name the points that mirror each other "
+                         "with --pairs.")  # fmt: skip
+    # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
+    mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
+    mesh = Mesh(mean, cohort.faces, name="mean")
+    found = find_mirror(mesh)
+    if found.off_share > LARGEST_OFF:
+        raise InputError(
+            f"The mean lies {100 * found.off_share:.1f} % of its size from its own mirror image about the best plane, "
+            f"and over {100 * LARGEST_OFF:.0f} % an object, such as a femur or a spleen, is taken to have no mirror "
+            "symmetry; leave asymmetry out, or name what mirrors what with --pairs."
+        )
+    notes: list[str] = []
+    rival = found.others_share[0]
+    if rival <= LARGEST_OFF:
+        notes.append(
+            f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off beside "
+            f"{100 * found.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
+        )
+    everything = np.arange(cohort.n_vertices, dtype=np.int32)
+    other = mirror_pairs(mesh, found)
+    if other is not None:
+        corners, weights = _alone(other)
+        return Sides(everything, cohort.faces, corners, weights, True, found.off_share, tuple(notes))
+    notes.append(
+        "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; what "
+        "the mean's sides differ by along the surface cannot be seen so."
+    )
+    return Sides(everything, cohort.faces, found.corners, found.weights, False, found.off_share, tuple(notes))
+
+
+def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "The pairs") -> Sides:
+    """Return the sides that pairs of vertices give; others are left out.
+
+    Args:
+        cohort: of the shapes.
+        pairs: of vertices; one on the plane stands beside itself.
+        where: what the pairs are called in messages.
+
+    Raises:
+        InputError: vertices that do not exist or stand in two pairs, fewer than four, or pairs about which the mean is
+            nowhere near its mirror image.
+    """
+    other: dict[int, int] = {}
+    for a, b in pairs:
+        for v in (a, b):
+            if not 0 <= v < cohort.n_vertices:
+                raise InputError(
+                    f"{where}: there is no vertex {v}; they are counted from 0 to {cohort.n_vertices - 1}."
+                )
+        if other.get(a, b) != b or other.get(b, a) != a:
+            raise InputError(f"{where}: the vertex {a if other.get(a, b) != b else b} stands in two pairs; keep one.")
+        other[a], other[b] = b, a
+    if len(other) < _FEWEST:
+        raise InputError(
+            f"{where} name {len(other)} vertices, and {_FEWEST} are the least that show a plane; add some."
+        )
+    vertices = np.array(sorted(other), dtype=np.int32)
+    number = {int(v): at for at, v in enumerate(vertices)}
+    corners, weights = _alone(np.array([number[other[int(v)]] for v in vertices], dtype=np.int32))
+    own = np.full(cohort.n_vertices, -1, dtype=np.int32)
+    own[vertices] = np.arange(len(vertices))
+    faces = None if cohort.faces is None else own[cohort.faces]
+    faces = None if faces is None else faces[(faces >= 0).all(axis=1)]
+    faces = None if faces is None or not len(faces) else faces
+    sides = Sides(vertices, faces, corners, weights, True, 0.0)
+    x = cohort.reference[vertices]
+    image = sides.image(x)
+    try:
+        off = float(np.sqrt(((fit_similarity(image, x, with_scale=False).apply(image) - x) ** 2).sum(axis=1).mean()))
+    except InputError as error:
+        raise InputError(f"{where} lie on a line, so they show no plane; add pairs beside it.") from error
+    share = off / rms_size(x)
+    if share > LARGEST_PAIRED_OFF:
+        raise InputError(
+            f"{where}: the mean lies {100 * share:.0f} % of its size from its mirror image by them, and "
+            f"{100 * LARGEST_PAIRED_OFF:.0f} % is the most; check that each row names points that mirror each other."
+        )
+    left = cohort.n_vertices - len(vertices)
+    notes = (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
+    return Sides(vertices, faces, corners, weights, True, share, notes)
+
+
+def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
+    """Return the pairs of vertices in a CSV table of two columns, as numbers or as names of landmarks.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is no such table.
+        InputError: a name that is no landmark of the cohort.
+    """
+    check_file(path, _LARGEST_BYTES, "give a smaller table")
+    try:
+        rows = [[cell.strip() for cell in row] for row in table_rows(read_bytes(path))][1:]
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; write two columns with a header, a pair in each row.") from error
+    if not rows or any(len(row) != 2 for row in rows):
+        raise FileFormatError(f"{path} is no table of pairs; write two columns with a header, a pair in each row.")
+    landmarks = dict(cohort.landmarks or {})
+    unknown = sorted(
+        {cell for row in rows for cell in row if not (cell.isdecimal() and len(cell) < 12) and cell not in landmarks}
+    )
+    if unknown:
+        there = named(sorted(landmarks)) if landmarks else "none are known"
+        raise InputError(f"{path}: {named(unknown)} is neither a vertex number nor a landmark (landmarks: {there}).")
+    pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) for cell in row) for row in rows]
+    return tuple((a, b) for a, b in pairs)
+
+
+def _alone(other: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return corners (M, 3) and weights (M, 3) that take the vertex `other` (M,) alone."""
+    weights = np.zeros((len(other), 3))
+    weights[:, 0] = 1.0
+    corners = np.tile(other[:, None], (1, 3))
+    return corners, weights

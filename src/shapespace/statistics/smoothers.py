@@ -1,0 +1,168 @@
+"""Ridge and principal component regression as filters of one decomposition, chosen by nested folds of subjects.
+
+Both are linear in the target: a training set is decomposed once, and that serves every penalty and every permutation of
+the targets (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, 2009, section 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.types import FloatArray
+
+IndexArray = npt.NDArray[np.intp]
+PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
+"""Of ridge regression on coefficients in mm, times the largest squared singular value."""
+MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
+"""Leading principal components that a regression on whitened coefficients keeps."""
+_NOTHING = 1e-10
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How much of the shapes a regression goes by.
+
+    Args:
+        space: `raw` for ridge regression on coefficients in mm, `whitened` for least squares on the leading principal
+            components, which then count alike.
+        amount: the penalty times the largest squared singular value, or the number of components.
+    """
+
+    space: str
+    amount: float
+
+    def factors(self, singular: FloatArray) -> FloatArray:
+        """Return by how much (r,) directions with singular values (r,) take part, 0 to 1."""
+        if self.space == "raw":
+            return singular**2 / (singular**2 + self.amount * singular[0] ** 2)
+        return (np.arange(len(singular)) < self.amount).astype(np.float64)
+
+    def words(self) -> str:
+        """Return what it is."""
+        if self.space == "raw":
+            return f"ridge regression on coefficients in mm, penalty {self.amount:.2g} of the largest variance"
+        return f"least squares on the first {self.amount:.0f} principal components"
+
+
+CHOICES = tuple(Choice("raw", p) for p in PENALTIES) + tuple(Choice("whitened", m) for m in MODES)
+
+
+@dataclass(frozen=True, eq=False)
+class Decomposed:
+    """A training set.
+
+    Args:
+        middle: (K,) mean of its coefficients.
+        left: (n, r), singular: (r,), right: (r, K) of its centred coefficients.
+    """
+
+    middle: FloatArray
+    left: FloatArray
+    singular: FloatArray
+    right: FloatArray
+
+    @staticmethod
+    def of(X: FloatArray) -> Decomposed:
+        """Return it for coefficients (n, K)."""
+        middle = X.mean(axis=0)
+        left, singular, right = np.linalg.svd(X - middle, full_matrices=False)
+        kept = singular > _NOTHING * max(float(singular[0]), 1e-300)
+        return Decomposed(middle, left[:, kept], singular[kept], right[kept])
+
+    def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Choice]) -> FloatArray:
+        """Return what each choice predicts, (C, m, P), of coefficients (m, K) by targets (n, P) of the training set."""
+        mean = targets.mean(axis=0)
+        along = (X - self.middle) @ self.right.T / self.singular
+        of_targets = self.left.T @ (targets - mean)
+        return np.stack([mean + (along * choice.factors(self.singular)) @ of_targets for choice in choices])
+
+    def weights(self, target: FloatArray, choice: Choice) -> tuple[FloatArray, float]:
+        """Return weights (K,) and intercept of a prediction from coefficients, for a target (n,)."""
+        mean = float(target.mean())
+        beta = (choice.factors(self.singular) / self.singular * (self.left.T @ (target - mean))) @ self.right
+        return beta, mean - float(self.middle @ beta)
+
+    def effective(self, choice: Choice) -> float:
+        """Return the effective degrees of freedom of a choice, without the mean."""
+        return float(choice.factors(self.singular).sum())
+
+
+def folds_of(codes: IndexArray, count: int, rng: np.random.Generator) -> IndexArray:
+    """Return the fold (N,) of each row, dealt out by subjects, so that none stands in two.
+
+    Args:
+        codes: (N,) number of the subject of each row.
+        count: of folds.
+        rng: the only source of chance.
+    """
+    subjects = np.unique(codes)
+    dealt = np.empty(int(subjects.max()) + 1, dtype=np.intp)
+    dealt[rng.permutation(subjects)] = np.arange(len(subjects)) % count
+    return dealt[codes]
+
+
+def errors_of(
+    X: FloatArray, targets: FloatArray, weight: FloatArray, folds: IndexArray, choices: Sequence[Choice]
+) -> FloatArray:
+    """Return the weighted sum of squared errors (C, P) of each choice for targets (N, P), in folds (N,)."""
+    total = np.zeros((len(choices), targets.shape[1]))
+    for fold in np.unique(folds):
+        test = folds == fold
+        found = Decomposed.of(X[~test]).predict(X[test], targets[~test], choices)
+        total += np.einsum("m,cmp->cp", weight[test], (found - targets[test]) ** 2)
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class Nested:
+    """What nested cross-validation predicts of rows left out.
+
+    Args:
+        predicted: (N, P) for each column of targets.
+        baseline: (N, P) the mean of the training set.
+        chosen: (F, P) index of the choice in each outer fold.
+    """
+
+    predicted: FloatArray
+    baseline: FloatArray
+    chosen: IndexArray
+
+
+def nested(
+    X: FloatArray,
+    targets: FloatArray,
+    weight: FloatArray,
+    outer: IndexArray,
+    inner: Sequence[IndexArray],
+    choices: Sequence[Choice] = CHOICES,
+    on_fold: Callable[[int, int], None] | None = None,
+) -> Nested:
+    """Return predictions of all rows, each by a training set that has nothing of its subject, nor the choice either.
+
+    Args:
+        X: (N, K) coefficients.
+        targets: (N, P).
+        weight: (N,) of rows in errors.
+        outer: (N,) fold of each row.
+        inner: for each outer fold, the folds (n,) of its training rows.
+        choices: to choose from.
+        on_fold: called with (outer folds done, in all).
+    """
+    predicted, baseline = np.empty_like(targets), np.empty_like(targets)
+    chosen: list[IndexArray] = []
+    for fold, own in enumerate(inner):
+        test = outer == fold
+        train = ~test
+        errors = errors_of(X[train], targets[train], weight[train], own, choices)
+        best = errors.argmin(axis=0)
+        found = Decomposed.of(X[train]).predict(X[test], targets[train], choices)
+        predicted[test] = np.take_along_axis(found, best[None, None, :], axis=0)[0]
+        baseline[test] = targets[train].mean(axis=0)
+        chosen.append(best)
+        if on_fold is not None:
+            on_fold(fold + 1, len(inner))
+    return Nested(predicted, baseline, np.stack(chosen))
