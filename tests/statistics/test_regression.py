@@ -180,7 +180,7 @@ def test_new_surfaces_are_predicted_alike_in_any_pose(gauge: str) -> None:
     found = regress(cohort, "amount", folds=5, permutations=0, draws=10)
     one, turned = shapes[3:4], posed(shapes[3:4], rng) * (1.0 if gauge == "form" else 2.0)
     first, other = (
-        found.predictor.predict(Cohort.of_shapes(s, {}, faces=thing.faces, gauge=gauge))  # type: ignore[arg-type]
+        found.predictor.predict(Cohort.of_shapes(s, {}, faces=thing.faces, gauge=gauge, least=1))  # type: ignore[arg-type]
         for s in (one, turned)
     )
     assert first.value[0] == pytest.approx(other.value[0], abs=1e-6)

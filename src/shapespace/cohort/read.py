@@ -165,7 +165,7 @@ def _of_results(
     least = options.least if onto is None else 1
     if len(kept) < least:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and {least} is the least; "
+            f"{results.folder}: {len(kept)} of its fits can be used, and {_count_is(least)} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in kept]
@@ -229,7 +229,7 @@ def _of_surfaces(
     _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
     least = options.least if onto is None else 1
     if len(kept) < least:
-        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {least} is the least.")
+        raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {_count_is(least)} the least.")
     meshes: list[Mesh] = []
     for done, (file, _) in enumerate(kept, 1):
         mesh = mesh_at(file)
@@ -305,6 +305,10 @@ def _model_of(results: Results, fit: _Row, given: Path | None) -> ShapeModel:
 
 def _stem(file: Path) -> str:
     return next((file.name.removesuffix(end) for end in _ENDINGS if file.name.endswith(end)), stem_of(file))
+
+
+def _count_is(count: int) -> str:
+    return {1: "one is", 2: "two are"}.get(count, f"{count} are")
 
 
 def _number(value: Any) -> float:
