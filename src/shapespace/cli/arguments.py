@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
+from shapespace.cli.answers import compare
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -32,6 +33,10 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    compare.add(
+        _add(commands, "compare", "do groups differ, and with what: linear models of shape on covariates",
+             "shapespace compare people.csv --shapes fits --formula '~ sex + age' -o sex-and-age")
+    )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
     return top

@@ -43,6 +43,8 @@ class CompareOptions:
         permutations: arrangements, the observed one among them.
         seed: of the arrangements.
         maps: whether to test each vertex.
+        bump_width_mm: also seek, at each vertex, a bump along the normals of this standard deviation, beside how shapes
+            vary anyway; None does not. It is for fits, whose model knows how shapes vary.
         level: of significance.
         drop_missing: leave out shapes of which something in the formula is missing, and say so.
     """
@@ -52,6 +54,7 @@ class CompareOptions:
     permutations: int = 1000
     seed: int = 0
     maps: bool = True
+    bump_width_mm: float | None = None
     level: float = 0.05
     drop_missing: bool = False
 
@@ -62,6 +65,8 @@ class CompareOptions:
             raise InputError(f"The number of permutations must lie from 20 to 1000000, not at {self.permutations}.")
         if self.seed < 0 or not 0 < self.level < 1:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
+        if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
+            raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +358,7 @@ def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Cal
     stratum = family.stratum
     residual = stratum.residual(family.beside)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family.ends])
-    lengths = np.linalg.norm(directions, axis=1)
+    lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
     along = (directions / lengths[:, None]) @ stratum.basis
     products = stratum.products(stratum.basis, residual, options.permutations, options.seed)
     error = ((residual**2).sum() - (products**2).sum(axis=(1, 2))) / stratum.df_error
@@ -363,7 +368,7 @@ def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Cal
     step()
     maps: Iterable[EffectMap | None] = itertools.repeat(None)
     if options.maps:
-        maps = effect_maps(cohort, stratum, residual, products, along, changes)
+        maps = effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
         step()
     mean = cohort.coefficients.mean(axis=0)
     for at, (ends, made) in enumerate(zip(family.ends, maps, strict=False)):

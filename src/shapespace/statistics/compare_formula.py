@@ -207,9 +207,10 @@ def design_of(formula: str, table: Table) -> Design:
         factors.append(frozenset(factor.text for factor in term))
         members.append(frozenset(one.column for one in own))
     try:
-        made = formulaic.Formula(written, _ordering="none").get_model_matrix(
-            pandas.DataFrame(frame), context=_CONTEXT, na_action="ignore"
-        )
+        with np.errstate(all="ignore"):
+            made = formulaic.Formula(written, _ordering="none").get_model_matrix(
+                pandas.DataFrame(frame), context=_CONTEXT, na_action="ignore"
+            )
     # formulaic hands on whatever the functions of a formula raise.
     except Exception as error:
         raise InputError(f"The formula {formula!r} cannot be worked out ({_first(error)}); correct it.") from error
