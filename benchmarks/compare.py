@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -51,50 +52,50 @@ class Pool:
     change_mm: FloatArray
 
 
-def nose_change(surface: Mesh, mm: float) -> FloatArray:
+def nose_change(vertices: FloatArray, tip: int) -> FloatArray:
     """Return how far each vertex of a face is moved along its normal: the tip of the nose, with a smooth edge."""
-    assert surface.landmarks is not None
-    far = np.linalg.norm(surface.vertices - surface.landmarks["pronasale"], axis=1)
+    far = np.linalg.norm(vertices - vertices[tip], axis=1)
     edge = np.clip((NONE_MM - far) / (NONE_MM - WHOLE_MM), 0.0, 1.0)
-    return mm * edge * edge * (3.0 - 2.0 * edge)
+    return CHANGE_MM * edge * edge * (3.0 - 2.0 * edge)
 
 
 def make_pool(folder: Path, missing: float, people: int = POOL) -> Pool:
-    """Return the pool of one share of missing surface, fitted if its file is not there yet."""
+    """Return the pool of one share of missing surface, fitted if its files are not there yet."""
     faces = load_faces()
+    tip = faces.face_landmarks["pronasale"]
 
     def face(seed: int, k: int) -> Mesh:
         return faces.cut_to_face(faces.face(faces.draw_person(np.random.default_rng([seed, k]), f"{seed}_{k}")))
 
     trained = [face(0, k) for k in range(TRAINED)]
     model = ShapeModel.fit(trained, modes=MODES, gauge="shape", landmarks=faces.face_landmarks)
-    mean = Mesh(model.mean_vertices, model.faces, {k: model.mean_vertices[v] for k, v in model.landmarks.items()})
-    change = nose_change(mean, CHANGE_MM)
-    file = folder / f"pool_{round(100 * missing)}_{people}.npz"
-    if not file.is_file():
-        shape = (2, people)
-        b, stddev = np.zeros((*shape, MODES)), np.zeros((*shape, MODES))
-        dense = np.zeros((*shape, len(change), 3), dtype=np.float32)
-        used = np.zeros(shape, dtype=bool)
-        for changed, k in np.ndindex(*shape):
-            # Others in the second group: two groups of a study are different people.
-            own = face(1 + changed, k)
-            moved = nose_change(own, CHANGE_MM * changed)[:, None] * vertex_normals(own)
-            own = own.with_vertices(own.vertices + moved)
-            rng = np.random.default_rng([3, changed, k, round(100 * missing)])
-            scan = simulate_scan(own, rng, triangles=TRIANGLES, crop=[_cut(own, missing, rng)]).scan
-            try:
-                found = fit_scan(model, scan, FitConfig(dense=True))
-            except FitError:
-                continue
-            b[changed, k, : len(found.b)], stddev[changed, k, : len(found.b_stddev)] = found.b, found.b_stddev
-            T_model_scan = found.T_scan_model.inverse()
-            dense[changed, k] = T_model_scan.apply(found.surface(model, "dense").vertices)
-            used[changed, k] = found.status in ("converged", "max_iterations")
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(file, b=b, b_stddev=stddev, dense=dense, used=used)
-    kept = np.load(file)
-    return Pool(model, kept["b"], kept["b_stddev"], kept["dense"], kept["used"], change)
+    groups: list[Mapping[str, npt.NDArray[Any]]] = []
+    for changed in range(2):
+        file = folder / f"pool_{round(100 * missing)}_{people}_{changed}.npz"
+        if not file.is_file():
+            shape = (people, MODES)
+            b, stddev, used = np.zeros(shape), np.zeros(shape), np.zeros(people, dtype=bool)
+            dense = np.zeros((people, *model.mean_vertices.shape), dtype=np.float32)
+            for k in range(people):
+                # Others in the second group: two groups of a study are different people.
+                own = face(1 + changed, k)
+                if changed:
+                    moved = nose_change(own.vertices, tip)[:, None] * vertex_normals(own)
+                    own = own.with_vertices(own.vertices + moved)
+                rng = np.random.default_rng([3, changed, k, round(100 * missing)])
+                scan = simulate_scan(own, rng, triangles=TRIANGLES, crop=[_cut(own, missing, rng)]).scan
+                try:
+                    found = fit_scan(model, scan, FitConfig(dense=True))
+                except FitError:
+                    continue
+                b[k, : len(found.b)], stddev[k, : len(found.b_stddev)] = found.b, found.b_stddev
+                dense[k] = found.T_scan_model.inverse().apply(found.surface(model, "dense").vertices)
+                used[k] = found.status in ("converged", "max_iterations")
+            folder.mkdir(parents=True, exist_ok=True)
+            np.savez(file, b=b, b_stddev=stddev, dense=dense, used=used)
+        groups.append(np.load(file))
+    b, stddev, dense, used = (np.stack([group[name] for group in groups]) for name in ("b", "b_stddev", "dense", "used"))
+    return Pool(model, b, stddev, dense, used, nose_change(model.mean_vertices, tip))
 
 
 def _cut(face: Mesh, missing: float, rng: np.random.Generator) -> Cut:
