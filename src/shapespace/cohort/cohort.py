@@ -20,6 +20,8 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 _ORTHONORMAL = 1e-9
+# Of the size; single precision keeps a copy nearer than this.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +211,14 @@ class Cohort:
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
-            InputError: as `of_shapes`.
+            InputError: as `of_shapes`, or meshes with missing vertices.
         """
+        holed = [mesh.name for mesh in meshes if not np.isfinite(mesh.vertices).all()]
+        if holed:
+            raise InputError(
+                f"{len(holed)} of {len(meshes)} meshes lack vertices that their scans do not show ({named(holed)}); "
+                "build a model of all and fit it to the scans, or leave these out."
+            )
         first = meshes[0]
         for mesh in meshes[1:]:
             if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
@@ -228,6 +236,8 @@ class Cohort:
     ) -> Cohort:
         """Return the cohort of fits: in the model's frame, where their poses are divided out already.
 
+        Sizes that a model of forms holds in its modes are divided out in the `shape` gauge.
+
         Args:
             fitted: the coefficients.
             names: N.
@@ -243,18 +253,24 @@ class Cohort:
         rows = model.vertex_basis[:, :modes].T
         b = fitted.b
         reference = model.mean_vertices
-        if gauge == "form":
-            if not np.isfinite(sizes_mm).all():
-                lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
-                raise InputError(
-                    f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
-                    "or compare shapes with --gauge shape."
-                )
-            shapes = [reference + (row @ rows).reshape(-1, 3) for row in b]
-            scales = sizes_mm / np.array([centroid_size(shape) for shape in shapes])
-            b = np.column_stack([b * scales[:, None], scales - scales.mean()])
-            rows = np.vstack([rows, reference.reshape(1, -1)])
-            reference = reference * float(scales.mean())
+        if gauge == "form" and not np.isfinite(sizes_mm).all():
+            lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
+            raise InputError(
+                f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                "or compare shapes with --gauge shape."
+            )
+        if gauge == "form" or model.gauge == "form":
+            centre = reference.mean(axis=0)
+            middle = (reference - centre).ravel()
+            if gauge == "form":
+                scales = sizes_mm / np.array([centroid_size(reference + (row @ rows).reshape(-1, 3)) for row in b])
+            else:
+                # Of a model whose modes hold size, shapes are taken in the tangent plane at its mean.
+                scales = 1 / (1 + b @ (rows @ middle) / (middle @ middle))
+            mean = float(scales.mean())
+            b = np.column_stack([b * scales[:, None], scales - mean])
+            rows = np.vstack([rows, middle])
+            reference = centre + mean * (reference - centre)
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
@@ -265,16 +281,19 @@ class Cohort:
 
 
 def refuse_twice(cohort: Cohort) -> None:
-    """Check that no two shapes are the same, as of a scan that was copied.
+    """Check that no two shapes are the same but for rounding, as of a scan that was copied, in another pose perhaps.
 
     Raises:
         InputError: two are; the sentence names them.
     """
-    first: dict[bytes, str] = {}
-    for name, row in zip(cohort.names, cohort.coefficients, strict=True):
-        known = first.setdefault(row.tobytes(), name)
-        if known != name:
-            raise InputError(f"{known} and {name} are the same to the last digit; leave out one of them.")
+    from scipy.spatial import cKDTree
+
+    near = _SAME * centroid_size(cohort.reference)
+    pairs = cKDTree(cohort.coefficients).query_pairs(near, output_type="ndarray")
+    if len(pairs):
+        least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
+        first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]
+        raise InputError(f"{first} and {second} are the same shape but for rounding; leave out one of them.")
 
 
 def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:

@@ -178,6 +178,12 @@ def _of_results(
         if lacking:
             raise InputError(f"{results.folder} holds no {options.surfaces} surface of {named(lacking)}; fit them again"
                              f"{' with --dense' if options.surfaces == 'dense' else ''}.")  # fmt: skip
+        unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
+        if unknown and options.gauge == "form":
+            raise InputError(
+                f"The size of {named(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                "or compare shapes with --gauge shape."
+            )
         meshes: list[Mesh] = []
         for at, row in enumerate(fits):
             mesh = results.surface(row.name, options.surfaces)
@@ -186,7 +192,10 @@ def _of_results(
             if on_shape is not None:
                 on_shape(at + 1, len(fits))
         cohort = replace(
-            Cohort.of_meshes(meshes, stated, options.gauge), fitted=fitted, landmarks=dict(model.landmarks)
+            Cohort.of_meshes(meshes, stated, options.gauge),
+            fitted=fitted,
+            landmarks=dict(model.landmarks),
+            sizes_mm=sizes,
         )
     return replace(cohort, notes=(*notes, *cohort.notes))
 
