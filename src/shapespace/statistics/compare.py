@@ -146,7 +146,7 @@ class Effect:
     @property
     def label(self) -> str:
         """What is compared, in words."""
-        return f"{self.low} to {self.high}"
+        return f"{self.low} to {self.high.removeprefix(f'{self.name} ')}"
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ def _families(design: Design, stratum: Stratum) -> Iterator[_Family]:
         change = [design.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
         both = {one.column, other.column}
         beside = tuple(term for term in stratum.terms if not both <= term.variables)
-        what = f"{one.told(low)} to {one.told(high)}"
+        what = _told(one, low, high)
         ends = _Ends(f"{what} at {other.told(first)}", f"the same at {other.told(second)}", change[1] - change[0])
         yield _Family(f"{one.name}:{other.name}", stratum, beside, (ends,))
 
@@ -344,6 +344,10 @@ def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, floa
     if variable.levels:
         return list(itertools.combinations(variable.levels[:_MOST_LEVELS], 2))
     return [(variable.low, variable.high)]
+
+
+def _told(one: Variable, low: str | float, high: str | float) -> str:
+    return f"{one.told(low)} to {one.told(high).removeprefix(f'{one.name} ')}"
 
 
 def _interacting(design: Design, stratum: Stratum) -> Iterator[tuple[Variable, Variable]]:
@@ -408,7 +412,7 @@ def _parallel(design: Design, strata: Sequence[Stratum], options: CompareOptions
             drawn.append(np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(contrast), products))
         for first, second in itertools.combinations(range(len(drawn)), 2):
             angles = _angles(drawn[first], drawn[second])
-            names = [f"{one.told(low)} to {one.told(high)}, {other.told(other.levels[at])}" for at in (first, second)]
+            names = [f"{_told(one, low, high)}, {other.told(other.levels[at])}" for at in (first, second)]
             yield Angle(names[0], names[1], float(angles[0]), float((angles >= angles[0] - _TIE).mean()))
 
 

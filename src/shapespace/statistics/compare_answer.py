@@ -30,6 +30,7 @@ _SHOWN_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
 _TIMES = (1, 2, 3, 5, 10, 20, 50)
 _BINS = 40
+_PALE = "Vertices that are not found to differ are pale."
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
@@ -58,6 +59,7 @@ def answer_of(comparison: Comparison) -> Answer:
             "blocks": comparison.options.blocks,
             "permutations": comparison.options.permutations,
             "seed": comparison.options.seed,
+            "bump_width_mm": comparison.options.bump_width_mm,
             "level": comparison.options.level,
             "gauge": comparison.cohort.gauge,
             "shapes": len(comparison.cohort),
@@ -79,16 +81,24 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     for effect in comparison.effects:
         if effect.map is None:
             continue
+        held = f"(family-wise {100 * level:g} %)"
         found = effect.map.shown.p_family <= level
         if found.any():
             mm = np.where(found, effect.map.shown_mm, 0.0)
             at = int(np.abs(mm).argmax())
             yield (
-                f"{effect.label}: {100 * found.mean():.1f} % of the vertices differ (family-wise {100 * level:g} %), "
-                f"by up to {mm[at]:+.2f} mm{_near(comparison.cohort, at)}."
+                f"{effect.label}: {100 * found.mean():.1f} % of the vertices differ {held}, by up to {mm[at]:+.2f} mm"
+                f"{_near(comparison.cohort, at)}."
             )
         else:
-            yield f"{effect.label}: no vertex differs (family-wise {100 * level:g} %)."
+            yield f"{effect.label}: no vertex is found to differ {held}."
+        if effect.map.bump is not None and effect.map.bump_mm is not None:
+            at = int(effect.map.bump.f.argmax())
+            if effect.map.bump.p_family[at] <= level:
+                mm = effect.map.bump_mm[at]
+                yield f"{effect.label}: a bump of {mm:+.2f} mm is found{_near(comparison.cohort, at)} {held}."
+            else:
+                yield f"{effect.label}: no bump is found beside how shapes vary {held}."
     yield from comparison.warnings
     of = f" of {comparison.subjects} subjects" if comparison.subjects < shapes else ""
     yield f"{shapes} shapes{of}, {comparison.options.permutations} arrangements, the observed one among them."
@@ -173,29 +183,25 @@ def _of_angles(comparison: Comparison) -> Iterator[Part]:
 
 def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part]:
     file, level = f"effect_{at}.npz", f"{100 * comparison.options.level:g} %"
-    title: str | None = effect.label
     yield TextPart(
-        title=title,
+        title=effect.label,
         level=2,
         text=f"The largest change is {_largest(comparison, effect)}."
         if effect.map is not None
         else f"The change is {effect.rms_mm:.2f} mm (RMS over vertices).",
     )
     if effect.map is not None:
-        for title, values, mask, signed in (
-            (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family", True),
-            (f"Along the normal, false discovery rate {level}", "normal_fdr", "normal_fdr_mask", True),
-            (f"In any direction, family-wise error {level}", "length_mm", "length_family", False),
+        kept = _arrays(comparison, effect)
+        for title, values, mask in (
+            (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
+            (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
+            (f"In any direction, family-wise error {level}", "length_mm", "length_family"),
+            (f"Bumps beside how shapes vary, family-wise error {level}", "bump_mm", "bump_family"),
         ):
-            if effect.map.along is None and signed:
-                continue
-            yield SurfaceMapPart(
-                title=title,
-                arrays=file,
-                values="normal_mm" if signed else values,
-                mask=mask.removesuffix("_mask"),
-                signed=signed,
-            )
+            if values in kept:
+                yield SurfaceMapPart(
+                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=_PALE
+                )
     if comparison.cohort.faces is not None:
         times = _times(comparison, effect)
         yield MorphPart(
@@ -241,9 +247,7 @@ def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
 
 def _times(comparison: Comparison, effect: Effect) -> int:
     cohort = comparison.cohort
-    moved = float(np.linalg.norm(effect.change @ cohort.basis.reshape(len(cohort.basis), -1)) or 1.0)
-    if effect.map is not None:
-        moved = float(effect.map.length_mm.max()) or 1.0
+    moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
     size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
     return max((one for one in _TIMES if one * moved <= _SHOWN_SHARE * size), default=1)
 
@@ -266,6 +270,9 @@ def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[
     if made.along is not None and made.normal_mm is not None:
         out["normal_mm"] = made.normal_mm
         named["normal"] = made.along
+    if made.bump is not None and made.bump_mm is not None:
+        out["bump_mm"] = made.bump_mm
+        named["bump"] = made.bump
     for name, test in named.items():
         out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}
         masks: dict[str, BoolArray] = {f"{name}_family": test.p_family <= level, f"{name}_fdr": test.q <= level}
@@ -282,10 +289,13 @@ def _meshes(comparison: Comparison) -> Iterator[tuple[str, Mesh]]:
 
 
 def _tables(comparison: Comparison) -> Mapping[str, Rows]:
-    terms = [(t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in comparison.tests]
+    terms: list[tuple[object, ...]] = [
+        (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in comparison.tests
+    ]
     for left in comparison.remainders:
-        terms.append(("residual", left.stratum, left.df, left.squares, left.squares / left.squares_total, *[""] * 3))
-        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, *[""] * 3))
+        share = left.squares / left.squares_total
+        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
+        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
     tables: dict[str, Rows] = {
         "terms.csv": (("term", "stratum", "df", "squares_mm2", "r2", "f", "z", "p"), terms),
         "effects.csv": (

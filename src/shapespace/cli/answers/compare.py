@@ -20,6 +20,8 @@ def add(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the arrangements")
     sub.add_argument("--level", type=float, default=0.05, metavar="P", help="of significance (default 0.05)")
     sub.add_argument("--no-maps", action="store_true", help="do not test each vertex")
+    sub.add_argument("--bumps", type=float, metavar="MM",
+                     help="of fits: also seek bumps of this width beside how shapes vary anyway")  # fmt: skip
     add_gauge(sub)
     sub.set_defaults(run=run)
 
@@ -36,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         permutations=arguments.permutations,
         seed=arguments.seed,
         maps=not arguments.no_maps,
+        bump_width_mm=arguments.bumps,
         level=arguments.level,
         drop_missing=arguments.drop_missing,
     )
