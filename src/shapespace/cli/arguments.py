@@ -98,6 +98,8 @@ def _add_data(commands: Any) -> None:
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.add_argument("--intensity", type=_intensities, default=(1.0,), metavar="LIST",
                        help="of bundled expressions, with commas between them: one is drawn for each")  # fmt: skip
+    faces.add_argument("--effect", type=float, metavar="MM",
+                       help="write a sex and an age too, and give men a chin that stands out by MM more")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
     organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
                   "shapespace data organs -o organs --count 40")  # fmt: skip

@@ -246,7 +246,7 @@ def compare(
         remainders=tuple(_remainder(stratum) for stratum in strata),
         effects=effects,
         angles=(*_parallel(design, strata, options), *_between(effects)),
-        warnings=tuple(_warnings(cohort, strata, options, subjects)),
+        warnings=(*_warnings(cohort, strata, options, subjects), *_uncentred(design, options)),
         subjects=len(set(subjects)) if subjects is not None else len(cohort),
     )
 
@@ -462,6 +462,16 @@ def _warnings(
             yield (
                 f"There are only {round(math.exp(stratum.log_arrangements))} arrangements"
                 f"{' ' + stratum.name if stratum.name else ''}, so no p can be small."
+            )
+
+
+def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
+    for one in design.variables:
+        apart = any(one.column in term.variables and len(term.variables) > 1 for term in design.terms)
+        if options.squares == "III" and apart and not one.levels and one.low * one.high > 0:
+            yield (
+                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
+                f"center({one.name}) in the formula, or take type II."
             )
 
 
