@@ -203,6 +203,7 @@ def test_the_face_alone_is_a_sheet_with_the_landmarks_of_the_face(faces, people)
     assert {"pronasale", "menton", "left_pupil"} <= set(face.landmarks) == set(faces.face_landmarks)
     for name, vertex in faces.face_landmarks.items():
         assert np.array_equal(face.vertices[vertex], whole.landmarks[name])
+        assert np.array_equal(face.landmarks[name], whole.landmarks[name])
     assert np.array_equal(np.unique(face.faces), np.arange(len(face.vertices)))
     edges, count = np.unique(np.sort(directed_edges(face.faces), axis=1), axis=0, return_counts=True)
     assert len(face.vertices) - len(edges) + len(face.faces) == 1  # a disc

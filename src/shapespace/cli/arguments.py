@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
-from shapespace.cli.answers import asymmetry, change, regress, score
+from shapespace.cli.answers import asymmetry, change, compare, regress, score
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -33,6 +33,10 @@ def parser() -> argparse.ArgumentParser:
     _add_report(commands)
     _add_view(commands)
     _add_recognise(commands)
+    compare.add(
+        _add(commands, "compare", "do groups differ, and with what: linear models of shape on covariates",
+             "shapespace compare people.csv --shapes fits --formula '~ sex + age' -o sex-and-age")
+    )  # fmt: skip
     change.add(
         _add(commands, "change", "what changed between visits of the same subjects, in mm, and what of it is noise",
              "shapespace change visits.csv -o change --order before,after --stable forehead.csv")
@@ -110,6 +114,8 @@ def _add_data(commands: Any) -> None:
                        help="bundled people who vary as widely as real ones, for models of real scans")  # fmt: skip
     faces.add_argument("--intensity", type=_intensities, default=(1.0,), metavar="LIST",
                        help="of bundled expressions, with commas between them: one is drawn for each")  # fmt: skip
+    faces.add_argument("--effect", type=float, metavar="MM",
+                       help="write a sex and an age too, and give men a chin that stands out by MM more")  # fmt: skip
     faces.set_defaults(run=run.data_faces)
     organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
                   "shapespace data organs -o organs --count 40")  # fmt: skip

@@ -98,6 +98,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         raw=arguments.raw,
         wide=arguments.wide,
         intensities=arguments.intensity,
+        effect_mm=arguments.effect,
     )
     if arguments.json:
         show_json({"folder": str(arguments.output), "faces": count})

@@ -41,11 +41,12 @@ def write_simulated_faces(
     raw: bool = False,
     wide: bool = False,
     intensities: Sequence[float] = (1.0,),
+    effect_mm: float | None = None,
 ) -> int:
     """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
 
     Raises:
-        InputError: an unknown expression or area, intensities that cannot be, or wide people of
+        InputError: an unknown expression or area, intensities that cannot be, or wide people or an effect of
             ICT-FaceKit.
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
@@ -59,6 +60,8 @@ def write_simulated_faces(
         raise InputError("People of ICT-FaceKit vary as widely as real ones already; leave --wide out.")
     if tuple(intensities) != (1.0,) and source == "ict-facekit":
         raise InputError("Expressions of ICT-FaceKit are written at full intensity; leave --intensity out.")
+    if effect_mm is not None and source == "ict-facekit":
+        raise InputError("Effects of sex are put in bundled people only; leave --effect out.")
     make_folder(folder)
     total = subjects * len(expressions)
     with progress(total, "writing", "face", quiet=quiet) as bar:
@@ -75,7 +78,8 @@ def write_simulated_faces(
         else:
             face_files.write_faces(
                 folder, subjects=subjects, expressions=expressions, seed=seed, raw=raw, wide=wide,
-                face_only=area == "face", intensities=intensities, progress=step,
+                face_only=area == "face", intensities=intensities, effect_mm=effect_mm,
+                progress=step,
             )  # fmt: skip
     licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else (LICENSE, "shapespace")
     who = "people who vary widely" if wide else "people"

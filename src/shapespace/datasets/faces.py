@@ -291,8 +291,8 @@ class FaceGenerator:
         Models of it follow scans that show hair, a collar or no more than the face.
         """
         used, triangles = self._face_part
-        points = {k: mesh.vertices[v] for k, v in self.face_landmarks.items()}
-        return Mesh(mesh.vertices[used], triangles, points, mesh.name)
+        left = mesh.vertices[used]
+        return Mesh(left, triangles, {k: left[v] for k, v in self.face_landmarks.items()}, mesh.name)
 
     @cached_property
     def face_landmarks(self) -> Mapping[str, int]:

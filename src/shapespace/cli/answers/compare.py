@@ -1,0 +1,53 @@
+"""`shapespace compare`: do groups differ, and with what."""
+
+from __future__ import annotations
+
+import argparse
+
+from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
+
+
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_cohort(sub)
+    sub.add_argument("--formula", required=True, metavar="FORMULA",
+                     help="what explains shape, such as '~ sex + age'; size and log_size are known too")  # fmt: skip
+    sub.add_argument("--blocks", metavar="COLUMN", help="says whose scans are repeated ones, such as subject")
+    sub.add_argument("--type", choices=("I", "II", "III"), default="II", dest="squares",
+                     help="of sums of squares (default II: after all terms that do not contain it)")  # fmt: skip
+    sub.add_argument("--permutations", type=int, default=1000, metavar="N",
+                     help="arrangements, the observed one among them (default 1000)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the arrangements")
+    sub.add_argument("--level", type=float, default=0.05, metavar="P", help="of significance (default 0.05)")
+    sub.add_argument("--no-maps", action="store_true", help="do not test each vertex")
+    sub.add_argument("--bumps", type=float, metavar="MM",
+                     help="of fits: also seek bumps of this width beside how shapes vary anyway")  # fmt: skip
+    add_gauge(sub)
+    sub.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare the shapes of a cohort."""
+    from shapespace.batch.progress import progress
+    from shapespace.statistics.compare import CompareOptions, compare
+    from shapespace.statistics.compare_answer import answer_of
+
+    options = CompareOptions(
+        squares=arguments.squares,
+        blocks=arguments.blocks,
+        permutations=arguments.permutations,
+        seed=arguments.seed,
+        maps=not arguments.no_maps,
+        bump_width_mm=arguments.bumps,
+        level=arguments.level,
+        drop_missing=arguments.drop_missing,
+    )
+    cohort = cohort_of(arguments)
+    with progress(None, "permuting", "step", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = compare(cohort, arguments.formula, options, on_step=step)
+    return finish(answer_of(found), arguments)

@@ -1,0 +1,499 @@
+"""Do groups differ, and with what: linear models of shape on covariates, tested by permutation of residuals.
+
+Collyer and Adams, RRPP, Methods in Ecology and Evolution 9, 2018; Freedman and Lane, J. Business & Economic Statistics
+1(4), 1983; Goodall, JRSS B 53(2), 1991.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort, with_columns
+from shapespace.errors import InputError
+from shapespace.statistics.compare_formula import Design, Term, Variable, columns_of, design_of
+from shapespace.statistics.compare_maps import EffectMap, effect_maps
+from shapespace.statistics.compare_strata import Stratum, less, strata_of
+from shapespace.types import FloatArray, read_only
+
+SquaresType: TypeAlias = Literal["I", "II", "III"]
+TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
+"""Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
+
+_RANK = 1e-9
+_TIE = 1e-9
+_MOST_LEVELS = 6
+_FEWEST = 20
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """How groups are compared.
+
+    Args:
+        squares: one of `TYPES`.
+        blocks: column that says whose scans are repeated ones; None takes all shapes for independent.
+        permutations: arrangements, the observed one among them.
+        seed: of the arrangements.
+        maps: whether to test each vertex.
+        bump_width_mm: also seek, at each vertex, a bump along the normals of this standard deviation, beside how shapes
+            vary anyway; None does not. It is for fits, whose model knows how shapes vary.
+        level: of significance.
+        drop_missing: leave out shapes of which something in the formula is missing, and say so.
+    """
+
+    squares: SquaresType = "II"
+    blocks: str | None = None
+    permutations: int = 1000
+    seed: int = 0
+    maps: bool = True
+    bump_width_mm: float | None = None
+    level: float = 0.05
+    drop_missing: bool = False
+
+    def __post_init__(self) -> None:
+        if self.squares not in TYPES:
+            raise InputError(f"There is no type {self.squares!r} of sums of squares; choose one of {', '.join(TYPES)}.")
+        if not 20 <= self.permutations <= 1_000_000:
+            raise InputError(f"The number of permutations must lie from 20 to 1000000, not at {self.permutations}.")
+        if self.seed < 0 or not 0 < self.level < 1:
+            raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
+        if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
+            raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TermTest:
+    """A row of the Procrustes analysis of variance.
+
+    Args:
+        term: as it is called.
+        stratum: in which it is tested; empty where there is one.
+        df: degrees of freedom.
+        squares: sum of squares, mm².
+        r2: its share of the total of the stratum.
+        f: mean square by that of the residuals.
+        z: how many standard deviations log F lies above those of the arrangements.
+        p: share of arrangements with an F as large, the observed one among them.
+        arrangements: (P,) F of each, the observed one first.
+    """
+
+    term: str
+    stratum: str
+    df: int
+    squares: float
+    r2: float
+    f: float
+    z: float
+    p: float
+    arrangements: FloatArray
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """Residuals and total of a stratum: degrees of freedom, and sums of squares in mm²."""
+
+    stratum: str
+    df: int
+    squares: float
+    df_total: int
+    squares_total: float
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What differs between two values of a variable, all other variables being the same.
+
+    Args:
+        name: of the variable, or of two that interact.
+        low: what the change is from, such as `sex female`.
+        high: what it is to.
+        stratum: in which it is tested.
+        change: (K,) mm, as coefficients of the cohort; from low to high.
+        at_low: (K,) the shape at low.
+        at_high: (K,) the shape at high.
+        distance_mm: Procrustes distance, the root of the squared changes summed over vertices.
+        rms_mm: root of their mean.
+        f: squared distance by its variance.
+        z: how many standard deviations log F lies above those of the arrangements.
+        p: share of arrangements with an F as large.
+        p_family: the same by the largest F of all pairs of classes of this variable.
+        map: vertex by vertex; None where it was not asked for.
+    """
+
+    name: str
+    low: str
+    high: str
+    stratum: str
+    change: FloatArray
+    at_low: FloatArray
+    at_high: FloatArray
+    distance_mm: float
+    rms_mm: float
+    f: float
+    z: float
+    p: float
+    p_family: float
+    map: EffectMap | None = None
+
+    @property
+    def label(self) -> str:
+        """What is compared, in words."""
+        return f"{self.low} to {self.high.removeprefix(f'{self.name} ')}"
+
+
+@dataclass(frozen=True)
+class Angle:
+    """The angle between two changes of shape; `p` tests whether they are parallel, None where that is not asked."""
+
+    first: str
+    second: str
+    degrees: float
+    p: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A linear model of shapes on covariates, with its tests.
+
+    Args:
+        cohort: whose shapes they are, as far as they were used.
+        design: the columns.
+        options: how they were compared.
+        tests: of the terms.
+        remainders: of the strata.
+        effects: of the variables, and of pairs of them that interact.
+        angles: between effects.
+        warnings: what makes the numbers less than they look, a sentence each.
+        subjects: number of subjects; that of shapes where all are independent.
+    """
+
+    cohort: Cohort
+    design: Design
+    options: CompareOptions
+    tests: tuple[TermTest, ...]
+    remainders: tuple[Remainder, ...]
+    effects: tuple[Effect, ...]
+    angles: tuple[Angle, ...]
+    warnings: tuple[str, ...]
+    subjects: int
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """(K,) of the shapes."""
+        return read_only(self.cohort.coefficients.mean(axis=0))
+
+    def test(self, term: str) -> TermTest:
+        """Return the test of a term.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        found = [one for one in self.tests if one.term == term]
+        if not found:
+            raise InputError(f"There is no term {term!r}; there is {', '.join(one.term for one in self.tests)}.")
+        return found[0]
+
+
+def compare(
+    cohort: Cohort,
+    formula: str,
+    options: CompareOptions | None = None,
+    *,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Return the linear model of a cohort's shapes on what the formula names, tested by permutation of residuals.
+
+    `size` and `log_size`, the centroid size in mm and its logarithm, may stand in the formula beside the columns of the
+    table.
+
+    Args:
+        cohort: the shapes and their table.
+        formula: such as `~ sex + age`.
+        options: None for the defaults.
+        on_step: called with (done, total).
+
+    Raises:
+        InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
+            covariate, terms that follow from others, or more columns than shapes.
+        ShapespaceError: the extra `statistics` is not installed.
+    """
+    options = options or CompareOptions()
+    cohort = _with_sizes(cohort)
+    named = columns_of(formula, cohort.table)
+    cohort = cohort.complete([*named, *([options.blocks] if options.blocks else ())], drop_missing=options.drop_missing)
+    design = design_of(formula, cohort.table)
+    subjects = None if options.blocks is None else cohort.table.texts(options.blocks)
+    repeated = subjects is not None and len(set(subjects)) < len(subjects)
+    strata = strata_of(cohort.coefficients, design, subjects if repeated else None, options.blocks or "")
+    families = [family for stratum in strata for family in _families(design, stratum)]
+    total = len(design.terms) + len(families) * (1 + options.maps)
+    step = _Steps(total, on_step)
+    tests = tuple(test for stratum in strata for test in _tests(stratum, options, step))
+    effects = tuple(e for family in families for e in _effects(cohort, family, options, step))
+    return Comparison(
+        cohort=cohort,
+        design=design,
+        options=options,
+        tests=tests,
+        remainders=tuple(_remainder(stratum) for stratum in strata),
+        effects=effects,
+        angles=(*_parallel(design, strata, options), *_between(effects)),
+        warnings=(*_warnings(cohort, strata, options, subjects), *_uncentred(design, options)),
+        subjects=len(set(subjects)) if subjects is not None else len(cohort),
+    )
+
+
+class _Steps:
+    def __init__(self, total: int, tell: Callable[[int, int], None] | None) -> None:
+        self.done, self.total, self.tell = 0, total, tell
+
+    def __call__(self) -> None:
+        self.done += 1
+        if self.tell is not None:
+            self.tell(self.done, self.total)
+
+
+def _with_sizes(cohort: Cohort) -> Cohort:
+    sizes = {"size": cohort.sizes_mm, "log_size": np.log(cohort.sizes_mm)}
+    return with_columns(cohort, {name: v for name, v in sizes.items() if name not in cohort.table.columns})
+
+
+def _tests(stratum: Stratum, options: CompareOptions, step: Callable[[], None]) -> Iterator[TermTest]:
+    total = float((stratum.shapes**2).sum())
+    for at, term in enumerate(stratum.terms):
+        reduced = _reduced(term, at, stratum.terms, options.squares)
+        residual = stratum.residual(reduced)
+        own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
+        rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
+        products = stratum.products(np.hstack([own, rest]), residual, options.permutations, options.seed)
+        squares = (products**2).sum(axis=2)
+        df = own.shape[1]
+        explained = squares[:, :df].sum(axis=1)
+        f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)
+        yield TermTest(
+            term.label, stratum.name, df, float(explained[0]), float(explained[0] / total), float(f[0]), effect_size(f),
+            _share(f), read_only(f),
+        )  # fmt: skip
+        step()
+
+
+def _reduced(term: Term, at: int, terms: Sequence[Term], squares: SquaresType) -> list[Term]:
+    """Return the terms that a term is tested beside."""
+    if squares == "I":
+        return list(terms[:at])
+    others = [other for other in terms if other is not term]
+    return others if squares == "III" else [other for other in others if not term.factors < other.factors]
+
+
+def _remainder(stratum: Stratum) -> Remainder:
+    left = stratum.residual(stratum.terms)
+    return Remainder(
+        stratum.name, stratum.df_error, float((left**2).sum()), len(stratum.matrix) - stratum.removed,
+        float((stratum.shapes**2).sum()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    low: str
+    high: str
+    contrast: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Family:
+    """Contrasts that are tested beside the same other terms."""
+
+    name: str
+    stratum: Stratum
+    beside: tuple[Term, ...]
+    ends: tuple[_Ends, ...]
+
+
+def _families(design: Design, stratum: Stratum) -> Iterator[_Family]:
+    for one in design.variables:
+        alone = [term for term in design.terms if term.variables == frozenset({one.column})]
+        wanted = alone or [term for term in design.terms if one.column in term.variables]
+        if any(term in stratum.terms for term in wanted):
+            beside = tuple(term for term in stratum.terms if one.column not in term.variables)
+            ends = [
+                _Ends(one.told(low), one.told(high), design.contrast(one.column, low, high))
+                for low, high in _pairs(one)
+            ]
+            yield _Family(one.name, stratum, beside, tuple(ends))
+    for one, other in _interacting(design, stratum):
+        (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
+        change = [design.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
+        both = {one.column, other.column}
+        beside = tuple(term for term in stratum.terms if not both <= term.variables)
+        what = _told(one, low, high)
+        ends = _Ends(f"{what} at {other.told(first)}", f"the same at {other.told(second)}", change[1] - change[0])
+        yield _Family(f"{one.name}:{other.name}", stratum, beside, (ends,))
+
+
+def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, float]]:
+    """Return the pairs of values between which a change is shown."""
+    if variable.levels:
+        return list(itertools.combinations(variable.levels[:_MOST_LEVELS], 2))
+    return [(variable.low, variable.high)]
+
+
+def _told(one: Variable, low: str | float, high: str | float) -> str:
+    return f"{one.told(low)} to {one.told(high).removeprefix(f'{one.name} ')}"
+
+
+def _interacting(design: Design, stratum: Stratum) -> Iterator[tuple[Variable, Variable]]:
+    """Yield pairs of variables with one change each that share a term of this stratum."""
+    for one, other in itertools.combinations(design.variables, 2):
+        together = any({one.column, other.column} <= term.variables for term in stratum.terms)
+        if together and len(one.levels) <= 2 and len(other.levels) <= 2:
+            yield one, other
+
+
+def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Callable[[], None]) -> Iterator[Effect]:
+    stratum = family.stratum
+    residual = stratum.residual(family.beside)
+    directions = np.stack([stratum.direction(ends.contrast) for ends in family.ends])
+    lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
+    along = (directions / lengths[:, None]) @ stratum.basis
+    products = stratum.products(stratum.basis, residual, options.permutations, options.seed)
+    error = ((residual**2).sum() - (products**2).sum(axis=(1, 2))) / stratum.df_error
+    f = np.stack([_ratio((np.einsum("m,pmk->pk", a, products) ** 2).sum(axis=1), error) for a in along])
+    largest = f.max(axis=0)
+    changes = directions @ stratum.shapes
+    step()
+    maps: Iterable[EffectMap | None] = itertools.repeat(None)
+    if options.maps:
+        maps = effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
+        step()
+    mean = cohort.coefficients.mean(axis=0)
+    for at, (ends, made) in enumerate(zip(family.ends, maps, strict=False)):
+        distance = float(np.linalg.norm(changes[at]))
+        yield Effect(
+            name=family.name,
+            low=ends.low,
+            high=ends.high,
+            stratum=stratum.name,
+            change=read_only(changes[at]),
+            at_low=read_only(mean - changes[at] / 2),
+            at_high=read_only(mean + changes[at] / 2),
+            distance_mm=distance,
+            rms_mm=distance / math.sqrt(cohort.n_vertices),
+            f=float(f[at, 0]),
+            z=effect_size(f[at]),
+            p=_share(f[at]),
+            p_family=float((largest >= f[at, 0] * (1 - _TIE)).mean()),
+            map=made,
+        )
+
+
+def _parallel(design: Design, strata: Sequence[Stratum], options: CompareOptions) -> Iterator[Angle]:
+    """Yield angles between what a variable changes in one class of another and in the next, where they interact.
+
+    The arrangements are those of the model without the interaction, where these changes are the same.
+    """
+    for stratum, one, other in _changes_by_class(design, strata):
+        low, high = _pairs(one)[0]
+        beside = [term for term in stratum.terms if not {one.column, other.column} <= term.variables]
+        residual = stratum.residual(beside)
+        products = stratum.products(stratum.basis, residual, options.permutations, options.seed)
+        products += stratum.basis.T @ (stratum.shapes - residual)
+        drawn: list[FloatArray] = []
+        for level in other.levels[:_MOST_LEVELS]:
+            contrast = design.contrast(one.column, low, high, {other.column: level})
+            drawn.append(np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(contrast), products))
+        for first, second in itertools.combinations(range(len(drawn)), 2):
+            angles = _angles(drawn[first], drawn[second])
+            names = [f"{_told(one, low, high)}, {other.told(other.levels[at])}" for at in (first, second)]
+            yield Angle(names[0], names[1], float(angles[0]), float((angles >= angles[0] - _TIE).mean()))
+
+
+def _changes_by_class(design: Design, strata: Sequence[Stratum]) -> Iterator[tuple[Stratum, Variable, Variable]]:
+    for stratum in strata:
+        for one, other in itertools.permutations(design.variables, 2):
+            together = any(term.variables == frozenset({one.column, other.column}) for term in stratum.terms)
+            main = any(term.variables == frozenset({one.column}) for term in stratum.terms)
+            if together and main and len(one.levels) <= 2 and other.levels:
+                yield stratum, one, other
+
+
+def _between(effects: Sequence[Effect]) -> Iterator[Angle]:
+    """Yield angles between the effects of different variables."""
+    for one, other in itertools.combinations(effects, 2):
+        if one.name != other.name and ":" not in one.name + other.name:
+            angle = float(_angles(one.change[None], other.change[None])[0])
+            yield Angle(one.label, other.label, angle, None)
+
+
+def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the (P,) angles in degrees of vectors (P, K)."""
+    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
+
+
+def _warnings(
+    cohort: Cohort, strata: Sequence[Stratum], options: CompareOptions, subjects: Sequence[str] | None
+) -> Iterator[str]:
+    own = cohort.table.columns.get("subject", ())
+    if subjects is None and all(own) and len(set(own)) < len(own):
+        yield (
+            f"The {len(own)} shapes are of {len(set(own))} subjects and are taken for independent, which makes "
+            "differences look surer than they are; say --blocks subject."
+        )
+    if subjects is not None:
+        counts = Counter(subjects)
+        if max(counts.values()) == 1:
+            yield f"No {options.blocks} has two shapes, so --blocks changes nothing."
+        elif len(set(counts.values())) > 1 and len(strata) and strata[0].name.startswith("between"):
+            yield (
+                f"There are {min(counts.values())} to {max(counts.values())} shapes of a {options.blocks}; each counts "
+                "once, by its mean, and p is approximate where means of few scans are noisier."
+            )
+    for stratum in strata:
+        if stratum.log_arrangements < math.log(_FEWEST):
+            yield (
+                f"There are only {round(math.exp(stratum.log_arrangements))} arrangements"
+                f"{' ' + stratum.name if stratum.name else ''}, so no p can be small."
+            )
+
+
+def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
+    for one in design.variables:
+        apart = any(one.column in term.variables and len(term.variables) > 1 for term in design.terms)
+        if options.squares == "III" and apart and not one.levels and one.low * one.high > 0:
+            yield (
+                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
+                f"center({one.name}) in the formula, or take type II."
+            )
+
+
+def effect_size(statistic: FloatArray) -> float:
+    """Return how many standard deviations the logarithm of the first of (P,) F lies above the mean of all.
+
+    Collyer, Sekora and Adams, Heredity 115, 2015. RRPP from 0.6 on makes them normal by a Box-Cox transform first.
+    """
+    logs = np.log(np.maximum(statistic, 1e-300))
+    spread = float(logs.std())
+    return float((logs[0] - logs.mean()) / spread) if spread > 0 else 0.0
+
+
+def _share(statistic: FloatArray) -> float:
+    return float((statistic >= statistic[0] * (1 - _TIE)).mean())
+
+
+def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:
+    return explained / np.maximum(left, 1e-300)
+
+
+def _span(columns: FloatArray, rank: int | None = None) -> FloatArray:
+    """Return orthonormal columns (n, r) that span those given."""
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, : int((s > _RANK * max(float(s.max(initial=0.0)), 1e-300)).sum()) if rank is None else rank]

@@ -1,0 +1,316 @@
+"""A comparison as an answer: sentences, tables, maps and morphs of its report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.schemas import (
+    Counts,
+    CurvePart,
+    HistogramPart,
+    MorphPart,
+    Part,
+    Series,
+    SurfaceMapPart,
+    TableColumn,
+    TablePart,
+    TextPart,
+)
+from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.compare import Comparison, Effect
+from shapespace.types import BoolArray, FloatArray, Mesh
+
+_SHOWN_SHARE = 0.05
+"""A morph shows changes exaggerated to about this share of the size."""
+_TIMES = (1, 2, 3, 5, 10, 20, 50)
+_BINS = 40
+_PALE = "Vertices that are not found to differ are pale."
+_NO_FACES = np.zeros((0, 3), dtype=np.int32)
+
+
+def answer_of(comparison: Comparison) -> Answer:
+    """Return a comparison with all that its report shows; files are numbered as its effects are."""
+    effects = comparison.effects
+    parts = [
+        *_of_terms(comparison),
+        *_of_pairs(comparison),
+        *_of_angles(comparison),
+        *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
+    ]
+    fitted = comparison.cohort.fitted
+    return Answer(
+        question="compare",
+        title=f"Shape {comparison.design.formula.strip()}",
+        summary=tuple(_summary(comparison)),
+        parts=tuple(parts),
+        tables=_tables(comparison),
+        arrays={f"effect_{at}.npz": _arrays(comparison, effect) for at, effect in enumerate(effects, 1)},
+        meshes=dict(_meshes(comparison)),
+        notes=comparison.cohort.notes,
+        settings={
+            "formula": comparison.design.formula,
+            "squares": comparison.options.squares,
+            "blocks": comparison.options.blocks,
+            "permutations": comparison.options.permutations,
+            "seed": comparison.options.seed,
+            "bump_width_mm": comparison.options.bump_width_mm,
+            "level": comparison.options.level,
+            "gauge": comparison.cohort.gauge,
+            "shapes": len(comparison.cohort),
+            "subjects": comparison.subjects,
+        },
+        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+    )
+
+
+def _summary(comparison: Comparison) -> Iterator[str]:
+    level, shapes = comparison.options.level, len(comparison.cohort)
+    for test in comparison.tests:
+        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
+        where = f" {test.stratum}" if test.stratum else ""
+        if test.p <= level:
+            yield f"Shape differs with {test.term}{where} ({told})."
+        else:
+            yield f"No difference of shape with {test.term}{where} is found ({told})."
+    for effect in comparison.effects:
+        if effect.map is None:
+            continue
+        held = f"(family-wise {100 * level:g} %)"
+        found = effect.map.shown.p_family <= level
+        if found.any():
+            mm = np.where(found, effect.map.shown_mm, 0.0)
+            at = int(np.abs(mm).argmax())
+            yield (
+                f"{effect.label}: {100 * found.mean():.1f} % of the vertices differ {held}, by up to {mm[at]:+.2f} mm"
+                f"{_near(comparison.cohort, at)}."
+            )
+        else:
+            yield f"{effect.label}: no vertex is found to differ {held}."
+        if effect.map.bump is not None and effect.map.bump_mm is not None:
+            at = int(effect.map.bump.f.argmax())
+            if effect.map.bump.p_family[at] <= level:
+                mm = effect.map.bump_mm[at]
+                yield f"{effect.label}: a bump of {mm:+.2f} mm is found{_near(comparison.cohort, at)} {held}."
+            else:
+                yield f"{effect.label}: no bump is found beside how shapes vary {held}."
+    yield from comparison.warnings
+    of = f" of {comparison.subjects} subjects" if comparison.subjects < shapes else ""
+    yield f"{shapes} shapes{of}, {comparison.options.permutations} arrangements, the observed one among them."
+
+
+def _p(p: float) -> str:
+    return f"p {p:.3g}"
+
+
+def _near(cohort: Cohort, vertex: int) -> str:
+    """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
+    if not cohort.landmarks:
+        return ""
+    names, places = list(cohort.landmarks), np.array(list(cohort.landmarks.values()))
+    far = np.linalg.norm(cohort.reference[places] - cohort.reference[vertex], axis=1)
+    return f" near {names[int(far.argmin())]}"
+
+
+def _column(name: str, kind: Any = "text") -> TableColumn:
+    return TableColumn(name=name, kind=kind)
+
+
+def _of_terms(comparison: Comparison) -> Iterator[Part]:
+    strata = any(test.stratum for test in comparison.tests)
+    rows: list[tuple[Any, ...]] = []
+    for left in comparison.remainders:
+        own = [test for test in comparison.tests if test.stratum == left.stratum]
+        rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in own]
+        share = left.squares / left.squares_total
+        rows.append(("residual", left.stratum, left.df, left.squares, left.squares / left.df, share, *[None] * 3))
+        rows.append(("total", left.stratum, left.df_total, left.squares_total, None, None, *[None] * 3))
+    columns = (
+        _column("term"), _column("tested"), _column("df", "count"), _column("sum of squares, mm²", "number"),
+        _column("mean square, mm²", "number"), _column("R²", "percent"), _column("F", "number"),
+        _column("Z", "number"), _column("p", "p"),
+    )  # fmt: skip
+    if not strata:
+        columns = (*columns[:1], *columns[2:])
+        rows = [(*row[:1], *row[2:]) for row in rows]
+    note = (
+        f"Type {comparison.options.squares} sums of squares of Procrustes distances, by permutation of residuals. Z is "
+        "by how many standard deviations log F lies above those of the arrangements."
+    )
+    yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
+    for test in comparison.tests:
+        f = np.log10(np.maximum(test.arrangements, 1e-12))
+        counts, edges = np.histogram(f, bins=_BINS)
+        yield HistogramPart(
+            title=f"F of {test.term} among its arrangements",
+            edges=_floats(edges),
+            series=(Counts(counts=_floats(counts), label="arrangements"),),
+            x="log10 F",
+            observed=float(f[0]),
+            observed_label="observed",
+        )
+
+
+def _of_pairs(comparison: Comparison) -> Iterator[Part]:
+    rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in comparison.effects)
+    yield TablePart(
+        title="How far apart",
+        level=2,
+        note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
+        "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
+        columns=(
+            _column("variable"), _column("from, to"), _column("Procrustes distance", "mm"), _column("RMS", "mm"),
+            _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
+        ),
+        rows=rows,
+    )  # fmt: skip
+
+
+def _of_angles(comparison: Comparison) -> Iterator[Part]:
+    if comparison.angles:
+        yield TablePart(
+            title="Angles between changes of shape",
+            note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes.",
+            columns=(_column("one"), _column("other"), _column("angle, degrees", "number"), _column("p", "p")),
+            rows=tuple((a.first, a.second, a.degrees, a.p) for a in comparison.angles),
+        )
+
+
+def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part]:
+    file, level = f"effect_{at}.npz", f"{100 * comparison.options.level:g} %"
+    yield TextPart(
+        title=effect.label,
+        level=2,
+        text=f"The largest change is {_largest(comparison, effect)}."
+        if effect.map is not None
+        else f"The change is {effect.rms_mm:.2f} mm (RMS over vertices).",
+    )
+    if effect.map is not None:
+        kept = _arrays(comparison, effect)
+        for title, values, mask in (
+            (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
+            (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
+            (f"In any direction, family-wise error {level}", "length_mm", "length_family"),
+            (f"Bumps beside how shapes vary, family-wise error {level}", "bump_mm", "bump_family"),
+        ):
+            if values in kept:
+                yield SurfaceMapPart(
+                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=_PALE
+                )
+    if comparison.cohort.faces is not None:
+        times = _times(comparison, effect)
+        yield MorphPart(
+            title="From low to high",
+            note="" if times == 1 else f"Exaggerated {times} times.",
+            arrays=file,
+            low_label=effect.low,
+            high_label=effect.high,
+            times=float(times),
+        )
+    yield from _of_scores(comparison, effect)
+
+
+def _largest(comparison: Comparison, effect: Effect) -> str:
+    assert effect.map is not None
+    mm = effect.map.shown_mm
+    at = int(np.abs(mm).argmax())
+    way = "" if effect.map.normal_mm is None else ", outwards" if mm[at] > 0 else ", inwards"
+    return f"{abs(mm[at]):.2f} mm{way}{_near(comparison.cohort, at)}"
+
+
+def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
+    """Yield regression scores against a number: shapes projected on what it changes."""
+    one = next((v for v in comparison.design.variables if v.name == effect.name and not v.levels), None)
+    length = float(np.linalg.norm(effect.change))
+    if one is None or length == 0:
+        return
+    x = np.array(comparison.design.values[one.column], dtype=np.float64)
+    y = (comparison.cohort.coefficients - comparison.mean) @ effect.change / length
+    slope = length / (one.high - one.low)
+    ends = np.array([one.low, one.high])
+    yield CurvePart(
+        title=f"Regression score of {one.name}",
+        note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
+        x=one.name,
+        y="score, mm",
+        series=(
+            Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
+            Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
+        ),
+    )
+
+
+def _times(comparison: Comparison, effect: Effect) -> int:
+    cohort = comparison.cohort
+    moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
+    size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
+    return max((one for one in _TIMES if one * moved <= _SHOWN_SHARE * size), default=1)
+
+
+def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[Any]]:
+    cohort, level = comparison.cohort, comparison.options.level
+    times = _times(comparison, effect)
+    half = (times - 1) / 2 * effect.change
+    out: dict[str, npt.NDArray[Any]] = {
+        "vertices": cohort.vertices(comparison.mean),
+        "faces": _NO_FACES if cohort.faces is None else cohort.faces,
+        "low": cohort.vertices(effect.at_low - half),
+        "high": cohort.vertices(effect.at_high + half),
+    }
+    made = effect.map
+    if made is None:
+        return out
+    out |= {"change_mm": made.change_mm, "length_mm": made.length_mm}
+    named = {"length": made.any_way}
+    if made.along is not None and made.normal_mm is not None:
+        out["normal_mm"] = made.normal_mm
+        named["normal"] = made.along
+    if made.bump is not None and made.bump_mm is not None:
+        out["bump_mm"] = made.bump_mm
+        named["bump"] = made.bump
+    for name, test in named.items():
+        out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}
+        masks: dict[str, BoolArray] = {f"{name}_family": test.p_family <= level, f"{name}_fdr": test.q <= level}
+        out |= masks
+    return out
+
+
+def _meshes(comparison: Comparison) -> Iterator[tuple[str, Mesh]]:
+    if comparison.cohort.faces is None:
+        return
+    for at, effect in enumerate(comparison.effects, 1):
+        for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
+            yield f"effect_{at}_{end}.ply", comparison.cohort.mesh(shape, name)
+
+
+def _tables(comparison: Comparison) -> Mapping[str, Rows]:
+    terms: list[tuple[object, ...]] = [
+        (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in comparison.tests
+    ]
+    for left in comparison.remainders:
+        share = left.squares / left.squares_total
+        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
+        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
+    tables: dict[str, Rows] = {
+        "terms.csv": (("term", "stratum", "df", "squares_mm2", "r2", "f", "z", "p"), terms),
+        "effects.csv": (
+            ("number", "variable", "from", "to", "stratum", "distance_mm", "rms_mm", "f", "z", "p", "p_of_all_pairs"),
+            [
+                (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
+                for at, e in enumerate(comparison.effects, 1)
+            ],
+        ),
+    }
+    if comparison.angles:
+        rows = [(a.first, a.second, a.degrees, "" if a.p is None else a.p) for a in comparison.angles]
+        tables["angles.csv"] = (("first", "second", "degrees", "p"), rows)
+    return tables
+
+
+def _floats(values: FloatArray | npt.NDArray[np.int64] | Sequence[float]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

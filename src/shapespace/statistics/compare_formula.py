@@ -1,0 +1,354 @@
+"""A formula such as `~ sex + age` to the columns of a linear model: its terms, and contrasts between values.
+
+Only names of columns and a few functions may stand in a formula, so it runs nothing but what it says. Columns and
+coding are formulaic's; classes are coded by deviations (sum to zero), so that type III tests mean something.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.table import Table
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.late import other_package
+from shapespace.types import FloatArray, read_only
+
+INSTALL = "'shapespace[statistics]'"
+FUNCTIONS: Mapping[str, str] = {
+    "C": "classes, where a column holds their numbers",
+    "log": "natural logarithm",
+    "log10": "decimal logarithm",
+    "sqrt": "square root",
+    "center": "less its mean",
+    "scale": "less its mean, in standard deviations",
+    "poly": "orthogonal polynomial, poly(age, 2)",
+    "bs": "B-spline, bs(age, df=4)",
+}
+"""What a formula may call, and what it is."""
+
+_LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
+_MOST_CELLS = 100_000
+_PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
+_POWER = re.compile(r"\*\*|\^")
+_ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
+_CONTEXT = {"sqrt": np.sqrt}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A column that a formula names, as numbers or as classes.
+
+    Args:
+        name: of the column; in C() where its numbers are taken for classes.
+        column: its name inside.
+        levels: classes in order; none of numbers.
+        low: 5th percentile of numbers.
+        high: 95th percentile.
+        middle: their mean.
+    """
+
+    name: str
+    column: str
+    levels: tuple[str, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+    middle: float = 0.0
+
+    def told(self, value: str | float) -> str:
+        """Return a value in words, such as `sex female` or `age 61`."""
+        return f"{self.name} {value}" if isinstance(value, str) else f"{self.name} {value:.4g}"
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of a formula.
+
+    Args:
+        label: as it is called.
+        factors: what is multiplied in it, as written.
+        variables: of them, by their names inside.
+        columns: of the design.
+    """
+
+    label: str
+    factors: frozenset[str]
+    variables: frozenset[str]
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """The columns of a linear model beside the intercept.
+
+    Args:
+        formula: as it was given.
+        matrix: (N, p).
+        terms: of it, those of fewer variables first.
+        variables: that it names.
+        values: N of each variable, by its name inside.
+    """
+
+    formula: str
+    matrix: FloatArray
+    terms: tuple[Term, ...]
+    variables: tuple[Variable, ...]
+    values: Mapping[str, Sequence[str | float]]
+    _spec: Any = field(repr=False)
+
+    def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
+        """Return the (n, p) columns where each variable, by its name inside, has these n values."""
+        pandas = other_package("pandas", "A formula", INSTALL)
+        frame: dict[str, Any] = {}
+        for one in self.variables:
+            own = list(values[one.column])
+            frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
+        made = self._spec.get_model_matrix(pandas.DataFrame(frame), context=_CONTEXT)
+        return np.asarray(made, dtype=np.float64)[:, 1:]
+
+    def with_held(self, held: Collection[str]) -> FloatArray:
+        """Return `matrix` as it were if some variables, by their names inside, were the same in all rows.
+
+        Numbers are held at their mean, of classes it is the average.
+        """
+        own = [one for one in self.variables if one.column in held]
+        cells = _cells([one.levels or (one.middle,) for one in own], self.formula)
+        total = np.zeros(self.matrix.shape)
+        for cell in cells:
+            same = {one.column: [value] * len(total) for one, value in zip(own, cell, strict=True)}
+            total += self.rows({**self.values, **same})
+        return total / len(cells)
+
+    def contrast(
+        self, column: str, low: str | float, high: str | float, fixed: Mapping[str, str | float] | None = None
+    ) -> FloatArray:
+        """Return what `high` has more than `low` in each of the p columns, on an average of the other variables.
+
+        Classes of the others count alike, numbers stand at their mean; only others that share a term matter.
+
+        Args:
+            column: of the variable, by its name inside.
+            low: value.
+            high: value.
+            fixed: values of other variables, by their names inside.
+        """
+        held = dict(fixed or {})
+        beside = {name for term in self.terms if column in term.variables for name in term.variables}
+        choices: list[Sequence[str | float]] = []
+        for one in self.variables:
+            if one.column == column:
+                choices.append((low, high))
+            elif one.column in held:
+                choices.append((held[one.column],))
+            elif one.levels:
+                choices.append(one.levels if one.column in beside else one.levels[:1])
+            else:
+                choices.append((one.middle,))
+        cells = _cells(choices, self.formula)
+        values = {one.column: [cell[at] for cell in cells] for at, one in enumerate(self.variables)}
+        rows = self.rows(values)
+        at_high = np.array([value == high for value in values[column]])
+        return read_only(rows[at_high].mean(axis=0) - rows[~at_high].mean(axis=0))
+
+
+def _cells(choices: Sequence[Sequence[str | float]], formula: str) -> list[tuple[str | float, ...]]:
+    if np.prod([float(len(choice)) for choice in choices]) > _MOST_CELLS:
+        raise InputError(f"The classes in {formula!r} make too many combinations; leave out interactions.")
+    return list(itertools.product(*choices))
+
+
+def columns_of(formula: str, table: Table) -> tuple[str, ...]:
+    """Return the columns of the table that a formula names.
+
+    Raises:
+        InputError: it cannot be read, or names something else.
+        ShapespaceError: the extra `statistics` is not installed.
+    """
+    return tuple(dict.fromkeys(factor.name for term in _parsed(formula, table) for factor in term))
+
+
+def design_of(formula: str, table: Table) -> Design:
+    """Return the columns of a linear model of the rows of a table, in which nothing that is named is missing.
+
+    Raises:
+        InputError: the formula cannot be read, names something that is no column or calls something that is not in
+            `FUNCTIONS`; a column is the same for all, holds text where numbers should be, or gives no finite number.
+        ShapespaceError: the extra `statistics` is not installed.
+    """
+    parsed = _parsed(formula, table)
+    pandas = other_package("pandas", "A formula", INSTALL)
+    formulaic = other_package("formulaic", "A formula", INSTALL)
+    inside: dict[tuple[str, bool], Variable] = {}
+    frame: dict[str, Any] = {}
+    own_values: dict[str, Sequence[str | float]] = {}
+    for factor in itertools.chain.from_iterable(parsed):
+        classes = factor.holds_classes(table)
+        if (factor.name, classes) not in inside:
+            variable, values = _variable(table, factor.name, f"v{len(inside)}", classes=classes)
+            inside[factor.name, classes] = variable
+            own_values[variable.column] = values
+            frame[variable.column] = (
+                pandas.Categorical(values, categories=variable.levels) if classes else np.asarray(values)
+            )
+    written, labels = ["1"], list[str]()
+    factors, members = list[frozenset[str]](), list[frozenset[str]]()
+    for term in parsed:
+        own = [inside[factor.name, factor.holds_classes(table)] for factor in term]
+        written.append(
+            ":".join(f.written(one.column, classes=bool(one.levels)) for f, one in zip(term, own, strict=True))
+        )
+        labels.append(":".join(factor.text for factor in term))
+        factors.append(frozenset(factor.text for factor in term))
+        members.append(frozenset(one.column for one in own))
+    try:
+        with np.errstate(all="ignore"):
+            made = formulaic.Formula(written, _ordering="none").get_model_matrix(
+                pandas.DataFrame(frame), context=_CONTEXT, na_action="ignore"
+            )
+    # formulaic hands on whatever the functions of a formula raise.
+    except Exception as error:
+        raise InputError(f"The formula {formula!r} cannot be worked out ({_first(error)}); correct it.") from error
+    matrix = np.asarray(made, dtype=np.float64)
+    spec = made.model_spec
+    slices = [tuple(int(at) - 1 for at in indices) for indices in spec.term_indices.values()][1:]
+    terms = tuple(Term(*parts) for parts in zip(labels, factors, members, slices, strict=True))
+    for term in terms:
+        if not np.isfinite(matrix[:, [at + 1 for at in term.columns]]).all():
+            raise InputError(f"{table.where}: {term.label} is not finite in all rows, as a logarithm of 0 would be.")
+    return Design(formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, spec)
+
+
+@dataclass(frozen=True)
+class _Factor:
+    """A piece of a term: a column, or what a function makes of it.
+
+    Args:
+        text: as it was written.
+        name: of the column.
+        call: the function; empty for none.
+        tree: the call; None for none.
+    """
+
+    text: str
+    name: str
+    call: str = ""
+    tree: ast.expr | None = None
+
+    def holds_classes(self, table: Table) -> bool:
+        """Return whether it is classes, not numbers.
+
+        Raises:
+            InputError: a function needs numbers and the column holds text.
+        """
+        text = table.kind(self.name) == "text"
+        if text and self.call not in ("", "C"):
+            raise InputError(
+                f"{table.where}: {self.call}() in the formula needs numbers, and {self.name!r} holds text."
+            )
+        return text or self.call == "C"
+
+    def written(self, column: str, *, classes: bool) -> str:
+        """Return it with the column's name inside, which can be no code."""
+        if classes:
+            return f"C({column}, contr.sum)"
+        return column if self.tree is None else ast.unparse(_renamed(self.tree, column))
+
+
+def _renamed(tree: ast.expr, column: str) -> ast.expr:
+    """Return a checked call with `column` for its innermost first argument."""
+    if isinstance(tree, ast.Call):
+        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], tree.keywords)
+    return ast.Name(column)
+
+
+def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
+    formulaic = other_package("formulaic", "A formula", INSTALL)
+    where = f"The formula {formula[:80]!r}"
+    right = formula.strip().removeprefix("~")
+    stars = len(re.findall(r"\*", _POWER.sub("", right)))
+    powers = len(_POWER.findall(right))
+    if "~" in right:
+        raise InputError(
+            f"{where} has something before ~ or a second one; shape is what is explained, so write '~ sex'."
+        )
+    if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", right)) > _MOST_NAMES:
+        raise InputError(f"{where} is too long; write a shorter one.")
+    if not _PLAIN.fullmatch(right) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", right):
+        raise InputError(f"{where} holds something other than columns, + - * : / ^ and the functions of a formula.")
+    try:
+        terms = list(formulaic.Formula("~ " + right, _ordering="degree"))
+        keeps_mean = any(str(term) == "1" for term in terms)
+        drawn = [[_factor(f, table, where) for f in term.factors] for term in terms if str(term) != "1"]
+    except ShapespaceError:
+        raise
+    # The parser raises what it likes on what it cannot read.
+    except Exception as error:
+        raise InputError(f"{where} cannot be read ({_first(error)}); write one such as '~ sex + age'.") from error
+    if not keeps_mean:
+        raise InputError(f"{where} leaves out the mean shape, without which effects mean nothing; drop the 0 or - 1.")
+    if not drawn:
+        raise InputError(f"{where} names no column; write one such as '~ sex + age'.")
+    return drawn
+
+
+def _factor(factor: Any, table: Table, where: str) -> _Factor:
+    text, kind = str(factor.expr), factor.eval_method.value
+    if kind == "lookup":
+        return _Factor(text, _known(text, table, where))
+    tree = ast.parse(text, mode="eval").body if kind == "python" else None
+    if tree is None or not isinstance(tree, ast.Call) or not isinstance(tree.func, ast.Name):
+        raise InputError(f"{where} holds {text[:60]!r}; {_ALLOWED}")
+    if tree.func.id == "C" and not (len(tree.args) == 1 and isinstance(tree.args[0], ast.Name) and not tree.keywords):
+        raise InputError(f"{where}: {text[:60]!r} must take one column and nothing else.")
+    return _Factor(text, _column(tree, table, where), tree.func.id, tree)
+
+
+def _column(tree: ast.expr, table: Table, where: str) -> str:
+    """Return the column in calls of `FUNCTIONS`, whose first argument is a column or a call, and others numbers."""
+    if isinstance(tree, ast.Name):
+        return _known(tree.id, table, where)
+    function = tree.func.id if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) else ""
+    if not isinstance(tree, ast.Call) or function not in FUNCTIONS or not tree.args:
+        raise InputError(f"{where} holds {ast.unparse(tree)[:60]!r}; {_ALLOWED}")
+    for value in (*tree.args[1:], *(keyword.value for keyword in tree.keywords)):
+        constant = value.value if isinstance(value, ast.Constant) else None
+        if not isinstance(constant, int | float) or not 0 <= constant <= _LARGEST_CONSTANT:
+            raise InputError(f"{where} gives {function}() something other than a number up to {_LARGEST_CONSTANT}.")
+    return _column(tree.args[0], table, where)
+
+
+def _known(name: str, table: Table, where: str) -> str:
+    if name not in table.columns:
+        raise InputError(f"{where} names {name[:60]!r}, which is no column; there is {', '.join(table.columns)}.")
+    return name
+
+
+def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[Variable, Sequence[str | float]]:
+    """Return a column as a variable and its values, of which there are two or more."""
+    if not classes:
+        numbers = table.numbers(name)
+        if np.ptp(numbers) == 0:
+            raise InputError(f"{table.where}: {name!r} is {numbers[0]:g} for all {len(table)} shapes; leave it out.")
+        low, high = (float(value) for value in np.percentile(numbers, [5, 95]))
+        if low == high:
+            low, high = float(numbers.min()), float(numbers.max())
+        return Variable(name, column, (), low, high, float(numbers.mean())), [float(value) for value in numbers]
+    told = table.kind(name) == "number"
+    cells = [f"{float(cell):g}" if told else cell for cell in table.texts(name)]
+    levels = tuple(sorted(set(cells), key=float) if told else sorted(set(cells)))
+    if len(levels) == 1:
+        raise InputError(
+            f"{table.where}: {name!r} is {levels[0][:40]!r} for all {len(table)} shapes; a comparison needs two groups."
+        )
+    return Variable(f"C({name})" if told else name, column, levels), cells
+
+
+def _first(error: Exception) -> str:
+    text = re.sub(r"\x1b\[[0-9;]*m|[⧛⧚]", "", str(error)).strip()
+    return (text.splitlines() or [type(error).__name__])[0][:120].rstrip(".")

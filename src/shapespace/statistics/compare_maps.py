@@ -1,0 +1,215 @@
+"""Changes of shape tested at every vertex; the largest F of each arrangement holds the family-wise error.
+
+A change may also be sought beside how shapes vary anyway: at each vertex a bump of given width along the normals, by
+the matched filter for it in the covariance of the residuals (as in Fisher's linear discriminant; the covariance is
+shrunk by Ledoit and Wolf, J. Multivariate Analysis 88, 2004, towards that of the model and the noise of the fits).
+
+Nichols and Holmes, Human Brain Mapping 15, 2001; Benjamini and Hochberg, JRSS B 57(1), 1995.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.geometry.surface import vertex_normals
+from shapespace.late import other_package
+from shapespace.statistics.compare_formula import INSTALL
+from shapespace.statistics.compare_strata import Stratum
+from shapespace.types import FloatArray, Mesh, read_only
+
+_VERTICES = 512
+_BYTES = 48 * 2**20
+_TIE = 1e-9
+_NONE = 1e-12
+_REACH = 3.0
+"""Standard deviations after which a bump ends."""
+_FLOOR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A statistic at each vertex.
+
+    Args:
+        f: (V,) squared change by its variance.
+        p: (V,) share of arrangements with an F as large there.
+        p_family: (V,) share of arrangements whose largest F of all vertices is as large: with `p_family` below 5 % a
+            whole map without any effect shows a vertex in 5 % of studies.
+        q: (V,) false discovery rate at which the vertex is found.
+    """
+
+    f: FloatArray
+    p: FloatArray
+    p_family: FloatArray
+    q: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class EffectMap:
+    """A change of shape at each vertex.
+
+    Args:
+        change_mm: (V, 3).
+        normal_mm: (V,) along the normal of the mean, outwards positive; None for points.
+        length_mm: (V,).
+        along: test of `normal_mm`; None for points.
+        any_way: test of `change_mm`, in whatever direction.
+        bump_mm: (V,) height of the bump there that explains the change best; None where none were sought.
+        bump: test of `bump_mm`.
+    """
+
+    change_mm: FloatArray
+    normal_mm: FloatArray | None
+    length_mm: FloatArray
+    along: Tested | None
+    any_way: Tested
+    bump_mm: FloatArray | None = None
+    bump: Tested | None = None
+
+    @property
+    def shown_mm(self) -> FloatArray:
+        """(V,) along the normal where there is one, else the length."""
+        return self.length_mm if self.normal_mm is None else self.normal_mm
+
+    @property
+    def shown(self) -> Tested:
+        """The test of `shown_mm`."""
+        return self.any_way if self.along is None else self.along
+
+
+def effect_maps(
+    cohort: Cohort,
+    stratum: Stratum,
+    residual: FloatArray,
+    products: FloatArray,
+    along: FloatArray,
+    changes: FloatArray,
+    bump_width_mm: float | None = None,
+) -> Sequence[EffectMap]:
+    """Return the maps of E effects that are tested beside the same other terms; memory does not grow with P times V.
+
+    Args:
+        cohort: whose vertices they are.
+        stratum: in which they are tested.
+        residual: (n, K) of the other terms.
+        products: (P, m, K) of orthonormal columns of the model with it, in each arrangement; the observed one first.
+        along: (E, m) unit vectors: each effect in these columns.
+        changes: (E, K) mm.
+        bump_width_mm: standard deviation of the bumps; None seeks none.
+    """
+    P, m, K = products.shape
+    E, V = len(along), cohort.n_vertices
+    lenses = _lenses(cohort, residual, bump_width_mm)
+    seen = {name: np.empty((E, V, 3 if name == "any_way" else 1)) for name in lenses}
+    observed, as_large = ({name: np.zeros((E, V)) for name in lenses} for _ in range(2))
+    largest = {name: np.zeros((E, P)) for name in lenses}
+    flat = products.reshape(P * m, K)
+    chunk = max(1, _BYTES // (m * 3 * _VERTICES * 8))
+    for first in range(0, V, _VERTICES):
+        part = slice(first, min(first + _VERTICES, V))
+        for name, lens in lenses.items():
+            rows, unit = lens(part)
+            width = rows.shape[1] // (part.stop - part.start)
+            seen[name][:, part] = (changes @ rows).reshape(E, -1, width) / unit[:, None]
+            squares = ((residual @ rows) ** 2).sum(axis=0).reshape(-1, width).sum(axis=1)
+            for start in range(0, P, chunk):
+                drawn = (flat[start * m : (start + chunk) * m] @ rows).reshape(-1, m, len(squares), width)
+                effect = np.tensordot(along, drawn, axes=(1, 1))
+                explained = np.einsum("epvc,epvc->epv", effect, effect)
+                left = squares - np.einsum("pmvc,pmvc->pv", drawn, drawn)
+                f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)
+                if start == 0:
+                    observed[name][:, part] = f[:, 0]
+                as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
+                so_far = largest[name][:, start : start + chunk]
+                np.maximum(so_far, f.max(axis=2), out=so_far)
+    made: list[EffectMap] = []
+    for at in range(E):
+        tests = {name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at]) for name in lenses}
+        own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
+        change = seen["any_way"][at]
+        made.append(
+            EffectMap(
+                change_mm=read_only(change),
+                normal_mm=own.get("along"),
+                length_mm=read_only(np.linalg.norm(change, axis=1)),
+                along=tests.get("along"),
+                any_way=tests["any_way"],
+                bump_mm=own.get("bump"),
+                bump=tests.get("bump"),
+            )
+        )
+    return made
+
+
+_Lens = Callable[[slice], tuple[FloatArray, FloatArray]]
+"""Returns what vertices see of coefficients: (K, m c) columns, and what (m,) of it is 1 mm."""
+
+
+def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -> dict[str, _Lens]:
+    def any_way(part: slice) -> tuple[FloatArray, FloatArray]:
+        return cohort.basis[:, 3 * part.start : 3 * part.stop], np.ones(part.stop - part.start)
+
+    lenses: dict[str, _Lens] = {"any_way": any_way}
+    if cohort.faces is None:
+        return lenses
+    mean = cohort.vertices(cohort.coefficients.mean(axis=0))
+    normals = vertex_normals(Mesh(mean, cohort.faces))
+
+    def along(part: slice) -> tuple[FloatArray, FloatArray]:
+        rows = any_way(part)[0].reshape(len(cohort.basis), -1, 3)
+        return np.einsum("kvc,vc->kv", rows, normals[part]), np.ones(part.stop - part.start)
+
+    lenses["along"] = along
+    if bump_width_mm is not None:
+        lenses["bump"] = _bumps(
+            along(slice(0, cohort.n_vertices))[0], mean, bump_width_mm, _precision(cohort, residual)
+        )
+    return lenses
+
+
+def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: FloatArray) -> _Lens:
+    """Return the matched filters of bumps, from what vertices see along their normals (K, V)."""
+    from scipy.spatial import cKDTree  # loads much
+
+    tree: Any = cKDTree(mean)
+
+    def bump(part: slice) -> tuple[FloatArray, FloatArray]:
+        near = tree.sparse_distance_matrix(cKDTree(mean[part]), _REACH * width_mm, output_type="coo_matrix")
+        near.data = np.exp(-0.5 * (near.data / width_mm) ** 2)
+        shapes = np.asarray((near.tocsr().T @ ahead.T).T)
+        filters = precision @ shapes
+        return filters, np.maximum((filters * shapes).sum(axis=0), 1e-300)
+
+    return bump
+
+
+def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
+    """Return the (K, K) inverse covariance of residuals; no order of them gives another, so tests stay exact."""
+    sklearn: Any = other_package("sklearn.covariance", "Seeking bumps", INSTALL)
+    prior = np.eye(len(cohort.basis))
+    if cohort.fitted is not None:
+        model = cohort.fitted.model
+        modes = cohort.fitted.b.shape[1]
+        known = cohort.basis @ model.vertex_basis[:, :modes]
+        variance = model.stddev[:modes] ** 2 + (cohort.fitted.b_stddev**2).mean(axis=0)
+        # What no mode of the model makes is taken to vary alike in all directions.
+        beside = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
+        prior = (known * variance) @ known.T + max(beside, _FLOOR * float(variance.mean())) * prior
+    factor = np.linalg.cholesky(prior)
+    white = np.linalg.solve(factor, residual.T).T
+    shrunk = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_
+    half = np.linalg.solve(factor, np.eye(len(factor)))
+    return half.T @ np.linalg.solve(shrunk, half)
+
+
+def _tested(f: FloatArray, p: FloatArray, largest: FloatArray) -> Tested:
+    from scipy.stats import false_discovery_control  # loads much
+
+    as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))
+    return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(false_discovery_control(p)))

@@ -1,0 +1,525 @@
+"""Linear models of shape: sums of squares by a plain oracle, permutation, blocks, maps, and what is refused."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.geometry.surface import vertex_normals
+from shapespace.schemas import PARTS, Analysis, json_text
+from shapespace.statistics import compare_maps
+from shapespace.statistics.compare import CompareOptions, SquaresType, compare
+from shapespace.statistics.compare_answer import answer_of
+from shapespace.statistics.compare_formula import FUNCTIONS
+from shapespace.types import FloatArray, Mesh
+
+pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
+
+QUICK = CompareOptions(permutations=20, maps=False)
+SIDE = 6
+
+
+def surface() -> tuple[FloatArray, Any]:
+    """A small curved surface of 36 vertices."""
+    x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
+    points = np.stack([x, y, 0.1 * (x - 2.5) ** 2], axis=-1).reshape(-1, 3) * 10.0
+    at = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
+    a, b, c, d = (at[i : SIDE - 1 + i, j : SIDE - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)]).astype(np.int32)
+
+
+def cohort(columns: dict[str, Any], effect: FloatArray | None = None, seed: int = 0, stddev: float = 1.0) -> Cohort:
+    """Shapes that are noise about a surface, with an `effect` (N, V, 3) beside it."""
+    points, faces = surface()
+    n = len(next(iter(columns.values())))
+    noise = np.random.default_rng(seed).normal(size=(n, len(points), 3)) * stddev
+    shapes = points + noise + (0.0 if effect is None else effect)
+    return Cohort.of_shapes(shapes, columns, faces=faces, align=False)
+
+
+def people(n: int = 37, seed: int = 1) -> dict[str, Any]:
+    """An unbalanced table."""
+    rng = np.random.default_rng(seed)
+    return {
+        "sex": rng.choice(["female", "male"], n, p=[0.6, 0.4]).tolist(),
+        "site": rng.choice(["a", "b", "c"], n).tolist(),
+        "age": rng.uniform(20, 60, n).tolist(),
+    }
+
+
+# A plain oracle: designs by hand, residual sums of squares by least squares.
+
+
+def coded(values: list[str]) -> FloatArray:
+    levels = sorted(set(values))
+    out = np.zeros((len(values), len(levels) - 1))
+    for row, value in enumerate(values):
+        out[row] = -1.0 if value == levels[-1] else np.eye(len(levels) - 1)[levels.index(value)]
+    return out
+
+
+def pieces(table: dict[str, Any], formula: list[tuple[str, ...]]) -> dict[tuple[str, ...], FloatArray]:
+    single = {
+        name: np.array(v, dtype=float)[:, None] if isinstance(v[0], float) else coded(v) for name, v in table.items()
+    }
+    out: dict[tuple[str, ...], FloatArray] = {}
+    for term in formula:
+        columns = np.ones((len(table["sex"]), 1))
+        for name in term:
+            columns = np.stack([a * b for a in columns.T for b in single[name].T], axis=1)
+        out[term] = columns
+    return out
+
+
+def left(shapes: FloatArray, columns: list[FloatArray]) -> tuple[float, int]:
+    x = np.hstack([np.ones((len(shapes), 1)), *columns])
+    beta = np.linalg.lstsq(x, shapes, rcond=None)[0]
+    return float(((shapes - x @ beta) ** 2).sum()), len(shapes) - int(np.linalg.matrix_rank(x))
+
+
+def beside(term: tuple[str, ...], terms: list[tuple[str, ...]], squares: str) -> list[tuple[str, ...]]:
+    if squares == "I":
+        return terms[: terms.index(term)]
+    others = [other for other in terms if other != term]
+    return others if squares == "III" else [other for other in others if not set(term) < set(other)]
+
+
+FORMULAS = {
+    "~ sex + age": [("sex",), ("age",)],
+    "~ age + site": [("age",), ("site",)],
+    "~ sex * site + age": [("sex",), ("site",), ("age",), ("sex", "site")],
+    "~ sex * age * site": [("sex",), ("age",), ("site",), ("sex", "age"), ("sex", "site"), ("age", "site"),
+                           ("sex", "age", "site")],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("formula", "squares"), list(itertools.product(FORMULAS, ("I", "II", "III"))))
+def test_sums_of_squares_r2_and_f_are_those_of_plain_least_squares(formula: str, squares: SquaresType) -> None:
+    table, terms = people(), FORMULAS[formula]
+    shapes = cohort(table)
+    found = compare(shapes, formula, CompareOptions(squares=squares, permutations=20, maps=False))
+    columns = pieces(table, terms)
+    flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
+    total = left(flat, [])[0]
+    error, df_error = left(flat, list(columns.values()))
+    for term in terms:
+        reduced = [columns[other] for other in beside(term, terms, squares)]
+        (without, df_without), (with_it, df_with) = left(flat, reduced), left(flat, [*reduced, columns[term]])
+        test = found.test(":".join(term))
+        df = df_without - df_with
+        expected = (without - with_it, (without - with_it) / total, (without - with_it) / df / (error / df_error))
+        assert test.df == df
+        np.testing.assert_allclose((test.squares, test.r2, test.f), expected, rtol=1e-8)
+    assert found.remainders[0].df == df_error
+    np.testing.assert_allclose(found.remainders[0].squares, error, rtol=1e-8)
+    np.testing.assert_allclose(found.remainders[0].squares_total, total, rtol=1e-8)
+
+
+@pytest.mark.parametrize("squares", ["I", "II", "III"])
+def test_one_number_a_shape_gives_the_tables_of_statsmodels(squares: SquaresType) -> None:
+    smf = pytest.importorskip("statsmodels.formula.api")
+    anova = pytest.importorskip("statsmodels.stats.anova")
+    pandas = pytest.importorskip("pandas")
+    table = people(50)
+    rng = np.random.default_rng(4)
+    y = rng.normal(size=50) + 0.5 * (np.array(table["sex"]) == "male") + 0.02 * np.array(table["age"])
+    points, _ = surface()
+    shapes = points + y[:, None, None] * np.eye(3)[2] * (np.arange(len(points)) == 7)[:, None]
+    found = compare(
+        Cohort.of_shapes(shapes, table, align=False), "~ sex * age + site",
+        CompareOptions(squares=squares, permutations=20, maps=False),
+    )  # fmt: skip
+    fitted = smf.ols("y ~ C(sex, Sum) * age + C(site, Sum)", pandas.DataFrame({**table, "y": y})).fit()
+    expected = anova.anova_lm(fitted, typ=("I", "II", "III").index(squares) + 1)
+    rows = {"sex": "C(sex, Sum)", "age": "age", "site": "C(site, Sum)", "sex:age": "C(sex, Sum):age"}
+    if squares == "I":
+        # Its terms stand in another order.
+        rows = {"sex:age": rows["sex:age"]}
+    for name, row in rows.items():
+        test = found.test(name)
+        np.testing.assert_allclose((test.squares, test.f), expected.loc[row, ["sum_sq", "F"]], rtol=1e-7)
+
+
+def test_p_and_z_are_those_of_a_plain_loop_over_permuted_residuals() -> None:
+    table = people(30)
+    shift = 0.35 * (np.array(table["sex"]) == "male")[:, None, None] * np.ones((1, SIDE * SIDE, 1)) * [0, 0, 1]
+    shapes = cohort(table, shift)
+    test = compare(shapes, "~ age + sex", CompareOptions(permutations=2000, maps=False)).test("sex")
+    flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
+    columns = pieces(table, [("age",), ("sex",)])
+    x0 = np.hstack([np.ones((30, 1)), columns["age",]])
+    fit = x0 @ np.linalg.lstsq(x0, flat, rcond=None)[0]
+    rng, drawn = np.random.default_rng(8), []
+    for k in range(2000):
+        y = fit + (flat - fit)[rng.permutation(30) if k else np.arange(30)]
+        (without, _), (with_it, df) = left(y, [columns["age",]]), left(y, list(columns.values()))
+        drawn.append((without - with_it) / (with_it / df))
+    logs = np.log(drawn)
+    p = np.mean(np.array(drawn) >= drawn[0])
+    assert 0.001 < p < 0.2, "the case tests nothing"
+    assert abs(test.p - p) < 4 * np.sqrt(2 * p * (1 - p) / 2000)
+    assert abs(test.z - (logs[0] - logs.mean()) / logs.std()) < 0.15
+
+
+def test_a_seed_gives_the_same_numbers_and_another_one_others() -> None:
+    shapes = cohort(people())
+    one, same, other = (
+        compare(shapes, "~ sex + age", CompareOptions(permutations=100, seed=seed)) for seed in (3, 3, 4)
+    )
+    assert json_text(answer_of(one).analysis().parts) == json_text(answer_of(same).analysis().parts)
+    for a, b in zip(one.effects, same.effects, strict=True):
+        assert a.map is not None and b.map is not None
+        np.testing.assert_array_equal(a.map.shown.p_family, b.map.shown.p_family)
+    assert (one.tests[0].arrangements[1:] != other.tests[0].arrangements[1:]).any()
+    assert one.tests[0].arrangements[0] == other.tests[0].arrangements[0]
+
+
+def test_the_observed_arrangement_counts_so_no_p_is_zero() -> None:
+    table = people()
+    shift = 30.0 * (np.array(table["sex"]) == "male")[:, None, None] * np.ones((1, SIDE * SIDE, 3))
+    found = compare(cohort(table, shift), "~ sex", CompareOptions(permutations=50))
+    assert found.test("sex").p == 1 / 50
+    assert found.effects[0].map is not None
+    assert found.effects[0].map.any_way.p_family.min() == 1 / 50
+
+
+# Blocks.
+
+
+def repeated(subjects: int, scans: int, seed: int, between: float = 1.0, within: float = 0.3) -> tuple[Any, FloatArray]:
+    """A table of repeated scans with a sex of each subject, and the shapes' differences by subject and by scan."""
+    rng = np.random.default_rng([9, seed])
+    who = np.repeat(np.arange(subjects), scans)
+    sex = rng.permutation(["female", "male"] * subjects)[:subjects]
+    own = rng.normal(size=(subjects, SIDE * SIDE, 3)) * between
+    table = {
+        "subject": [f"s{k}" for k in who],
+        "sex": sex[who].tolist(),
+        "smile": (["no", "yes"] * len(who))[: len(who)],
+    }
+    return table, own[who] + rng.normal(size=(len(who), SIDE * SIDE, 3)) * within
+
+
+def test_a_difference_of_subjects_is_tested_on_their_means() -> None:
+    table, noise = repeated(14, 3, 0)
+    found = compare(cohort(table, noise, stddev=0.0), "~ sex", CompareOptions(blocks="subject", permutations=20))
+    means = noise.reshape(14, 3, -1).mean(axis=1)
+    sex = coded(table["sex"][::3])
+    (without, df), (with_it, df_error) = left(means, []), left(means, [sex])
+    test = found.test("sex")
+    assert test.stratum == "between subject"
+    assert (found.remainders[0].df, found.remainders[0].df_total) == (df_error, df) == (12, 13)
+    np.testing.assert_allclose(
+        (test.squares, test.f), (without - with_it, (without - with_it) / (with_it / df_error)), rtol=1e-8
+    )
+
+
+def test_a_difference_of_scans_is_tested_within_subjects() -> None:
+    table, noise = repeated(9, 4, 1)
+    found = compare(
+        cohort(table, noise, stddev=0.0), "~ sex * smile", CompareOptions(blocks="subject", permutations=20)
+    )
+    flat = noise.reshape(36, -1)
+    subject, smile = np.eye(9)[np.repeat(np.arange(9), 4)][:, 1:], coded(table["smile"])
+    both = smile * coded(table["sex"])
+    (without, _), (with_it, df) = left(flat, [subject, both]), left(flat, [subject, both, smile])
+    test = found.test("smile")
+    # Type II: without the interaction, of which smile is a part; the error is that of the whole model.
+    error = with_it / df
+    (without, _), (with_it, _) = left(flat, [subject]), left(flat, [subject, smile])
+    assert [one.stratum for one in found.tests] == ["between subject", "within subject", "within subject"]
+    np.testing.assert_allclose(test.squares, without - with_it, rtol=1e-8)
+    np.testing.assert_allclose(test.f, (without - with_it) / error, rtol=1e-8)
+    assert found.remainders[1].df == df
+
+
+def test_whole_subjects_are_permuted_and_scans_only_within_theirs() -> None:
+    table, noise = repeated(6, 3, 2)
+    from shapespace.statistics.compare_formula import design_of
+    from shapespace.statistics.compare_strata import strata_of
+
+    shapes = cohort(table, noise, stddev=0.0)
+    strata = strata_of(shapes.coefficients, design_of("~ sex + smile", shapes.table), table["subject"], "subject")
+    between, within = strata
+    assert len(between.shapes) == 6
+    who = np.repeat(np.arange(6), 3)
+    for start, rows in within.arrangements(120, 0):
+        assert (np.sort(rows, axis=1) == np.arange(18)).all()
+        assert (who[rows] == who).all()
+        if start == 0:
+            assert (rows[0] == np.arange(18)).all()
+    moved = np.concatenate([rows for _, rows in within.arrangements(120, 0)])
+    assert {tuple(np.argsort(row[:3])) for row in moved} == set(itertools.permutations(range(3)))
+
+
+def test_repeated_scans_taken_for_independent_find_what_is_not_there_and_blocks_do_not() -> None:
+    found = {"subject": 0, None: 0}
+    for seed in range(40):
+        table, noise = repeated(12, 4, seed)
+        for blocks in found:
+            options = CompareOptions(blocks=blocks, permutations=60, maps=False)
+            found[blocks] += compare(cohort(table, noise, stddev=0.0), "~ sex", options).test("sex").p <= 0.05
+    assert found["subject"] <= 6
+    assert found[None] >= 20
+
+
+def test_that_repeated_scans_are_taken_for_independent_is_said() -> None:
+    table, noise = repeated(8, 2, 0)
+    assert any("--blocks subject" in one for one in compare(cohort(table, noise), "~ sex", QUICK).warnings)
+
+
+def test_subjects_who_lack_a_smile_do_not_seem_to_differ_by_it() -> None:
+    table, noise = repeated(12, 4, 5, within=0.01)
+    smile = np.array(table["smile"]) == "yes"
+    shown = noise + 20.0 * smile[:, None, None] * [0, 0, 1]
+    # All men but one lack half of their smiles.
+    kept = [k for k in range(48) if not (table["sex"][k] == "male" and smile[k] and k % 4 == 1)]
+    kept_table = {name: [cells[k] for k in kept] for name, cells in table.items()}
+    options = CompareOptions(blocks="subject", permutations=20, maps=False)
+    whole = compare(cohort(table, shown, stddev=0.0), "~ sex + smile", options).test("sex")
+    found = compare(cohort(kept_table, shown[kept], stddev=0.0), "~ sex + smile", options)
+    np.testing.assert_allclose(found.test("sex").squares, whole.squares, rtol=0.05)
+    assert any("2 to 4" in one or "3 to 4" in one for one in found.warnings)
+
+
+# Maps and effects.
+
+
+def test_maps_are_those_of_a_plain_test_at_each_vertex(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compare_maps, "_VERTICES", 7)
+    monkeypatch.setattr(compare_maps, "_BYTES", 7 * 3 * 8 * 2 * 11)
+    table = people(25)
+    shapes = cohort(table)
+    found = compare(shapes, "~ age + sex", CompareOptions(permutations=60)).effects[1]
+    from shapespace.statistics.compare_formula import design_of
+    from shapespace.statistics.compare_strata import strata_of
+
+    stratum = strata_of(shapes.coefficients, design_of("~ age + sex", shapes.table), None, "")[0]
+    every = np.stack([shapes.vertices(k) for k in range(25)])
+    normals = vertex_normals(Mesh(every.mean(axis=0), shapes.faces))
+    columns = pieces(table, [("age",), ("sex",)])
+    x0 = np.hstack([np.ones((25, 1)), columns["age",]])
+    x1 = np.hstack([x0, columns["sex",]])
+
+    def f(y: FloatArray) -> FloatArray:
+        rss = [((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2) for x in (x0, x1)]
+        a, b = (part.reshape(25, SIDE * SIDE, -1).sum(axis=(0, 2)) for part in rss)
+        return (a - b) / (b / 22)
+
+    for test, y in (
+        (found.map.along, np.einsum("nvc,vc->nv", every, normals)),  # pyright: ignore[reportOptionalMemberAccess]
+        (found.map.any_way, every.reshape(25, -1)),  # pyright: ignore[reportOptionalMemberAccess]
+    ):
+        fit = x0 @ np.linalg.lstsq(x0, y, rcond=None)[0]
+        # Rows of the design are permuted, which is the inverse permutation of the residuals.
+        orders = [np.argsort(row) for _, rows in stratum.arrangements(60, 0) for row in rows]
+        drawn = np.stack([f(fit + (y - fit)[order]) for order in orders])
+        assert test is not None
+        np.testing.assert_allclose(test.f, drawn[0], rtol=1e-8)
+        np.testing.assert_allclose(test.p, (drawn >= drawn[0] * (1 - 1e-9)).mean(axis=0))
+        largest = drawn.max(axis=1)
+        np.testing.assert_allclose(test.p_family, (largest[:, None] >= drawn[0] * (1 - 1e-9)).mean(axis=0))
+    beta = np.linalg.lstsq(x1, every.reshape(25, -1), rcond=None)[0]
+    assert found.map is not None
+    np.testing.assert_allclose(found.map.change_mm.ravel(), -2 * beta[2], atol=1e-9)
+
+
+def test_a_change_that_was_put_in_comes_back_where_and_as_large_as_it_is() -> None:
+    table = people(60)
+    where = np.arange(SIDE * SIDE) < SIDE
+    male = (np.array(table["sex"]) == "male")[:, None, None]
+    older = (np.array(table["age"]) - 40.0)[:, None, None] / 10
+    effect = male * where[:, None] * [0, 0, 3.0] + older * ~where[:, None] * [2.0, 0, 0]
+    found = compare(cohort(table, effect, stddev=0.5), "~ sex + age", CompareOptions(permutations=200))
+    sex, age = found.effects
+    assert sex.map is not None and age.map is not None
+    assert sex.label == "sex female to male"
+    np.testing.assert_array_equal(sex.map.any_way.p_family <= 0.05, where)
+    np.testing.assert_allclose(sex.map.change_mm, where[:, None] * [0, 0, 3.0], atol=0.6)
+    np.testing.assert_allclose(
+        found.cohort.vertices(sex.at_high) - found.cohort.vertices(sex.at_low), sex.map.change_mm, atol=1e-9
+    )
+    span = (found.design.variables[1].high - found.design.variables[1].low) / 10
+    np.testing.assert_allclose(age.map.change_mm, ~where[:, None] * [2.0 * span, 0, 0], atol=0.6)
+    assert [abs(one.degrees - 90) < 5 for one in found.angles] == [True]
+
+
+def test_pairs_of_three_groups_are_compared_and_the_family_of_them_held() -> None:
+    table = people(60)
+    c = (np.array(table["site"]) == "c")[:, None, None] * np.ones((1, SIDE * SIDE, 1)) * [0, 0, 2.0]
+    found = compare(cohort(table, c), "~ site", CompareOptions(permutations=200, maps=False)).effects
+    assert [one.label for one in found] == ["site a to b", "site a to c", "site b to c"]
+    assert found[0].p > 0.05 > max(found[1].p_family, found[2].p_family)
+    assert all(one.p_family >= one.p for one in found)
+    np.testing.assert_allclose([one.rms_mm for one in found[1:]], 2.0, atol=0.4)
+
+
+def test_slopes_that_are_parallel_are_told_from_those_that_are_not() -> None:
+    table = people(80)
+    age = (np.array(table["age"]) - 40.0)[:, None, None] / 10 * np.ones((1, SIDE * SIDE, 1))
+    male = (np.array(table["sex"]) == "male")[:, None, None]
+    options = CompareOptions(permutations=200, maps=False)
+    same = compare(cohort(table, age * [1.0, 0, 0]), "~ sex * age", options)
+    other = compare(cohort(table, age * np.where(male, [1.0, 0, 0], [0, 1.0, 0])), "~ sex * age", options)
+    angles = [next(one for one in found.angles if one.p is not None) for found in (same, other)]
+    assert angles[0].p is not None and angles[1].p is not None
+    assert angles[0].p > 0.05 > angles[1].p
+    assert abs(angles[1].degrees - 90) < 20
+    assert "sex:age" in {one.name for one in other.effects}
+
+
+def test_allometry_finds_that_larger_shapes_are_of_another_shape() -> None:
+    points, faces = surface()
+    rng = np.random.default_rng(3)
+    size = rng.uniform(0.8, 1.2, 40)
+    shapes = size[:, None, None] * points + rng.normal(size=(40, len(points), 3)) * 0.3
+    shapes[..., 2] += 10 * (size - 1)[:, None] * np.sin(points[:, 0] / 10)
+    found = compare(
+        Cohort.of_shapes(shapes, {"age": range(40)}, faces=faces), "~ log_size", CompareOptions(permutations=100)
+    )
+    assert found.test("log_size").p == 0.01
+    assert found.effects[0].map is not None
+
+
+def test_points_without_triangles_are_tested_by_the_length_of_their_change() -> None:
+    points, _ = surface()
+    table = people(30)
+    shapes = points + np.random.default_rng(0).normal(size=(30, len(points), 3))
+    found = compare(Cohort.of_shapes(shapes, table, align=False), "~ sex", CompareOptions(permutations=50))
+    assert found.effects[0].map is not None and found.effects[0].map.along is None
+    assert {type(part).__struct_config__.tag for part in answer_of(found).parts} <= set(PARTS)
+
+
+def test_an_answer_is_written_with_all_that_its_parts_name(tmp_path: Path) -> None:
+    found = compare(cohort(people()), "~ sex * age", CompareOptions(permutations=50))
+    answer = answer_of(found)
+    assert answer.save(tmp_path).name == Analysis.FILE
+    for part in answer.parts:
+        file = getattr(part, "arrays", "")
+        if file:
+            with np.load(tmp_path / file) as arrays:
+                named = {getattr(part, name, "") for name in ("vertices", "faces", "values", "mask", "low", "high")}
+                assert named - {""} <= set(arrays.files)
+    rows = (tmp_path / "terms.csv").read_text("utf-8").splitlines()
+    assert [row.partition(",")[0] for row in rows] == ["term", "sex", "age", "sex:age", "residual", "total"]
+
+
+# What is refused.
+
+
+HOSTILE = [
+    "~ __import__('os').system('touch HURT')",
+    "~ log(__import__('os').system('touch HURT'))",
+    "~ {__import__('os').system('touch HURT')}",
+    "~ C(open('HURT', 'w'))",
+    "~ poly(age, open('HURT', 'w'))",
+    "~ log(age, base=open('HURT', 'w'))",
+    "~ eval('1')",
+    "~ np.save('HURT', age)",
+    "~ age.__class__.__mro__",
+    "~ [open(x, 'w') for x in ['HURT']]",
+    "~ (lambda: open('HURT', 'w'))()",
+    "~ I(open('HURT', 'w'))",
+    "~ Q('age')",
+    "~ poly(age, 999999999)",
+    "~ (sex + age + site)**999",
+    "~ ((sex + age)**3)**3",
+    "~ sex*age*site*sex*age*site*sex",
+    "~ " + "+".join(["age"] * 500),
+    "~ `age`; open('HURT', 'w')",
+    "~ age | sex",
+    "~ @age",
+]
+
+
+@pytest.mark.parametrize("formula", HOSTILE, ids=range(len(HOSTILE)))
+def test_a_formula_runs_nothing_and_ends_in_a_sentence(
+    formula: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(people(), formula, "formula")
+    assert not list(tmp_path.iterdir())
+
+
+def refused(table: dict[str, Any], formula: str, *words: str, options: CompareOptions = QUICK) -> None:
+    with pytest.raises(InputError) as caught:
+        compare(cohort(table), formula, options)
+    text = str(caught.value)
+    assert all(word in text for word in words), text
+    assert text.endswith(".") and "\n" not in text and "\x1b" not in text, text
+    assert len(text) < 300, text
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("~ weight", ("'weight'", "no column", "sex")),
+        ("~ sex +", ("cannot be read",)),
+        ("~ (sex", ("cannot be read",)),
+        ("", ("names no column",)),
+        ("~ 1", ("names no column",)),
+        ("~ sex - 1", ("mean shape",)),
+        ("shape ~ sex", ("before ~",)),
+        ("~ log(sex)", ("needs numbers", "'sex'")),
+        ("~ C(age, 3)", ("one column",)),
+        ("~ log(low)", ("not finite",)),
+        ("~ one", ("'one' is 'x' for all",)),
+        ("~ same", ("'same' is 3 for all",)),
+        ("~ age + older", ("older follows from",)),
+        ("~ sex + both", ("follows from",)),
+        ("~ sex * nested", ("follows from", "empty group")),
+        ("~ each", ("too many for 37 shapes",)),
+        ("~ mixed", ("'mixed' holds numbers but 'old'",)),
+        ("~ holes", ("holes of 2 of 37", "--drop-missing")),
+    ],
+)
+def test_tables_and_formulas_that_cannot_be_are_refused(formula: str, words: tuple[str, ...]) -> None:
+    table = people()
+    age = table["age"]
+    table |= {
+        "low": [0.0, *age[1:]],
+        "one": ["x"] * 37,
+        "same": [3.0] * 37,
+        "older": [2 * value + 1 for value in age],
+        "both": [f"is {sex}" for sex in table["sex"]],
+        "nested": ["f" if sex == "female" else site for sex, site in zip(table["sex"], table["site"], strict=True)],
+        "each": [f"id{k}" for k in range(37)],
+        "mixed": ["old", *age[1:]],
+        "holes": [None, None, *age[2:]],
+    }
+    refused(table, formula, *words)
+
+
+def test_missing_rows_are_left_out_when_asked_and_said() -> None:
+    table = people() | {"holes": [None, None, *people()["age"][2:]]}
+    found = compare(cohort(table), "~ holes", CompareOptions(permutations=20, maps=False, drop_missing=True))
+    assert len(found.cohort) == 35
+    assert any("2 of 37" in note for note in answer_of(found).notes)
+
+
+def test_blocks_that_cannot_be_are_refused() -> None:
+    table = people() | {"who": ["anna"] * 37, "pair": [f"p{k // 19}" for k in range(37)]}
+    of = {name: CompareOptions(blocks=name, permutations=20, maps=False) for name in ("who", "pair", "nobody")}
+    refused(table, "~ sex", "one who", options=of["who"])
+    refused(table, "~ pair", "too many", "between pair", options=of["pair"])
+    refused(table, "~ sex", "'nobody'", options=of["nobody"])
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    for wrong in ({"permutations": 5}, {"seed": -1}, {"level": 0.0}, {"squares": "IV"}):
+        with pytest.raises(InputError):
+            CompareOptions(**wrong)  # pyright: ignore[reportArgumentType]
+
+
+def test_what_a_formula_may_call_is_called() -> None:
+    table = people()
+    columns = {"C": "C(group)", "poly": "poly(age, 2)", "bs": "bs(age, df=4)"}
+    table["group"] = (np.arange(37) % 10).astype(float).tolist()
+    for name in FUNCTIONS:
+        found = compare(cohort(table), "~ " + columns.get(name, f"{name}(age)"), QUICK)
+        assert len(found.tests) == 1 and found.effects, name
+    assert compare(cohort(table), "~ C(group)", QUICK).tests[0].df == 9
