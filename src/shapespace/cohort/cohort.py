@@ -16,6 +16,7 @@ import numpy.typing as npt
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
@@ -32,6 +33,7 @@ class Fitted:
         b_stddev: (N, K) standard deviations of them, mm.
         status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
         folder: of the results, as it was given.
+        additive: the same model where its file parts identity and expression.
     """
 
     model: ShapeModel
@@ -39,6 +41,7 @@ class Fitted:
     b_stddev: FloatArray
     status: tuple[str, ...]
     folder: str
+    additive: AdditiveModel | None = None
 
     @cached_property
     def z(self) -> FloatArray:
