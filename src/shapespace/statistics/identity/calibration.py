@@ -32,7 +32,8 @@ def cllr_min(score: FloatArray, same: BoolArray) -> float:
     """
     isotonic = other_package("sklearn.isotonic", _NEEDS, _INSTALL).IsotonicRegression
     weights = np.where(same, 0.5 / same.sum(), 0.5 / (~same).sum())
-    p = cast(FloatArray, isotonic(y_min=0.0, y_max=1.0).fit_transform(score, same.astype(float), weights))
+    rule = isotonic(y_min=0.0, y_max=1.0).fit(score, same.astype(np.float64), sample_weight=weights)
+    p = cast(FloatArray, rule.predict(score))
     p = np.clip(p, 0.0, 1.0)
     with np.errstate(divide="ignore"):
         return cllr(np.log(p) - np.log1p(-p), same)

@@ -166,7 +166,7 @@ def identify(
         sizes.append(len(np.unique(gallery)))
         for name, scores in found.items():
             parts[name].append(search(scores, gallery, probes))
-    people = people_drawn(len(trial.people), options.draws, options.seed)
+    people = people_drawn(trial.tested, options.draws, options.seed)
     found_by: list[Identified] = []
     for number, (name, told) in enumerate(parts.items()):
         found_by.append(identified(name, joined(told), min(sizes), people))
@@ -183,7 +183,15 @@ def joined(parts: Sequence[Searches]) -> Searches:
     return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
 
-def _identified(name: str, searches: Searches, most: int, people: FloatArray) -> Identified:
+def identified(name: str, searches: Searches, most: int, people: FloatArray) -> Identified:
+    """Return the figures of one score.
+
+    Args:
+        name: of it.
+        searches: of all probes.
+        most: ranks that are told.
+        people: (draws, P) from `people_drawn`.
+    """
     rates = np.array(FPIR)
     rows: list[FloatArray] = []
     for times in people:

@@ -1,7 +1,7 @@
 """The likelihood ratio of two scans being of one person, by normal within- and between-person covariance.
 
-A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows, and the error of its fit ~ N(0, N) on top,
-which differs from scan to scan. This is the two-covariance model of PLDA: Brummer and de Villiers, "The speaker
+A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows and the error of its fit. W differs from
+scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers, "The speaker
 partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006. Uncertainty that is
 stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
 """
@@ -19,7 +19,7 @@ from shapespace.late import other_package
 from shapespace.statistics.identity.samples import Samples
 from shapespace.types import FloatArray, read_only
 
-_LEAST_WITHIN, _LEAST_BETWEEN = 0.1, 1e-3
+_MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +30,8 @@ class TwoCovariance:
         mean: (K,) of all people.
         basis: (K, K) columns v with v^T W v = 1, so that basis^T B basis is diagonal.
         between: (K,) that diagonal.
+        noise: (K,) share of the covariance within that is taken for errors of fits.
+        noise_scale: (K,) of the variances that fits state, so that those of training make up `noise` on average.
         people: learned from.
         scans: learned from.
     """
@@ -37,6 +39,8 @@ class TwoCovariance:
     mean: FloatArray
     basis: FloatArray
     between: FloatArray
+    noise: FloatArray
+    noise_scale: FloatArray
     people: int
     scans: int
 
@@ -44,8 +48,9 @@ class TwoCovariance:
     def learn(training: Samples) -> TwoCovariance:
         """Return the covariances of `training`, shrunk as far as Ledoit and Wolf find it needs (2004).
 
-        The errors that fits state are taken out of the covariance within, of which a tenth is kept at least: they are
-        added again for each scan that is compared.
+        The errors that fits state are part of the covariance within. Where they exceed nine tenths of it they are
+        scaled down to that: files keep their diagonal alone, which overstates the error in those directions in which
+        errors of several coefficients cancel.
 
         Raises:
             InputError: fewer than three people, or nobody of them has two scans.
@@ -71,21 +76,23 @@ class TwoCovariance:
         within = cast(FloatArray, shrunk(own[several], assume_centered=True)[0]) * (several.sum() / freedom)
         spread = cast(FloatArray, shrunk(means - mean, assume_centered=True)[0]) * (len(names) / (len(names) - 1))
         between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)
-        within = _less(within, np.diag(training.variance.mean(axis=0)), _LEAST_WITHIN)
         values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
-        return TwoCovariance(
-            read_only(mean), read_only(basis), read_only(np.maximum(values, 0.0)), people=len(names), scans=n
-        )
+        stated = training.variance.mean(axis=0) @ basis**2
+        noise = np.minimum(stated, _MOST_NOISE)
+        scale = np.divide(noise, stated, out=np.ones(k), where=stated > 0)
+        arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
+        return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
 
     def log_ratio(self, gallery: Samples, probes: Samples) -> FloatArray:
         """Return (G, P) log likelihood ratios, natural, of one person against two.
 
-        The error of each fit is diagonal in its coefficients; here its diagonal in the coordinates of `basis` is used.
+        The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
+        the coordinates of `basis` is used.
         """
         g, p = (samples.x - self.mean for samples in (gallery, probes))
         g, p = g @ self.basis, p @ self.basis
         # Total variances, (G, K) and (P, K).
-        of_g, of_p = (self.between + 1.0 + one.variance @ self.basis**2 for one in (gallery, probes))
+        of_g, of_p = (self.between + self.within(one) for one in (gallery, probes))
         alone = (p**2 / of_p + np.log(of_p)).sum(axis=1)
         out = np.empty((len(g), len(p)))
         for row, (x, total) in enumerate(zip(g, of_g, strict=True)):
@@ -95,6 +102,10 @@ class TwoCovariance:
             together = ((p - pull * x) ** 2 / left + np.log(left)).sum(axis=1)
             out[row] = 0.5 * (alone - together)
         return out
+
+    def within(self, samples: Samples) -> FloatArray:
+        """Return (N, K) variances within a person, of which 1 is usual, in the coordinates of `basis`."""
+        return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
 
 
 def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from shapespace.errors import InputError
 from shapespace.types import BoolArray, FloatArray, IntArray
@@ -117,10 +116,13 @@ class Figure:
     high: float | None = None
 
 
-def people_drawn(people: int, draws: int, seed: int) -> npt.NDArray[np.float64]:
-    """Return (draws, people) how often each person is there in draws with replacement."""
+def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
+    """Return (draws, P) how often each person is there in draws with replacement of those who are `tested` (P,)."""
     rng = np.random.default_rng((seed, 14))
-    return rng.multinomial(people, np.full(people, 1.0 / people), size=draws).astype(np.float64)
+    count = int(tested.sum())
+    out = np.zeros((draws, len(tested)))
+    out[:, tested] = rng.multinomial(count, np.full(count, 1.0 / count), size=draws)
+    return out
 
 
 def figure(value: float | None, drawn: Sequence[float] | FloatArray) -> Figure:

@@ -14,7 +14,7 @@ from shapespace.errors import InputError
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.statistics.identity.samples import Samples, samples_of
 from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
 _FOLDS, _GROUPS = 4, 5
@@ -94,6 +94,14 @@ class Trial:
     def subjects(self) -> tuple[str, ...]:
         """(N,) whom each scan shows."""
         return tuple(self.people[k] for k in self.person.tolist())
+
+    @property
+    def tested(self) -> BoolArray:
+        """(P,) who is compared."""
+        out = np.zeros(len(self.people), dtype=np.bool_)
+        for one in self.rounds:
+            out[self.person[[*one.gallery, *one.probes]]] = True
+        return out
 
     def pairs(self, round_: Round) -> tuple[Pairs, IntArray]:
         """Return the pairs of a round, and (M, 2) the places of each in gallery and probes."""
@@ -245,9 +253,9 @@ def _rounds(
 
 
 def _refuse_too_few(trial: Trial, table: Table) -> None:
-    tested = {int(trial.person[row]) for one in trial.rounds for row in (*one.gallery, *one.probes)}
-    if len(tested) < 2:
-        raise InputError(f"{table.where}: {len(tested)} people are compared, and two are the least.")
+    tested = int(trial.tested.sum())
+    if tested < 2:
+        raise InputError(f"{table.where}: {tested} person is compared, and two are the least.")
     if not any(trial.pairs(one)[0].same.any() for one in trial.rounds):
         raise InputError(
             f"{table.where}: no two scans that are compared show one person; nobody can be recognised by one scan."

@@ -94,11 +94,6 @@ class Verification:
     def __getitem__(self, name: str) -> Verified:
         return next(one for one in self.scores if one.name == name)
 
-    @property
-    def tested(self) -> int:
-        """Number of people who were compared."""
-        return len(np.unique([self.pairs.one, self.pairs.other]))
-
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
         from shapespace.statistics.identity.verify_answer import answer
@@ -125,7 +120,7 @@ def verify(
     pairs, scores = _pairs_and_scores(trial, options, options.modes)
     values = trial.cohort.table.texts(options.by) if options.by else ()
     chosen = {value: _with_value(values, value, pairs, all_pairs=trial.all_pairs) for value in sorted(set(values))}
-    people = people_drawn(len(trial.people), options.draws, options.seed)
+    people = people_drawn(trial.tested, options.draws, options.seed)
     total, done = len(scores) * options.draws, 0
 
     def step() -> None:
