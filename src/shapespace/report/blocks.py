@@ -165,7 +165,7 @@ class Turning:
         still: what the still shows, told with it alone.
     """
 
-    widget: Literal["modes", "fit", "scatter"]
+    widget: Literal["modes", "morph", "fit", "scatter"]
     payload: str
     poster: Image
     caption: str

@@ -53,7 +53,7 @@ _MOST_NAMED = 12
 _MOST_WORST = 3
 _VERDICT = "Do not trust this fit: "
 _FEWEST_LEVELS = 2
-_RESERVE_BYTES = 400_000
+_RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
 
 
 class FolderPage:
@@ -77,7 +77,8 @@ class FolderPage:
         on_step: Step | None = None,
     ) -> None:
         self.folder = folder
-        self.recognised = (folder.root / recognition.FILE).is_file()
+        self.recognised = (folder.root / recognition.STUDY.file).is_file()
+        self.analyses = recognition.find_analyses(folder.root)
         self.label_note = ""
         found: Mapping[str, Label] = {}
         try:
@@ -129,8 +130,9 @@ class FolderPage:
         if sum(fit.fitted for fit in self.fits) < 2:
             del chapters[2]
         if self.recognised:
-            found = Chapter("Recognition", lambda: recognition.recognition_section(self.page, self.folder))
+            found = Chapter("Recognition", lambda: recognition.study_section(self.page, self.folder))
             chapters.insert(-2, found)
+        chapters[-2:-2] = recognition.analysis_chapters(self.page, self.folder.root, self.analyses)
         lead = "What a statistical shape model made of raw surfaces. Distances are in millimetres of the model's frame."
         made = f"Made by shapespace {__version__} from the files in {name}."
         return self.page.html(f"{counted(len(self.fits), 'fit')} in {name}", [Text(lead)], made, chapters)
@@ -404,7 +406,7 @@ class FolderPage:
         """Return one fit with every picture, as far as the file's size allows."""
         staged = self.staged(fit)
         population = self.others(fit)
-        reserve = _RESERVE_BYTES + (recognition.SECTION_BYTES if self.recognised else 0)
+        reserve = _RESERVE_BYTES + recognition.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
         alone = len(self.fits) == 1
         pictures = sections.fit_in_full(self.page, staged, population, reserve=reserve, folded=alone)
         return [*sections.fit_facts(fit), *pictures]

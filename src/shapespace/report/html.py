@@ -8,7 +8,7 @@ from pathlib import Path
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import write_text
 from shapespace.report.page import LARGEST_REPORT_BYTES, Step
-from shapespace.report.recognition import is_study, study_page
+from shapespace.report.recognition import kept_alone, study_page
 from shapespace.report.saved import Folder, find_fits
 from shapespace.schemas import CorrespondenceRecord
 from shapespace.store.results import Results
@@ -40,9 +40,10 @@ def write_report(
     """Write one HTML file on the results saved in `folder`, and return its path.
 
     A folder with a demo.json is reported as the demo, one with a correspondence.json as a correspondence, one with a
-    recognition.json and no fits as a study of recognition, any other as the results of `shapespace fit`; of very many
-    fits those to look at have rows and pictures, and all are in the distributions. The page needs
-    no network; without a script it loses what turns and sorts, and can be read.
+    recognition.json and no fits as a study of recognition, one with an analysis.json and no fits as an analysis, any
+    other as the results of `shapespace fit`; of very many fits those to look at have rows and pictures, and all are in
+    the distributions. Analyses in the folder of fits, or in folders directly in it, are sections of its report. The
+    page needs no network; without a script it loses what turns and sorts, and can be read.
 
     Args:
         folder: of the results.
@@ -54,7 +55,7 @@ def write_report(
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
         FileFormatError: demo.json, correspondence.json or the mean shape beside it, the recognition.json of a study,
-            `model` or `labels` is damaged.
+            the analysis.json of an analysis, `model` or `labels` is damaged.
         InputError: the folder holds no results, or only records that cannot be read, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
@@ -76,10 +77,10 @@ def write_report(
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
         page = CorrespondencePage(results, on_step).html()
-    elif is_study(results):
+    elif (kept := kept_alone(results)) is not None:
         if model is not None or labels is not None:
-            raise InputError(f"{folder} is a study without fits; leave out --model and --labels.")
-        page = study_page(results, on_step)
+            raise InputError(f"{folder} holds {kept.article} without fits; leave out --model and --labels.")
+        page = study_page(results, kept, on_step)
     else:
         from shapespace.report.folder_page import FolderPage
         from shapespace.report.many_page import ManyPage, is_many

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.report import sections, tables
+from shapespace.report import recognition, sections, tables
 from shapespace.report.blocks import (
     Block,
     Cell,
@@ -98,6 +98,7 @@ class ManyPage(FolderPage):
             Chapter("Fits to look at", self.fits_part, "Fits"),
             Chapter("Distributions", self.distributions),
             Chapter("Time and site", self.drift),
+            *recognition.analysis_chapters(self.page, self.folder.root, self.analyses),
             Chapter("The model", self.model_part, "Model"),
             Chapter("Settings and versions", self.settings, "Settings"),
         ]

@@ -111,7 +111,7 @@ class Page:
 
     def turning(
         self,
-        widget: Literal["modes", "fit", "scatter"],
+        widget: Literal["modes", "morph", "fit", "scatter"],
         payload: bytes,
         poster: Image,
         caption: str,

@@ -1,4 +1,4 @@
-"""What a study of recognition measured, from its recognition.json: a section of a report, or a report of its own.
+"""What a study measured or an analysis found, from its file: a section of a report, or a report of its own.
 
 The file names the parts in the order in which they are shown; what is absent is not shown, and what is damaged says so
 in its place.
@@ -6,89 +6,160 @@ in its place.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from shapespace.report import tables
-from shapespace.report.blocks import Block, Cell, Column, Facts, Folded, Group, Table, Text, facts_of, text_table
+from shapespace.report.blocks import (
+    Block,
+    Cell,
+    Column,
+    Command,
+    Facts,
+    Folded,
+    Group,
+    Notice,
+    Table,
+    Text,
+    facts_of,
+    text_table,
+)
 from shapespace.report.page import Chapter, Make, Page, Step, rendered
 from shapespace.report.saved import Folder, has_fits
-from shapespace.report.study_parts import FILE, MOST_PARAGRAPH, MOST_ROWS, TITLES, StudyParts, paragraphs, wrong
-from shapespace.report.wording import DASH, counted, moment
-from shapespace.schemas import STUDY_AGAIN, Recognition, Target, check_format, read, read_part
+from shapespace.report.study_parts import (
+    ANALYSIS,
+    MOST_PARAGRAPH,
+    MOST_ROWS,
+    STUDY,
+    TITLES,
+    Kept,
+    StudyParts,
+    paragraphs,
+)
+from shapespace.report.wording import DASH, counted, listed, moment, printable
+from shapespace.schemas import Target, check_format, read, read_part
 from shapespace.version import __version__
 
 SECTION_BYTES = 1_500_000
 """How much of a report of fits is kept free for this section."""
 
+MOST_ANALYSES = 12
+"""How many analyses a report of fits shows."""
+
 _MOST_PARTS, _MOST_TEXT = 120, 400
 _PART_BYTES = 700_000
-_BESIDE = ("confusion", "calibration", "learning_curve", "modes", "face_map", "curve")
+_MOST_NOTES = 40
+_BESIDE = ("confusion", "calibration", "learning_curve", "modes", "face_map", "curve", "surface_map", "histogram")
 _CHAPTER = 2
 _T = TypeVar("_T")
 
 
-def is_study(folder: Folder) -> bool:
-    """Return whether `folder` holds a recognition.json and no fit, so that there is nothing else to report.
+def kept_alone(folder: Folder) -> Kept | None:
+    """Return what `folder` holds where it holds no fit, so that there is nothing else to report; None for neither.
 
-    One without a format is a free collection of scores, which is no study.
+    A file without a format is a free collection of scores, which is no study.
     """
-    return (folder.root / FILE).is_file() and not has_fits(folder) and "format" in _content(folder)
+    there = [kept for kept in (STUDY, ANALYSIS) if (folder.root / kept.file).is_file()]
+    if not there or has_fits(folder):
+        return None
+    return next((kept for kept in there if "format" in _content(folder, kept)), None)
 
 
-def study_page(folder: Folder, on_step: Step | None = None) -> str:
-    """Return the report of a study alone.
+def study_page(folder: Folder, kept: Kept, on_step: Step | None = None) -> str:
+    """Return the report of a study or an analysis alone.
 
     Args:
-        folder: with a recognition.json.
+        folder: with its file.
+        kept: which of them it is.
         on_step: told of each picture.
 
     Raises:
-        FileError: recognition.json cannot be read.
+        FileError: the file cannot be read.
         FileFormatError: it is damaged, or no file of this format.
     """
-    content = _content(folder)
+    content = _content(folder, kept)
     pictured = [part for part in _raw_parts(content) if _raw(part, "kind") not in ("table", "text")]
     page = Page(max(len(pictured), 1), on_step)
-    study = _Study(page, folder, content)
+    study = _Study(page, folder, kept, content)
     name = folder.root.resolve().name
     made = f"shapespace {study.head['version']}".strip()
     if study.head["created"]:
         made += f", {moment(study.head['created'])}"
     beside = ", beside the targets that were set for it" if content.get("targets") else ""
-    lead = [Text(f"What a study of recognition measured{beside}."), Text(f"{made}.", "soft")]
-    chapters = [Chapter("Summary", study.summary)] if content.get("summary") or content.get("targets") else []
+    lead = [Text(f"{kept.lead}{beside}."), Text(f"{made}.", "soft")]
+    said = any(content.get(key) for key in ("summary", "targets", "notes"))
+    chapters = [Chapter("Summary", study.summary)] if said else []
     for heading, make in study.chapters("Results", 3):
         chapters.append(Chapter(heading, make, heading if len(heading) <= 36 else f"{heading[:35]}…"))
     chapters.append(Chapter("Settings, versions and hashes", study.settings, "Settings"))
-    title = study.head["title"] or f"Recognition study in {name}"
+    title = study.head["title"] or f"{kept.title} in {name}"
     return page.html(title, lead, f"Made by shapespace {__version__} from the files in {name}.", chapters)
 
 
-def recognition_section(page: Page, folder: Folder) -> list[Block]:
-    """Return what a study measured, as a section of the report of fits.
+def study_section(page: Page, folder: Folder, kept: Kept = STUDY) -> list[Block]:
+    """Return what a study measured or an analysis found, as a section of the report of fits.
 
     Args:
         page: that it goes to.
-        folder: with a recognition.json.
+        folder: with its file.
+        kept: which of them it is.
 
     Raises:
-        FileError: recognition.json cannot be read.
+        FileError: the file cannot be read.
         FileFormatError: it is damaged, or no file of this format.
     """
-    content = _content(folder)
-    if "format" not in content:
+    content = _content(folder, kept)
+    if kept is STUDY and "format" not in content:
         return tables.score_tables(content, many="Scores by class", single="Scores")
-    study = _Study(page, folder, content)
+    study = _Study(page, folder, kept, content)
     out: list[Block] = [Text(study.head["title"])] if study.head["title"] else []
     out += page.tried(study.summary)
     for heading, make in study.chapters("", 4):
         out += [page.section(heading, make)] if heading else page.tried(make)
-    return [*out, Folded("Settings and versions of this study", page.tried(study.settings))]
+    return [*out, Folded(f"Settings and versions of this {kept.word}", page.tried(study.settings))]
 
 
-def _content(folder: Folder) -> dict[str, Any]:
-    return cast(dict[str, Any], _shortened(Folder(folder.root, STUDY_AGAIN).json(FILE)))
+def find_analyses(root: Path) -> list[Folder]:
+    """Return the folders that hold an analysis.json: `root` itself, and those directly in it, by name."""
+    inside: list[Path] = []
+    with os.scandir(root) as entries:
+        # A link may lead anywhere.
+        inside = sorted(Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False))
+    return [Folder(folder, ANALYSIS.again) for folder in (root, *inside) if (folder / ANALYSIS.file).is_file()]
+
+
+def analysis_chapters(page: Page, root: Path, found: Sequence[Folder]) -> list[Chapter]:
+    """Return a chapter for each of `found`, as `find_analyses` gives them, as far as there may be that many.
+
+    Args:
+        page: that they go to.
+        root: of the fits.
+        found: the folders.
+    """
+    out: list[Chapter] = []
+    for folder in found[:MOST_ANALYSES]:
+        name = folder.root.name if folder.root != root else ""
+        heading = printable(f"Analysis {name}".strip())
+        out.append(Chapter(heading, lambda folder=folder: _analysis(page, folder, root), heading[:36]))
+    rest = found[MOST_ANALYSES:]
+    if rest:
+        told = listed([printable(folder.root.name) for folder in rest], 40)
+        out.append(Chapter("Further analyses", lambda: Text(f"Not shown here, but each has its own report: {told}.")))
+    return out
+
+
+def _analysis(page: Page, folder: Folder, root: Path) -> list[Block]:
+    out = study_section(page, folder, ANALYSIS)
+    if folder.root == root:
+        return out
+    name = printable(folder.root.name)
+    return [*out, Text("This analysis in a report of its own:", "soft"), Command(f"shapespace report FOLDER/{name}")]
+
+
+def _content(folder: Folder, kept: Kept) -> dict[str, Any]:
+    return cast(dict[str, Any], _shortened(Folder(folder.root, kept.again).json(kept.file)))
 
 
 def _shortened(value: object, most: int = _MOST_TEXT) -> object:
@@ -100,7 +171,7 @@ def _shortened(value: object, most: int = _MOST_TEXT) -> object:
         return [_shortened(item, most) for item in cast(list[object], value)]
     if isinstance(value, dict):
         found = cast(dict[str, object], value)
-        long = ("note", "text", "summary", "settings")
+        long = ("note", "notes", "text", "summary", "settings")
         return {
             str(_shortened(key)): _shortened(item, MOST_PARAGRAPH if key in long else most)
             for key, item in found.items()
@@ -118,31 +189,40 @@ def _raw_parts(content: Mapping[str, object]) -> list[object]:
 
 
 class _Study:
-    """A study and the page that it goes to; each key of its file is read when it is shown."""
+    """A study or an analysis and the page that it goes to; each key of its file is read when it is shown."""
 
-    def __init__(self, page: Page, folder: Folder, content: Mapping[str, Any]) -> None:
-        check_format(content, Recognition, FILE, STUDY_AGAIN)
+    def __init__(self, page: Page, folder: Folder, kept: Kept, content: Mapping[str, Any]) -> None:
+        check_format(content, kept.struct, kept.file, kept.again)
         self.page = page
-        self.folder = Folder(folder.root, STUDY_AGAIN)
-        self.kinds = StudyParts(page, self.folder)
+        self.kept = kept
+        self.folder = Folder(folder.root, kept.again)
+        self.kinds = StudyParts(page, self.folder, kept)
         self.content = content
         texts = {key: content.get(key) for key in ("title", "version", "created")}
         self.head = {key: text if isinstance(text, str) else "" for key, text in texts.items()}
 
     def _read(self, key: str, kind: type[_T]) -> _T:
-        return read(kind, self.content.get(key), f"{FILE}: {key}", STUDY_AGAIN)
+        return read(kind, self.content.get(key), f"{self.kept.file}: {key}", self.kept.again)
 
     def summary(self) -> list[Block]:
-        """Return the sentences of the study, and what it aimed at beside what it reached."""
+        """Return its sentences, what it aimed at beside what it reached, and who was left out."""
         out: list[Block] = []
         if self.content.get("summary"):
             out += self.page.tried(self.sentences)
         if self.content.get("targets"):
             out += self.page.tried(self.targets)
+        if self.content.get("notes"):
+            out += self.page.tried(self.notes)
         return out
 
+    def notes(self) -> Notice:
+        """Return what should be known of it, such as who was left out."""
+        found = self._read("notes", tuple[str, ...])
+        rest = [f"{len(found) - _MOST_NOTES} more, in {self.kept.file}."] if len(found) > _MOST_NOTES else []
+        return Notice("To be known", [*found[:_MOST_NOTES], *rest])
+
     def sentences(self) -> list[Block]:
-        """Return the sentences of the study."""
+        """Return its sentences."""
         said = self.content["summary"]
         return paragraphs(said if isinstance(said, str) else self._read("summary", tuple[str, ...]))
 
@@ -201,7 +281,7 @@ class _Study:
 
     def no_parts(self) -> list[Block]:
         """Refuse parts that are no list."""
-        raise wrong("its parts are no list")
+        raise self.kept.wrong("its parts are no list")
 
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
@@ -237,13 +317,13 @@ class _Study:
 
     def made(self, part: object) -> list[Block]:
         """Return a part by its kind."""
-        return self.kinds.blocks(read_part(part, FILE), _title(part))
+        return self.kinds.blocks(read_part(part, self.kept.file, self.kept.again), _title(part))
 
     def settings(self) -> list[Block]:
         """Return with what the study was made."""
         rows = [("Report", f"shapespace {__version__}")]
         if self.head["version"]:
-            rows.append(("Study", f"shapespace {self.head['version']}"))
+            rows.append((self.kept.word.capitalize(), f"shapespace {self.head['version']}"))
         if self.head["created"]:
             rows.append(("Made", moment(self.head["created"])))
         out: list[Block] = [Facts(rows, "Made with")]

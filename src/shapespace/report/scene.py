@@ -174,6 +174,29 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     return pack(arrays, facts)
 
 
+def pack_morph(low: Mesh, high: Mesh, labels: tuple[str, str], *, largest: int = 20_000) -> bytes:
+    """Return what the widget of a morph needs: two shapes in correspondence as a mean and one mode, from -1 to 1.
+
+    Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (1, V, 3) mm, half of the difference.
+
+    Args:
+        low: where the slider begins.
+        high: in correspondence with it; where the slider ends.
+        labels: what they are.
+        largest: how many triangles (or points) are kept.
+    """
+    middle, half = (low.vertices + high.vertices) / 2, (high.vertices - low.vertices) / 2
+    mesh, kept = _small(low.with_vertices(middle), largest)
+    extent = float(np.ptp(middle, axis=0).max())
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {
+        "mean": quantised(mesh.vertices, step=min(_PLACE_STEP_MM, extent / 4000), coded=True),
+        "modes": quantised(half[None, kept], step=min(_MODE_STEP_MM, extent / 8000), by_row=True, coded=True),
+    }
+    if mesh.faces is not None:
+        arrays["faces"] = _indices(mesh.faces, len(mesh.vertices), coded=True)
+    return pack(arrays, {"kind": "morph", "low": labels[0], "high": labels[1]})
+
+
 def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: int | None = None) -> bytes:
     """Return what the widget of a fit needs: the scan, the model at each stage, distances, regions, iterations.
 

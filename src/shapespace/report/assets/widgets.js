@@ -258,6 +258,77 @@
       return { view, model, z, draw };
     });
 
+  // Two shapes ------------------------------------------------------------------------------------------------------
+
+  /** A slider that moves one shape to another. */
+  Shapespace.widgets.morph = (element, payload) =>
+    lazily(element, payload, (unpacked) => {
+      const model = new Shapespace.Model(unpacked), { low, high } = unpacked.facts;
+      const { view, controls } = stage(element, `A shape between ${low} and ${high}, as the slider says`);
+      const at = new Float32Array([-1]), positions = new Float32Array(3 * model.V);
+      view.setSurface("shape", { positions: model.vertices(at), faces: model.faces, colour: colours().clay });
+      view.frame();
+      const bar = make("div", { class: "ss-bar", hidden: true });
+      const draw = () => view.move("shape", model.vertices(at, positions));
+      const words = (value) => (value <= -1 ? low : value >= 1 ? high : `${Math.round(50 + 50 * value)} % of the way`);
+      const row = slider({
+        label: `${low} to ${high}`, min: -1, max: 1, step: 0.02, value: -1, show: words,
+        input: (value) => {
+          stop();
+          at[0] = value;
+          draw();
+        },
+      });
+      row.row.classList.add("ss-wide");
+      let playing = 0;
+      const toggle = button("Animate", () => (playing ? stop() : play()), { "aria-pressed": "false" });
+      function play() {
+        const start = performance.now(), phase = Math.asin(at[0]);
+        toggle.textContent = "Pause";
+        toggle.setAttribute("aria-pressed", "true");
+        const step = (now) => {
+          if (!element.isConnected) return;
+          playing = requestAnimationFrame(step);
+          at[0] = Math.sin(phase + Math.max(now - start, 0) * 0.0016);
+          row.put(at[0]);
+          draw();
+        };
+        playing = requestAnimationFrame(step);
+      }
+      function stop() {
+        cancelAnimationFrame(playing);
+        playing = 0;
+        toggle.textContent = "Animate";
+        toggle.setAttribute("aria-pressed", "false");
+      }
+      const map = model.faces ? colours().diverging : colours().sequential;
+      let change = null, top = 0;
+      const put = (value) => {
+        stop();
+        at[0] = value;
+        row.put(value);
+        draw();
+      };
+      controls.append(
+        make("div", { class: "ss-sliders", role: "group", "aria-label": "Between the two shapes" }, row.row),
+        make("div", { class: "ss-buttons" }, button(low, () => put(-1)), button(high, () => put(1)), toggle),
+        tick("Colour by how far it moves", false, (on) => {
+          if (on && !change) {
+            change = model.displacement([1]).map((value) => 2 * value);
+            top = niceCeiling(quantile(change, 0.98));
+            Shapespace.colourBar(bar, {
+              map, range: [model.faces ? -top : 0, top], unit: "mm", open: true,
+              title: model.faces ? "Inwards (\u2212) or outwards (+), from one end to the other" : "Moved",
+            });
+          }
+          bar.hidden = !on;
+          view.paint("shape", on ? change : null, { map, range: [model.faces ? -top : 0, top] });
+        }),
+        bar
+      );
+      return { view, model, at, draw };
+    });
+
   /** A number from the standard normal distribution. */
   function normal() {
     return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());

@@ -11,6 +11,7 @@ Pictures of one row share camera and light, one figure has one scale, and the ma
 readers. Importing this package needs the extra `report`.
 """
 
+from shapespace.report.figures.analysis import histogram_figure, looked_at, morph_figure, surface_map_figure
 from shapespace.report.figures.coefficients import Coefficients, b_plane, b_space, scatter_matrix
 from shapespace.report.figures.correspondence import (
     SIDE_DEG,
@@ -87,15 +88,18 @@ __all__ = [
     "error_curves",
     "face_map_figure",
     "faces_grid",
+    "histogram_figure",
     "history_figure",
     "importance_figure",
     "learning_curve_figure",
     "levels_figure",
+    "looked_at",
     "mean_figure",
     "mesh_rows_figure",
     "missing_figure",
     "mode_animation",
     "modes_figure",
+    "morph_figure",
     "movement_figure",
     "nearness_figure",
     "over_time_figure",
@@ -108,5 +112,6 @@ __all__ = [
     "signed_maps",
     "spectrum_figure",
     "stages_figure",
+    "surface_map_figure",
     "threshold_figure",
 ]

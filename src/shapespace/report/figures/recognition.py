@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +45,10 @@ from shapespace.types import FloatArray, IntArray, Mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
+CurveScale: TypeAlias = Literal["linear", "log", "probit"]
+"""How the numbers of a curve stand along an axis."""
 
 _BARS = "#a9c9e2"
 _MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40
@@ -51,6 +56,12 @@ _MOST_BARS, _MOST_NAMED_BARS, _STRONGEST = 40, 24, 3
 _MOST_REGIONS = 9
 _SIDES = (0.0, 40.0)
 _NO_PICTURE = 0.945
+_MOST_SERIES, _MOST_TICKS = 60, 9
+_LEAST_SHARE, _PROBIT_ROOM = 1e-6, 0.12
+_SHARES = (
+    1e-6, 1e-5, 1e-4, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995,
+    0.998, 0.999, 1 - 1e-4,
+)  # fmt: skip
 
 
 def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: str = "") -> Figure:
@@ -369,7 +380,15 @@ def _region_bars(figure: Figure, ranked: Sequence[tuple[str, float]]) -> None:
 
 
 def curve_figure(
-    series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]], *, x: str, y: str, title: str = ""
+    series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]],
+    *,
+    x: str,
+    y: str,
+    title: str = "",
+    bands: Sequence[tuple[npt.ArrayLike, npt.ArrayLike] | None] = (),
+    dots: Sequence[bool] = (),
+    scales: tuple[CurveScale, CurveScale] = ("linear", "linear"),
+    diagonal: bool = False,
 ) -> Figure:
     """Draw one measure against another, a line a series.
 
@@ -378,28 +397,124 @@ def curve_figure(
         x: what the places are, with their unit,
         y: and the values.
         title: above the figure; by default it says what is drawn.
+        bands: for each series the lower and the upper ends (n,) of a band around it, not-a-number where there is none;
+            None for none.
+        dots: for each series whether it is dots without a line.
+        scales: of places and values; on `probit` shares stand at their normal deviates, and those of 0 and 1 at the
+            edge. What is not positive has no place on `log`.
+        diagonal: draw where both are the same.
 
     Raises:
-        InputError: no series, or one whose lists are empty or of different lengths.
+        InputError: no series or too many, one whose lists are empty or of different lengths, or numbers that have no
+            place on their scale.
     """
-    if not series:
-        raise InputError("There is nothing to draw of a curve without numbers.")
-    figure, axes = chart(title or f"{plain(y)[:1].upper()}{plain(y)[1:]} against {plain(x)}", height=3.3)
+    if not 1 <= len(series) <= _MOST_SERIES:
+        raise InputError(f"A figure has 1 to {_MOST_SERIES} curves, not {len(series)}.")
+    found: list[_Curve] = []
     for k, (name, places, values) in enumerate(series):
         at = _numbers(places, f"the places of the curve {short(name)}")
         height = _numbers(values, f"the values of the curve {short(name)}")
         if not len(at) or at.shape != height.shape:
             raise InputError(f"The curve {short(name)!r} has {len(at)} places but {len(height)} values.")
+        band = bands[k] if k < len(bands) else None
+        ends = [_numbers(end, f"the band of the curve {short(name)}", finite=False) for end in band or ()]
+        if any(end.shape != at.shape for end in ends):
+            raise InputError(f"The band of the curve {short(name)!r} needs {len(at)} lower and {len(at)} upper ends.")
+        found.append(_Curve(name, at, height, ends, k < len(dots) and dots[k]))
+    limits = (
+        _scale_ends(scales[0], [curve.at for curve in found]),
+        _scale_ends(scales[1], [values for curve in found for values in (curve.height, *curve.ends)]),
+    )
+    square = diagonal and scales[0] == scales[1]
+    figure, axes = chart(
+        title or f"{plain(y)[:1].upper()}{plain(y)[1:]} against {plain(x)}", height=4.6 if square else 3.3
+    )
+    for k, curve in enumerate(found):
+        at, height, *ends = (
+            _placed(values, scales[axis], limits[axis])
+            for axis, values in ((0, curve.at), (1, curve.height), *((1, end) for end in curve.ends))
+        )
+        colour, label = CATEGORIES[k % len(CATEGORIES)], escaped(short(curve.name, 34)) or None
+        if ends:
+            axes.fill_between(at, ends[0], ends[1], color=colour, alpha=0.2, lw=0)
+        if curve.dots:
+            axes.scatter(at, height, s=16, color=colour, alpha=0.6, linewidths=0, label=label)
+            continue
         dashes = "-" if k < len(CATEGORIES) else (0, (4, 2))
-        axes.plot(
-            at, height, color=CATEGORIES[k % len(CATEGORIES)], ls=dashes, lw=2, ms=4,
-            marker="o" if len(at) < 40 else "", label=escaped(short(name, 34)) or None,
-        )  # fmt: skip
-    axes.set(xlabel=escaped(short(x, 70)), ylabel=escaped(wrap(y, 2.4 * DPI, TEXT)))
+        axes.plot(at, height, color=colour, ls=dashes, lw=2, ms=4, marker="o" if len(at) < 40 else "", label=label)
     axes.margins(y=0.12)
-    if any(name for name, _, _ in series):
+    axes.set_xscale("log" if scales[0] == "log" else "linear")
+    axes.set_yscale("log" if scales[1] == "log" else "linear")
+    for axis, kind, ends in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
+        _scaled(axis, kind, ends)
+    if diagonal:
+        low = max(axes.get_xlim()[0], axes.get_ylim()[0])
+        high = min(axes.get_xlim()[1], axes.get_ylim()[1])
+        if low < high:
+            axes.plot([low, high], [low, high], color=GREY, ls=(0, (4, 3)), lw=1.3, scalex=False, scaley=False)
+    axes.set(xlabel=escaped(short(x, 70)), ylabel=escaped(wrap(y, 2.4 * DPI, TEXT)))
+    if any(curve.name for curve in found):
         legend(axes, loc="best")
     return finish(figure)
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    name: str
+    at: FloatArray
+    height: FloatArray
+    ends: Sequence[FloatArray]
+    dots: bool
+
+
+def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the least and the greatest number that has a place on a scale.
+
+    Raises:
+        InputError: there is none, or shares beyond 0 to 1 on `probit`.
+    """
+    known = np.concatenate(values)
+    known = known[np.isfinite(known)]
+    if kind == "probit" and ((known < 0) | (known > 1)).any():
+        raise InputError("On a probit scale stand shares from 0 to 1.")
+    if kind != "linear":
+        known = known[(known > 0) & ((known < 1) | (kind == "log"))]
+    if not len(known):
+        if kind == "log":
+            raise InputError("On a logarithmic scale stand numbers above 0, and there are none.")
+        return 0.01, 0.99
+    low, high = float(known.min()), float(known.max())
+    return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
+
+
+def _placed(values: FloatArray, kind: CurveScale, ends: tuple[float, float]) -> FloatArray:
+    """Return numbers as they are drawn: normal deviates on `probit`, nothing for what has no place on `log`."""
+    if kind == "probit":
+        from scipy.special import ndtri
+
+        low, high = ndtri(ends[0]) - _PROBIT_ROOM, ndtri(ends[1]) + _PROBIT_ROOM
+        return np.clip(ndtri(np.clip(values, 0, 1)), low, high)
+    return np.where(values > 0, values, np.nan) if kind == "log" else values
+
+
+def _scaled(axis: Axis, kind: CurveScale, ends: tuple[float, float]) -> None:
+    """Give an axis its scale and ticks that people read."""
+    if kind == "log":
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        if ends[1] < 30 * ends[0]:
+            axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+        else:
+            axis.set_minor_formatter(lambda value, _: "")
+    if kind == "probit":
+        from scipy.special import ndtri
+
+        low, high = float(ndtri(ends[0])) - _PROBIT_ROOM, float(ndtri(ends[1])) + _PROBIT_ROOM
+        ticks = [share for share in _SHARES if low <= ndtri(share) <= high]
+        # Their words would touch where the whole range is shown.
+        while len(ticks) > _MOST_TICKS:
+            ticks = ticks[::2]
+        axis.set_ticks(ndtri(ticks).tolist(), [f"{100 * share:.4g} %" for share in ticks])
+        axis.set_view_interval(low - 0.02, high + 0.02, ignore=True)
 
 
 def mesh_rows_figure(
