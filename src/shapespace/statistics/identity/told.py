@@ -32,13 +32,13 @@ def in_percent(one: Figure) -> str:
     """Return a share with its interval in words."""
     if one.value is None:
         return "not known"
-    interval = "" if one.low is None or one.high is None else f" (95 %: {100 * one.low:.2f} to {100 * one.high:.2f} %)"
-    return f"{100 * one.value:.2f} %{interval}"
+    ends = interval(one)
+    return f"{100 * one.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
 
 
 def interval(one: Figure) -> tuple[float, float] | None:
-    """Return the ends of an interval as tables have them."""
-    return None if one.low is None or one.high is None else (one.low, one.high)
+    """Return the ends of an interval; None where there is none, or where no draw of people differs."""
+    return None if one.low is None or one.high is None or one.low == one.high else (one.low, one.high)
 
 
 def cells(one: Figure) -> list[object]:

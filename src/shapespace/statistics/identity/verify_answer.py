@@ -161,16 +161,17 @@ def _table(found: Verification) -> TablePart:
 
 
 def _det(found: Verification) -> CurvePart:
+    genuine = int(found.pairs.same.sum())
+    # A rate of 0 has no place on this scale, and a score without an error would have no line.
+    ends = [0.5 / (len(found.pairs) - genuine), 0.5 / genuine]
     series: list[Series] = []
     for one in found.scores:
-        kept = (one.roc.far >= _LEAST_RATE) & (one.roc.tar <= 1 - _LEAST_RATE) & (one.roc.far < 1) & (one.roc.tar > 0)
-        if kept.any():
-            series.append(thinned(one.roc.far[kept], 1 - one.roc.tar[kept], called(one.name)))
-    perfect = [called(one.name) for one in found.scores if not (one.eer.value or 0.0)]
+        rates = (one.roc.far[1:-1], 1 - one.roc.tar[1:-1])
+        far, missed = (np.clip(rate, end, 1 - end) for rate, end in zip(rates, ends, strict=True))
+        series.append(thinned(far, missed, called(one.name)))
     return CurvePart(
         title="DET curve",
-        note="Both errors at their normal deviates."
-        + (f" Without an error, and so without a line: {', '.join(perfect)}." if perfect else ""),
+        note="Both errors at their normal deviates; none at all stands at half a pair.",
         series=tuple(series),
         x="false accept rate",
         y="false reject rate",
