@@ -6,6 +6,8 @@ import pytest
 from identity_people import people
 from shapespace.statistics.identity.scores import SCORES
 
+pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
+
 
 @pytest.fixture(scope="module")
 def training():

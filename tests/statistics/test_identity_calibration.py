@@ -8,6 +8,8 @@ import pytest
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Pairs
 
+pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
+
 
 def well_calibrated(n, seed=0, distance=2.0):
     """Scores of two unit normal distributions `distance` apart are their own log likelihood ratios, times `distance`."""

@@ -13,6 +13,8 @@ from shapespace.statistics.identity.rates import Sweep
 from shapespace.statistics.identity.samples import Samples
 from shapespace.statistics.identity.scores import SCORES
 
+pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
+
 
 def eer(score, gallery, probes):
     same = np.asarray(gallery.subjects)[:, None] == np.asarray(probes.subjects)

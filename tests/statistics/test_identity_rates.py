@@ -8,6 +8,8 @@ from shapespace.errors import InputError
 from shapespace.statistics.identity.identify import Searches, search
 from shapespace.statistics.identity.rates import Pairs, Sweep, figure, people_drawn, resampled
 
+pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
+
 
 def scores(seed, genuine=40, impostor=300, *, digits=None):
     rng = np.random.default_rng(seed)

@@ -17,6 +17,8 @@ from shapespace.statistics.identity.rounds import IdentityOptions, rows_of, tria
 from shapespace.statistics.identity.samples import samples_of
 from shapespace.statistics.identity.verify import verify
 
+pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
+
 FEW = IdentityOptions(draws=20)
 
 
