@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
-from shapespace.cli.answers import asymmetry, change, compare, regress, score
+from shapespace.cli.answers import asymmetry, change, compare, identity, regress, score
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -359,11 +359,19 @@ def _add_convert(commands: Any) -> None:
 
 def _add_recognise(commands: Any) -> None:
     sub = commands.add_parser("recognise", help="tell expressions or other classes apart by fitted coefficients")
-    sub = sub.add_subparsers(required=True, metavar="train|predict|transfer|study")
+    sub = sub.add_subparsers(required=True, metavar="train|predict|transfer|study|verify|identify")
     _add_recognise_train(sub)
     _add_recognise_predict(sub)
     _add_recognise_transfer(sub)
     _add_recognise_study(sub)
+    identity.add_verify(
+        _add(sub, "verify", "are two scans of one person: error rates and calibrated likelihood ratios",
+             "shapespace recognise verify scans.csv -o verified --gallery expression=neutral")
+    )  # fmt: skip
+    identity.add_identify(
+        _add(sub, "identify", "which of the people enrolled does a scan show: ranks, and what is missed",
+             "shapespace recognise identify scans.csv -o identified --gallery expression=neutral")
+    )  # fmt: skip
 
 
 def _add_recognise_train(commands: Any) -> None:

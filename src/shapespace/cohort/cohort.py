@@ -17,6 +17,7 @@ from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
@@ -36,6 +37,7 @@ class Fitted:
         status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
         folder: of the results, as it was given.
         beyond_mm: (N,) RMS of what the model left of the residuals, mm, NaN where a fit does not say; None for none.
+        additive: the same model where its file parts identity and expression.
     """
 
     model: ShapeModel
@@ -44,6 +46,7 @@ class Fitted:
     status: tuple[str, ...]
     folder: str
     beyond_mm: FloatArray | None = None
+    additive: AdditiveModel | None = None
 
     @cached_property
     def z(self) -> FloatArray:

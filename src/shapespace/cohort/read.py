@@ -15,6 +15,7 @@ from shapespace.cohort.table import Table, named, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.meshes import stem_of
+from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import SURFACE, surface_files
 from shapespace.store.results import ENDINGS, Results, mesh_at, modes_of
@@ -170,7 +171,7 @@ def _of_results(
         )
     fits = [row for row, _ in kept]
     _refuse_mixed(fits, results.folder)
-    model = _model_of(results, fits[0], options.model)
+    model, additive = _model_of(results, fits[0], options.model)
     stated = table.take([at for _, at in kept])
     names = tuple(row.name for row in fits)
     sizes = read_only([row.size_mm for row in fits])
@@ -182,6 +183,7 @@ def _of_results(
         tuple(row.status for row in fits),
         str(results.folder),
         read_only([row.beyond_mm for row in fits]),
+        additive,
     )
     if options.surfaces == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
@@ -292,15 +294,16 @@ def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
             raise InputError(f"{known} and {row.name} are fits of the same scan; leave one of them out of the table.")
 
 
-def _model_of(results: Results, fit: _Row, given: Path | None) -> ShapeModel:
+def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:
     source: dict[str, Any] = results.record(fit.name)["model"]
     path = given or results.folder / str(source.get("path") or source.get("name", ""))
     if given is None and not path.is_file():
         raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
-    model = ShapeModel.load(path)
+    found = load_model(path)
+    model, additive = (found.shape, found) if isinstance(found, AdditiveModel) else (found, None)
     if model.content_hash != fit.model_hash:
         raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
-    return model
+    return model, additive
 
 
 def _stem(file: Path) -> str:

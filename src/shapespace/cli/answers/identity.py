@@ -1,0 +1,116 @@
+"""`shapespace recognise verify` and `shapespace recognise identify`: who is it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from shapespace.cli.answers.common import add_cohort, cohort_of, finish
+
+if TYPE_CHECKING:
+    from shapespace.cohort.cohort import Cohort
+    from shapespace.statistics.identity.rounds import IdentityOptions
+
+
+def add_verify(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of verification."""
+    _add_who(sub)
+    sub.add_argument("--curve", type=_counts, default=(), metavar="K,K,...",
+                     help="find the equal error rate for these numbers of modes too")  # fmt: skip
+    sub.add_argument("--by", metavar="COLUMN", help="figures for each value of this column of the probes")
+    sub.set_defaults(run=run_verify)
+
+
+def add_identify(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of identification."""
+    _add_who(sub)
+    sub.set_defaults(run=run_identify, curve=(), by=None)
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    """Are two scans of one person."""
+    from shapespace.batch.progress import progress
+    from shapespace.statistics.identity.verify import verify
+
+    cohort, options = _asked(arguments)
+    with progress(None, "comparing", "draw", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = verify(cohort, options, on_step=step)
+    return finish(found.answer(), arguments)
+
+
+def run_identify(arguments: argparse.Namespace) -> int:
+    """Which of the people enrolled does a scan show."""
+    from shapespace.batch.progress import progress
+    from shapespace.statistics.identity.identify import identify
+
+    cohort, options = _asked(arguments)
+    with progress(None, "searching", "score", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = identify(cohort, options, on_step=step)
+    return finish(found.answer(), arguments)
+
+
+def _add_who(sub: argparse.ArgumentParser) -> None:
+    add_cohort(sub)
+    sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
+    sub.add_argument("--gallery", metavar="EXPR",
+                     help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all)")  # fmt: skip
+    sub.add_argument("--probe", metavar="EXPR", help="who is searched for (default: all others)")
+    sub.add_argument("--train", metavar="EXPR", help="who is learned from (default: the people of other folds)")
+    sub.add_argument("--role", metavar="COLUMN",
+                     help="that says gallery, probe or train instead (default: role, if there is one)")  # fmt: skip
+    sub.add_argument("--folds", type=int, metavar="N", help="parts of the people, each tested by the others (default 4)")
+    sub.add_argument("--scores", type=_names, metavar="LIST",
+                     help="likelihood-ratio, cosine, mahalanobis or distance, first the one that is told of first "
+                     "(default: all)")  # fmt: skip
+    sub.add_argument("--modes", type=int, metavar="K", help="leading coefficients of identity (default: all)")
+    sub.add_argument("--no-uncertainty", action="store_true", help="take all fits for exact")
+    sub.add_argument("--draws", type=int, default=1000, metavar="N", help="of people, for intervals (default 1000)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of folds and draws (default 0)")
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:
+    from shapespace.statistics.identity.rounds import IdentityOptions
+
+    cohort = cohort_of(arguments, "shape")
+    if arguments.surfaces != "coefficients":
+        cohort = replace(cohort, fitted=None)
+    chosen: dict[str, Any] = {} if arguments.scores is None else {"scores": arguments.scores}
+    options = IdentityOptions(
+        subject=arguments.subject,
+        gallery=arguments.gallery,
+        probe=arguments.probe,
+        train=arguments.train,
+        role=arguments.role,
+        folds=arguments.folds,
+        modes=arguments.modes,
+        curve=arguments.curve,
+        by=arguments.by,
+        uncertainty=not arguments.no_uncertainty,
+        draws=arguments.draws,
+        seed=arguments.seed,
+        drop_missing=arguments.drop_missing,
+        **chosen,
+    )
+    return cohort, options
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be numbers of modes such as 2,5,10, not {text!r}") from None

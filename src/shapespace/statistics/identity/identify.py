@@ -1,0 +1,210 @@
+"""Which of the people enrolled does a scan show: ranks, and what is missed where nobody need be enrolled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.errors import InputError
+from shapespace.statistics.answer import Answer
+from shapespace.statistics.identity.rates import Figure, figure, people_drawn
+from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+FPIR = (1e-1, 1e-2)
+"""Shares of searches for people who are not enrolled that find somebody, at which the misses are told."""
+
+_JUST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Searches:
+    """What each probe found in a gallery.
+
+    Args:
+        person: (S,) number of whom each probe shows.
+        rank: (S,) place of that person among all enrolled, 1 for the first, ties counted against it; 0 where they are
+            not enrolled.
+        own: (S,) score of that person; minus infinity where they are not enrolled.
+        best_other: (S,) the highest score of anybody else.
+    """
+
+    person: IntArray
+    rank: IntArray
+    own: FloatArray
+    best_other: FloatArray
+
+    @property
+    def enrolled(self) -> BoolArray:
+        """(S,) whose person is in the gallery."""
+        return self.rank > 0
+
+    def cmc(self, most: int, weights: FloatArray | None = None) -> FloatArray:
+        """Return (most,) the share of enrolled probes found within the first 1, 2, ... people."""
+        w = (np.ones(len(self.rank)) if weights is None else weights)[self.enrolled]
+        at = np.minimum(self.rank[self.enrolled] - 1, most)
+        return np.cumsum(np.bincount(at, weights=w, minlength=most + 1))[:most] / w.sum()
+
+    def fnir(self, fpir: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+        """Return the share of enrolled probes missed at thresholds that let at most `fpir` of others in.
+
+        Those others are probes of people who are not enrolled or, where there are none, all probes searched for without
+        their own person. A miss is a person who is below the threshold or not the first.
+        """
+        w = np.ones(len(self.rank)) if weights is None else weights
+        strangers = ~self.enrolled if not self.enrolled.all() else self.enrolled
+        score, own = self.best_other[strangers], w[strangers]
+        order = np.argsort(-score, kind="stable")
+        ranked, let_in = score[order], np.cumsum(own[order]) / own.sum()
+        # The lowest score that may be let in at each threshold, ties let in together.
+        ends = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
+        count = np.searchsorted(let_in[ends], np.asarray(fpir) * (1 + _JUST), side="right")
+        first_refused = np.append(ranked[ends], -np.inf)[count]
+        hit = (self.rank == 1)[:, None] & (self.own[:, None] > first_refused)
+        return 1.0 - np.average(hit[self.enrolled], axis=0, weights=w[self.enrolled])
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """How well one score finds people.
+
+    Args:
+        name: of the score.
+        searches: of all probes.
+        rank_1: share of enrolled probes whose person is first.
+        cmc: (R,) share found within the first 1 to R people.
+        band: (2, R) ends of its interval.
+        fnir: FPIR -> share missed; without a value where there are too few searches to say.
+    """
+
+    name: str
+    searches: Searches
+    rank_1: Figure
+    cmc: FloatArray
+    band: FloatArray
+    fnir: Mapping[float, Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What identification in a cohort found.
+
+    Args:
+        scores: one for each score that was asked for, in that order.
+        enrolled: people in the gallery; the least of all rounds.
+        probes: how many searches there were.
+        trained_on: how many people were learned from; the least of all rounds.
+        trial: who was who.
+        options: that it was asked with.
+    """
+
+    scores: tuple[Identified, ...]
+    enrolled: int
+    probes: int
+    trained_on: int
+    trial: Trial
+    options: IdentityOptions
+
+    def __getitem__(self, name: str) -> Identified:
+        return next(one for one in self.scores if one.name == name)
+
+    def answer(self) -> Answer:
+        """Return it as it is kept and reported."""
+        from shapespace.statistics.identity.identify_answer import answer
+
+        return answer(self)
+
+
+def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
+    """Return what probes find: a person's score is that of the scan of them that is most like the probe.
+
+    Args:
+        scores: (G, P).
+        gallery: (G,) number of whom each scan shows.
+        probes: (P,) the same.
+
+    Raises:
+        InputError: fewer than two people are enrolled.
+    """
+    people, whose = np.unique(gallery, return_inverse=True)
+    if len(people) < 2:
+        raise InputError(f"{len(people)} people are enrolled, and two are the least to tell apart; use fewer folds.")
+    best = np.full((len(people), len(probes)), -np.inf)
+    np.maximum.at(best, whose, scores)
+    own = people[:, None] == probes
+    others = np.where(own, -np.inf, best)
+    of_own = np.where(own, best, -np.inf).max(axis=0)
+    enrolled = own.any(axis=0)
+    rank = np.where(enrolled, 1 + (others >= of_own).sum(axis=0), 0)
+    return Searches(probes, rank.astype(np.int32), of_own, others.max(axis=0))
+
+
+def identify(
+    cohort: Cohort, options: IdentityOptions | None = None, *, on_step: Callable[[int, int], None] | None = None
+) -> Identification:
+    """Return how well people are found among those enrolled.
+
+    Args:
+        cohort: scans of which the table says whom they show.
+        options: who is enrolled; None enrols the first scan of each person. With folds, people are searched for among
+            those of their own fold.
+        on_step: called with (done, total).
+
+    Raises:
+        InputError: as `trial_of`, or too few people to learn from.
+        ShapespaceError: scikit-learn is not installed.
+    """
+    options = options or IdentityOptions()
+    trial = trial_of(cohort, options, enrol=True)
+    parts: dict[str, list[Searches]] = {name: [] for name in options.scores}
+    sizes: list[int] = []
+    for round_, found in scores_of(trial, options, options.modes):
+        gallery, probes = (trial.person[list(rows)] for rows in (round_.gallery, round_.probes))
+        sizes.append(len(np.unique(gallery)))
+        for name, scores in found.items():
+            parts[name].append(search(scores, gallery, probes))
+    people = people_drawn(trial.tested, options.draws, options.seed)
+    found_by: list[Identified] = []
+    for number, (name, told) in enumerate(parts.items()):
+        found_by.append(identified(name, joined(told), min(sizes), people))
+        if on_step is not None:
+            on_step(number + 1, len(parts))
+    learned = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
+    probes = sum(len(one.probes) for one in trial.rounds)
+    return Identification(tuple(found_by), min(sizes), probes, learned, trial, options)
+
+
+def joined(parts: Sequence[Searches]) -> Searches:
+    """Return the searches of several rounds as one."""
+    fields = ("person", "rank", "own", "best_other")
+    return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
+
+
+def identified(name: str, searches: Searches, most: int, people: FloatArray) -> Identified:
+    """Return the figures of one score.
+
+    Args:
+        name: of it.
+        searches: of all probes.
+        most: ranks that are told.
+        people: (draws, P) from `people_drawn`.
+    """
+    rates = np.array(FPIR)
+    rows: list[FloatArray] = []
+    for times in people:
+        weights = times[searches.person]
+        strangers = ~searches.enrolled if not searches.enrolled.all() else searches.enrolled
+        if weights[searches.enrolled].sum() > 0 and weights[strangers].sum() > 0:
+            rows.append(np.concatenate([searches.cmc(most, weights), searches.fnir(rates, weights)]))
+    drawn = np.array(rows).reshape(len(rows), most + len(rates))
+    cmc, fnir = searches.cmc(most), searches.fnir(rates)
+    searched = len(searches.rank) if searches.enrolled.all() else int((~searches.enrolled).sum())
+    band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
+    missed = {
+        rate: figure(float(fnir[k]), drawn[:, most + k]) if searched * rate >= 1 else Figure(None)
+        for k, rate in enumerate(FPIR)
+    }
+    return Identified(name, searches, figure(float(cmc[0]), drawn[:, 0]), cmc, band, missed)

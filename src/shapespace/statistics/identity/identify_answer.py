@@ -1,0 +1,129 @@
+"""The answer of identification as it is kept and reported."""
+
+from __future__ import annotations
+
+from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.statistics.answer import Answer
+from shapespace.statistics.identity.identify import Identification, Identified
+from shapespace.statistics.identity.told import (
+    called,
+    cells,
+    hashes,
+    in_percent,
+    interval,
+    none_missed,
+    role_of,
+    seen,
+    settings,
+    who_was_tested,
+)
+
+
+def answer(found: Identification) -> Answer:
+    """Return what `shapespace recognise identify` writes."""
+    trial, first = found.trial, found.scores[0]
+    strangers = int((~first.searches.enrolled).sum())
+    summary = seen(
+        [
+            f"By {called(first.name)} the right person is the first of {found.enrolled} in {in_percent(first.rank_1)} of "
+            f"{found.probes - strangers} searches.",
+            *(
+                f"Where {100 * rate:g} % of searches for strangers may find somebody, {in_percent(one)} of those enrolled "
+                "are missed."
+                for rate, one in first.fnir.items()
+                if one.value is not None
+            ),
+            *(
+                f"By {called(one.name)} the right person is the first in {in_percent(one.rank_1)}."
+                for one in found.scores[1:]
+            ),
+            who_was_tested(trial, found.trained_on),
+        ]
+    )
+    lost = [rate for rate, one in first.fnir.items() if one.value is None]
+    notes = seen(
+        [
+            *trial.notes,
+            none_missed((first.rank_1.value or 0.0) < 1, int(trial.tested.sum())),
+            f"There are too few searches for a false positive identification rate of {', '.join(f'{r:g}' for r in lost)}."
+            if lost
+            else "",
+            "" if strangers else "Nobody is a stranger, so each probe is searched for once more without its own person.",
+        ]
+    )
+    rows = [
+        (name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)
+    ]
+    told = ("score", "figure", "value", "low", "high")
+    return Answer(
+        question="recognise identify",
+        title="Who is it? Identification",
+        summary=summary,
+        parts=_parts(found),
+        tables={
+            "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
+            "scans.csv": (("scan", "subject", "role"), rows),
+        },
+        arrays={
+            "searches.npz": {
+                f"{field}_{one.name}": getattr(one.searches, field)
+                for one in found.scores
+                for field in ("rank", "own", "best_other")
+            }
+        },
+        notes=notes,
+        settings=settings(found.options),
+        model_hashes=hashes(trial),
+    )
+
+
+def _rows(one: Identified) -> list[list[object]]:
+    rows: list[list[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
+    rows += [[one.name, f"within {k}", share, *ends] for k, (share, *ends) in enumerate(
+        zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)]  # fmt: skip
+    rows += [[one.name, f"fnir at fpir {rate:g}", *cells(told)] for rate, told in one.fnir.items()]
+    return rows
+
+
+def _parts(found: Identification) -> tuple[Part, ...]:
+    columns = [TableColumn(name="score"), TableColumn(name="first", kind="percent"),
+               TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    for rate in found.scores[0].fnir:
+        columns += [TableColumn(name=f"FNIR at FPIR {rate:g}", kind="percent"),
+                    TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    rows = tuple(
+        (called(one.name), one.rank_1.value, interval(one.rank_1),
+         *(cell for told in one.fnir.values() for cell in (told.value, interval(told))))
+        for one in found.scores
+    )  # fmt: skip
+    ranks = tuple(float(k) for k in range(1, found.enrolled + 1))
+    return (
+        TablePart(
+            title="How well people are found",
+            note="FPIR: searches for somebody who is not enrolled that find somebody. FNIR: searches for somebody "
+            "enrolled that do not find them first and above the threshold.",
+            columns=tuple(columns),
+            rows=rows,
+        ),
+        CurvePart(
+            title="CMC curve",
+            note="How often the right person is within the first so many.",
+            series=tuple(
+                Series(x=ranks, y=tuple(one.cmc.tolist()), label=called(one.name),
+                       low=tuple(one.band[0].tolist()), high=tuple(one.band[1].tolist()))
+                for one in found.scores
+            ),
+            x="rank",
+            y="share of searches",
+        ),
+        TextPart(
+            title="How it was measured",
+            text=(
+                who_was_tested(found.trial, found.trained_on),
+                f"{found.enrolled} people are enrolled"
+                + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
+                + " A person's score is that of the scan of them that is most like the probe; ties count against the right"
+                " one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
+            ),
+        ),
+    )  # fmt: skip

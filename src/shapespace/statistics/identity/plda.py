@@ -1,0 +1,115 @@
+"""The likelihood ratio of two scans being of one person, by normal within- and between-person covariance.
+
+A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows and the error of its fit. W differs from
+scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers, "The speaker
+partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006. Uncertainty that is
+stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.linalg import eigh
+
+from shapespace.errors import InputError
+from shapespace.late import other_package
+from shapespace.statistics.identity.samples import Samples
+from shapespace.types import FloatArray, read_only
+
+_MOST_NOISE, _LEAST_BETWEEN = 0.9, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TwoCovariance:
+    """Between- and within-person covariance, in the coordinates in which both are diagonal.
+
+    Args:
+        mean: (K,) of all people.
+        basis: (K, K) columns v with v^T W v = 1, so that basis^T B basis is diagonal.
+        between: (K,) that diagonal.
+        noise: (K,) share of the covariance within that is taken for errors of fits.
+        noise_scale: (K,) of the variances that fits state, so that those of training make up `noise` on average.
+        people: learned from.
+        scans: learned from.
+    """
+
+    mean: FloatArray
+    basis: FloatArray
+    between: FloatArray
+    noise: FloatArray
+    noise_scale: FloatArray
+    people: int
+    scans: int
+
+    @staticmethod
+    def learn(training: Samples) -> TwoCovariance:
+        """Return the covariances of `training`, shrunk as far as Ledoit and Wolf find it needs (2004).
+
+        The errors that fits state are part of the covariance within. Where they exceed nine tenths of it they are
+        scaled down to that: files keep their diagonal alone, which overstates the error in those directions in which
+        errors of several coefficients cancel.
+
+        Raises:
+            InputError: fewer than three people, or nobody of them has two scans.
+            ShapespaceError: scikit-learn is not installed.
+        """
+        shrunk = other_package("sklearn.covariance", "The likelihood ratio", "'shapespace[statistics]'").ledoit_wolf
+        names, whose = np.unique(np.asarray(training.subjects), return_inverse=True)
+        counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
+        if len(names) < 3 or counts.max(initial=0.0) < 2:
+            raise InputError(
+                f"The likelihood ratio learns from people who are not tested, and there are {len(names)}, of whom "
+                f"{int((counts > 1).sum())} have two scans; give three people or more and several scans of each, or "
+                "leave it out of --scores."
+            )
+        n, k = training.x.shape
+        means = np.zeros((len(names), k))
+        np.add.at(means, whose, training.x)
+        means /= counts[:, None]
+        mean = means.mean(axis=0)
+        own = training.x - means[whose]
+        several = counts[whose] > 1
+        freedom = several.sum() - (counts > 1).sum()
+        within = cast(FloatArray, shrunk(own[several], assume_centered=True)[0]) * (several.sum() / freedom)
+        spread = cast(FloatArray, shrunk(means - mean, assume_centered=True)[0]) * (len(names) / (len(names) - 1))
+        between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)
+        values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
+        stated = training.variance.mean(axis=0) @ basis**2
+        noise = np.minimum(stated, _MOST_NOISE)
+        scale = np.divide(noise, stated, out=np.ones(k), where=stated > 0)
+        arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
+        return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
+
+    def log_ratio(self, gallery: Samples, probes: Samples) -> FloatArray:
+        """Return (G, P) log likelihood ratios, natural, of one person against two.
+
+        The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
+        the coordinates of `basis` is used.
+        """
+        g, p = (samples.x - self.mean for samples in (gallery, probes))
+        g, p = g @ self.basis, p @ self.basis
+        # Total variances, (G, K) and (P, K).
+        of_g, of_p = (self.between + self.within(one) for one in (gallery, probes))
+        alone = (p**2 / of_p + np.log(of_p)).sum(axis=1)
+        out = np.empty((len(g), len(p)))
+        for row, (x, total) in enumerate(zip(g, of_g, strict=True)):
+            # Of the probe given the gallery scan, if they are of one person.
+            pull = self.between / total
+            left = of_p - self.between * pull
+            together = ((p - pull * x) ** 2 / left + np.log(left)).sum(axis=1)
+            out[row] = 0.5 * (alone - together)
+        return out
+
+    def within(self, samples: Samples) -> FloatArray:
+        """Return (N, K) variances within a person, of which 1 is usual, in the coordinates of `basis`."""
+        return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
+
+
+def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:
+    """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
+    shares, vectors = cast(tuple[FloatArray, FloatArray], eigh(part, whole))
+    back = np.linalg.inv(vectors)
+    return (back.T * np.maximum(1.0 - shares, least)) @ back

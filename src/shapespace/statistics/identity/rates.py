@@ -1,0 +1,161 @@
+"""Error rates of verification: ROC, EER and TAR at FAR from scores of pairs, and their spread over people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+_LEVEL = 0.95
+_JUST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of scans.
+
+    Args:
+        one: (M,) number of the person of the first.
+        other: (M,) and of the second.
+        rows: (M, 2) of the cohort.
+    """
+
+    one: IntArray
+    other: IntArray
+    rows: IntArray
+
+    def __len__(self) -> int:
+        return len(self.one)
+
+    @cached_property
+    def same(self) -> BoolArray:
+        """(M,) whether both are of one person."""
+        return self.one == self.other
+
+    def take(self, chosen: BoolArray) -> Pairs:
+        """Return the chosen ones, (M,)."""
+        return Pairs(self.one[chosen], self.other[chosen], self.rows[chosen])
+
+    def weights(self, times: FloatArray) -> FloatArray:
+        """Return (M,) how often each pair is there if person k is there `times[k]` times."""
+        return np.where(self.same, times[self.one], times[self.one] * times[self.other])
+
+
+@dataclass(frozen=True, eq=False)
+class Roc:
+    """Rates against the threshold: a pair is accepted if its score is at least that.
+
+    Args:
+        threshold: (T,) falling, the first of them infinite.
+        far: (T,) share of impostor pairs accepted, from 0 to 1.
+        tar: (T,) share of genuine pairs accepted, from 0 to 1.
+    """
+
+    threshold: FloatArray
+    far: FloatArray
+    tar: FloatArray
+
+    @property
+    def eer(self) -> float:
+        """Where as many genuine pairs are refused as impostors accepted, between the two nearest thresholds."""
+        gap = 1.0 - self.tar - self.far
+        after = int(np.argmax(gap <= 0))
+        before = after - 1
+        share = gap[before] / (gap[before] - gap[after])
+        return float(self.far[before] + share * (self.far[after] - self.far[before]))
+
+    def tar_at(self, far: float | FloatArray) -> FloatArray:
+        """Return the share of genuine pairs accepted at the largest threshold range whose FAR is at most `far`."""
+        return self.tar[np.searchsorted(self.far, np.asarray(far) * (1 + _JUST), side="right") - 1]
+
+
+class Sweep:
+    """All thresholds of some scores, sorted once for any weights.
+
+    Args:
+        score: (M,).
+        same: (M,) genuine pairs.
+
+    Raises:
+        InputError: scores that are not finite, or no pair of one of both kinds.
+    """
+
+    def __init__(self, score: FloatArray, same: BoolArray) -> None:
+        if score.shape != same.shape or not np.isfinite(score).all():
+            raise InputError("Rates need a finite score for each pair.")
+        if same.all() or not same.any():
+            raise InputError(
+                f"There are {int(same.sum())} pairs of one person and {int((~same).sum())} of two; rates need both."
+            )
+        self._order = np.argsort(-score, kind="stable")
+        ranked = score[self._order]
+        self._ends = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
+        self._threshold = np.concatenate([[np.inf], ranked[self._ends]])
+        self._same = same[self._order]
+
+    def roc(self, weights: FloatArray | None = None) -> Roc:
+        """Return the rates with each pair counted as often as `weights` (M,) says; None for once."""
+        w = np.ones(len(self._order)) if weights is None else weights[self._order]
+        genuine = np.cumsum(np.where(self._same, w, 0.0))
+        impostor = np.cumsum(np.where(self._same, 0.0, w))
+        rates = [np.concatenate([[0.0], total[self._ends] / total[-1]]) for total in (impostor, genuine)]
+        return Roc(self._threshold, *rates)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure with the ends of its interval of 95 % over people; None where the data cannot say."""
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+
+def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
+    """Return (draws, P) how often each person is there in draws with replacement of those who are `tested` (P,)."""
+    rng = np.random.default_rng((seed, 14))
+    count = int(tested.sum())
+    out = np.zeros((draws, len(tested)))
+    out[:, tested] = rng.multinomial(count, np.full(count, 1.0 / count), size=draws)
+    return out
+
+
+def figure(value: float | None, drawn: Sequence[float] | FloatArray) -> Figure:
+    """Return a figure with the interval that figures of resampled people span."""
+    known = np.asarray([one for one in drawn if np.isfinite(one)])
+    if value is None or not len(known):
+        return Figure(value)
+    tail = 50.0 * (1.0 - _LEVEL)
+    low, high = np.percentile(known, [tail, 100.0 - tail])
+    return Figure(value, float(low), float(high))
+
+
+def resampled(
+    pairs: Pairs,
+    people: FloatArray,
+    of: Callable[[FloatArray], FloatArray],
+    figures: int,
+    on_draw: Callable[[], None] | None = None,
+) -> FloatArray:
+    """Return the (draws, figures) that `of` makes of the weights of pairs; NaN where a draw loses a kind of pair.
+
+    Args:
+        pairs: of whom.
+        people: (draws, P) from `people_drawn`.
+        of: (M,) weights -> (figures,).
+        figures: how many.
+        on_draw: called after each draw.
+    """
+    out = np.full((len(people), figures), np.nan)
+    for row, times in zip(out, people, strict=True):
+        weights = pairs.weights(times)
+        if weights[pairs.same].sum() > 0 and weights[~pairs.same].sum() > 0:
+            row[:] = of(weights)
+        if on_draw is not None:
+            on_draw()
+    return out

@@ -1,0 +1,262 @@
+"""Who is enrolled, who is searched for, and who is learned from: never a person of both."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import Table, named
+from shapespace.errors import InputError
+from shapespace.statistics.identity.rates import Pairs
+from shapespace.statistics.identity.samples import Samples, samples_of
+from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+ROLES = ("gallery", "probe", "train")
+_FOLDS, _GROUPS = 4, 5
+
+
+@dataclass(frozen=True)
+class IdentityOptions:
+    """Who is compared with whom, and how.
+
+    Args:
+        subject: the column that says whom a scan shows.
+        gallery: who is enrolled, as `column=value,value` or `column!=value`; None for no gallery, all against all.
+        probe: who is searched for, in the same way; None for all who are neither enrolled nor learned from.
+        train: who is learned from; None parts the people into `folds`.
+        role: the column that says it all: gallery, probe or train. None takes the column `role` if there is one and
+            none of the three above is given.
+        folds: in how many parts people are tested while the others are learned from; None for 4, or fewer where there
+            are fewer than 8 people.
+        scores: names of `SCORES`; the first is the one that the figures are told of.
+        modes: leading coefficients of identity that are used; None for all.
+        curve: numbers of modes for which the equal error rate is found as well.
+        by: a column of which each value has its own figures.
+        uncertainty: whether the likelihood ratio goes by what each fit states of its own error.
+        draws: of people, for intervals.
+        seed: of folds and draws.
+        drop_missing: leave out scans of which a column that is used says nothing.
+    """
+
+    subject: str = "subject"
+    gallery: str | None = None
+    probe: str | None = None
+    train: str | None = None
+    role: str | None = None
+    folds: int | None = None
+    scores: tuple[str, ...] = tuple(SCORES)
+    modes: int | None = None
+    curve: tuple[int, ...] = ()
+    by: str | None = None
+    uncertainty: bool = True
+    draws: int = 1000
+    seed: int = 0
+    drop_missing: bool = False
+
+
+@dataclass(frozen=True)
+class Round:
+    """Rows of a cohort: those learned from, and those of other people who are compared."""
+
+    training: tuple[int, ...]
+    gallery: tuple[int, ...]
+    probes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A cohort ready to be compared.
+
+    Args:
+        cohort: the scans of which all is known that is used.
+        people: names of all.
+        person: (N,) number of whom each scan shows.
+        rounds: that are compared; people learned from are in none of their round's gallery and probes.
+        group: (P,) of each person, for calibration on people of other groups.
+        all_pairs: whether there is no gallery, and each scan is compared with each other.
+        notes: what the user should know.
+    """
+
+    cohort: Cohort
+    people: tuple[str, ...]
+    person: IntArray
+    rounds: tuple[Round, ...]
+    group: IntArray
+    all_pairs: bool
+    notes: tuple[str, ...]
+
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        """(N,) whom each scan shows."""
+        return tuple(self.people[k] for k in self.person.tolist())
+
+    @property
+    def tested(self) -> BoolArray:
+        """(P,) who is compared."""
+        out = np.zeros(len(self.people), dtype=np.bool_)
+        for one in self.rounds:
+            out[self.person[[*one.gallery, *one.probes]]] = True
+        return out
+
+    def pairs(self, round_: Round) -> tuple[Pairs, IntArray]:
+        """Return the pairs of a round, and (M, 2) the places of each in gallery and probes."""
+        gallery, probes = (np.asarray(rows, dtype=np.int32) for rows in (round_.gallery, round_.probes))
+        at = np.indices((len(gallery), len(probes)), dtype=np.int32).reshape(2, -1).T
+        if self.all_pairs:
+            at = at[at[:, 0] < at[:, 1]]
+        rows = np.column_stack([gallery[at[:, 0]], probes[at[:, 1]]])
+        return Pairs(self.person[rows[:, 0]], self.person[rows[:, 1]], rows), at
+
+
+def rows_of(table: Table, expression: str) -> list[int]:
+    """Return the rows of a table that an expression such as `expression=neutral` names.
+
+    Raises:
+        InputError: it is none, there is no such column, or it names no row.
+    """
+    found = re.fullmatch(r"\s*([^=!]+?)\s*(!?=)\s*(.+?)\s*", expression)
+    if found is None:
+        raise InputError(f"{expression!r} names no scans; write a column and its values, such as expression=neutral.")
+    column, sign, text = found.groups()
+    values = {value.strip() for value in text.split(",")}
+    cells = table.texts(column)
+    rows = [row for row, cell in enumerate(cells) if (cell in values) == (sign == "=")]
+    if not rows:
+        there = named(sorted(set(cells) - {""}))
+        raise InputError(f"{table.where}: no scan has {expression}; {column} is {there or 'empty'}.")
+    return rows
+
+
+def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -> Trial:
+    """Return who is compared with whom.
+
+    Args:
+        cohort: the scans.
+        options: who is who.
+        enrol: whether there must be a gallery; without one, the first scan of each person is it.
+
+    Raises:
+        InputError: columns or scores that are not there, people who are both tested and learned from, or too few of
+            them.
+    """
+    refuse_unknown_scores(options.scores)
+    role = options.role
+    if role is None and "role" in cohort.table.columns and not (options.gallery or options.probe or options.train):
+        role = "role"
+    used = [options.subject, *([role] if role else []), *([options.by] if options.by else [])]
+    cohort = cohort.complete(used, drop_missing=options.drop_missing)
+    table, notes = cohort.table, list(cohort.notes)
+    people, person = np.unique(np.asarray(table.texts(options.subject)), return_inverse=True)
+    person = person.astype(np.int32)
+    gallery, probes, training = _roles(table, role, options)
+    tested = sorted({*gallery, *probes})
+    both = sorted({people[person[row]] for row in tested} & {people[person[row]] for row in training})
+    if both:
+        raise InputError(
+            f"{table.where}: {named(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put all "
+            "scans of a person on one side."
+        )
+    if enrol and not gallery:
+        first = {int(person[row]): row for row in reversed(probes)}
+        gallery, chosen = sorted(first.values()), set(first.values())
+        probes = [row for row in probes if row not in chosen]
+        notes.append("No gallery was named, so the first scan of each person is enrolled and the others are probes.")
+    all_pairs = not gallery
+    if all_pairs:
+        gallery = probes
+    group, rounds = _rounds(person, len(people), gallery, probes, training, options)
+    trial = Trial(cohort, tuple(people.tolist()), person, rounds, group, all_pairs, tuple(notes))
+    _refuse_too_few(trial, table)
+    return trial
+
+
+def scores_of(
+    trial: Trial, options: IdentityOptions, modes: int | None
+) -> Iterator[tuple[Round, Mapping[str, FloatArray]]]:
+    """Yield each round with the (G, P) scores of its gallery and probes by name.
+
+    Raises:
+        InputError: too few people to learn from, or more modes than there are.
+    """
+    for one in trial.rounds:
+        samples = samples_of(trial.cohort, trial.subjects, one.training, uncertainty=options.uncertainty)
+        samples = samples.leading(modes)
+        training, gallery, probes = (samples.take(rows) for rows in (one.training, one.gallery, one.probes))
+        yield one, {name: _scored(name, training, gallery, probes) for name in options.scores}
+
+
+def _scored(name: str, training: Samples, gallery: Samples, probes: Samples) -> FloatArray:
+    return SCORES[name](training)(gallery, probes)
+
+
+def _roles(table: Table, role: str | None, options: IdentityOptions) -> tuple[list[int], list[int], list[int]]:
+    """Return the rows of gallery, probes and training; no gallery for all against all."""
+    if role is not None:
+        cells = [cell.lower() for cell in table.texts(role)]
+        odd = sorted({cell for cell in cells if cell not in ROLES})
+        if odd:
+            raise InputError(f"{table.where}: {role!r} is {named(odd)}; it may be gallery, probe or train.")
+        gallery, probes, training = ([row for row, cell in enumerate(cells) if cell == what] for what in ROLES)
+        if gallery and not probes:
+            raise InputError(f"{table.where}: {role!r} names a gallery and no probe.")
+        return gallery, probes, training
+    training = rows_of(table, options.train) if options.train else []
+    gallery = [row for row in rows_of(table, options.gallery) if row not in set(training)] if options.gallery else []
+    if options.probe and not gallery:
+        raise InputError("Probes need a gallery; name it with --gallery.")
+    taken = {*training, *gallery}
+    probes = [row for row in (rows_of(table, options.probe) if options.probe else range(len(table)))]
+    return gallery, [row for row in probes if row not in taken], training
+
+
+def _rounds(
+    person: IntArray,
+    people: int,
+    gallery: Sequence[int],
+    probes: Sequence[int],
+    training: Sequence[int],
+    options: IdentityOptions,
+) -> tuple[IntArray, tuple[Round, ...]]:
+    """Return the group of each person, and the rounds."""
+    if not gallery:
+        raise InputError("Nobody is left to be tested; learn from fewer people.")
+    tested = np.unique(person[[*gallery, *probes]])
+    if training:
+        parts = max(min(_GROUPS, len(tested) // 2), 1)
+    else:
+        parts = options.folds or max(min(_FOLDS, len(tested) // 2), 1)
+        if options.folds and not 2 <= options.folds <= len(tested) // 2:
+            raise InputError(
+                f"{len(tested)} people cannot be parted into {options.folds} folds; each needs two of them, and two "
+                "folds are the least."
+            )
+        if parts < 2:
+            raise InputError(
+                f"There are {len(tested)} people, and four are the least: two to learn from, and two to tell apart."
+            )
+    order = np.random.default_rng((options.seed, 3)).permutation(len(tested))
+    group = np.zeros(people, dtype=np.int32)
+    group[tested[order]] = np.arange(len(tested)) % parts
+    if training:
+        return group, (Round(tuple(training), tuple(gallery), tuple(probes)),)
+    rounds: list[Round] = []
+    for fold in range(parts):
+        own_gallery, own_probes = (tuple(r for r in rows if group[person[r]] == fold) for rows in (gallery, probes))
+        others = tuple(sorted({r for r in (*gallery, *probes) if group[person[r]] != fold}))
+        rounds.append(Round(others, own_gallery, own_probes))
+    return group, tuple(rounds)
+
+
+def _refuse_too_few(trial: Trial, table: Table) -> None:
+    tested = int(trial.tested.sum())
+    if tested < 2:
+        raise InputError(f"{table.where}: {tested} person is compared, and two are the least.")
+    if not any(trial.pairs(one)[0].same.any() for one in trial.rounds):
+        raise InputError(
+            f"{table.where}: no two scans that are compared show one person; nobody can be recognised by one scan."
+        )

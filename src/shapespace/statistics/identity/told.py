@@ -1,0 +1,103 @@
+"""Figures of who-is-it in words, tables and curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from shapespace.schemas import Series
+from shapespace.statistics.identity.rates import Figure
+from shapespace.statistics.identity.rounds import IdentityOptions, Trial
+from shapespace.types import FloatArray
+
+_POINTS = 300
+CALLED = {
+    "likelihood-ratio": "likelihood ratio",
+    "cosine": "cosine",
+    "mahalanobis": "whitened distance",
+    "distance": "plain distance",
+}
+"""What scores are called in words."""
+
+
+def called(name: str) -> str:
+    """Return what a score is called in words."""
+    return CALLED.get(name, name)
+
+
+def in_percent(one: Figure) -> str:
+    """Return a share with its interval in words."""
+    if one.value is None:
+        return "not known"
+    ends = interval(one)
+    return f"{100 * one.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
+
+
+def interval(one: Figure) -> tuple[float, float] | None:
+    """Return the ends of an interval; None where there is none, or where no draw of people differs."""
+    return None if one.low is None or one.high is None or one.low == one.high else (one.low, one.high)
+
+
+def cells(one: Figure) -> list[object]:
+    """Return value, low and high of a figure as cells of a CSV table."""
+    return ["" if value is None else value for value in (one.value, one.low, one.high)]
+
+
+def thinned(x: FloatArray, y: FloatArray, label: str) -> Series:
+    """Return a line through the ends and a few hundred points of a curve, those where it turns first."""
+    corners = np.ones(len(x), dtype=np.bool_)
+    corners[1:-1] = ~(((x[1:-1] == x[:-2]) & (x[1:-1] == x[2:])) | ((y[1:-1] == y[:-2]) & (y[1:-1] == y[2:])))
+    at = np.flatnonzero(corners)
+    if len(at) > _POINTS:
+        at = at[np.unique(np.linspace(0, len(at) - 1, _POINTS).round().astype(np.intp))]
+    return Series(x=tuple(x[at].tolist()), y=tuple(y[at].tolist()), label=label)
+
+
+def who_was_tested(trial: Trial, trained_on: int) -> str:
+    """Return in words who was compared, and who was learned from."""
+    tested = int(trial.tested.sum())
+    learned = f"{trained_on} other people" if trained_on else "nobody"
+    if len(trial.rounds) == 1:
+        return f"{tested} people were tested; what is learned was learned from {learned}."
+    return (
+        f"{tested} people were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
+        f"learned from the other parts, of {trained_on} people at least."
+    )
+
+
+def settings(options: IdentityOptions) -> dict[str, Any]:
+    """Return all that the result depends on."""
+    return asdict(options)
+
+
+def hashes(trial: Trial) -> tuple[str, ...]:
+    """Return the hash of the model of the fits."""
+    return () if trial.cohort.fitted is None else (trial.cohort.fitted.model.content_hash,)
+
+
+def role_of(trial: Trial, row: int) -> str:
+    """Return what a scan was in the round in which its person was tested; empty where it was learned from alone."""
+    for one in trial.rounds:
+        if row in one.gallery:
+            return "both" if trial.all_pairs else "gallery"
+        if row in one.probes:
+            return "probe"
+    return ""
+
+
+def none_missed(errors: bool, people: int) -> str:
+    """Return what no error among some people is worth, by the rule of three."""
+    return (
+        ""
+        if errors
+        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may be "
+        "ones with whom errors happen (95 %, rule of three)."
+    )
+
+
+def seen(values: Sequence[str]) -> tuple[str, ...]:
+    """Return the sentences that say something."""
+    return tuple(value for value in values if value)

@@ -1,0 +1,233 @@
+"""Are two scans of one person: error rates of verification with their spread over people, and calibrated likelihood
+ratios."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.statistics.answer import Answer
+from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
+from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
+from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.types import BoolArray, FloatArray, IntArray
+
+FAR = (1e-1, 1e-2, 1e-3)
+"""Shares of impostor pairs accepted, at which the genuine pairs accepted are told."""
+
+GRID = np.geomspace(1e-4, 1.0, 61)
+_BY_DRAWS = 200
+_ENDS = (2.5, 97.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The figures of some pairs.
+
+    Args:
+        genuine: pairs of one person.
+        impostor: pairs of two.
+        eer: equal error rate.
+        tar: FAR -> TAR.
+    """
+
+    genuine: int
+    impostor: int
+    eer: Figure
+    tar: Mapping[float, Figure]
+
+
+@dataclass(frozen=True, eq=False)
+class Verified:
+    """How well one score tells pairs of one person from pairs of two.
+
+    Args:
+        name: of the score.
+        score: (M,) of all pairs.
+        llr: (M,) calibrated log likelihood ratios, natural; None where there are too few people to calibrate.
+        roc: the rates.
+        eer: equal error rate.
+        tar: FAR -> TAR; without a value where there are too few impostor pairs to say.
+        cllr: cost of the calibrated ratios, in bits.
+        cllr_min: of the best monotone calibration.
+        band: (2, 61) ends of the interval of TAR at the FAR of `GRID`.
+        by: value of the column `by` -> its figures.
+        curve: number of modes -> EER.
+    """
+
+    name: str
+    score: FloatArray
+    llr: FloatArray | None
+    roc: Roc
+    eer: Figure
+    tar: Mapping[float, Figure]
+    cllr: Figure
+    cllr_min: float
+    band: FloatArray
+    by: Mapping[str, Part]
+    curve: Mapping[int, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """What verification of a cohort found.
+
+    Args:
+        scores: one for each score that was asked for, in that order.
+        pairs: that were compared.
+        people: names.
+        trained_on: how many people were learned from; the least of all rounds.
+        trial: who was who.
+        options: that it was asked with.
+    """
+
+    scores: tuple[Verified, ...]
+    pairs: Pairs
+    people: tuple[str, ...]
+    trained_on: int
+    trial: Trial
+    options: IdentityOptions
+
+    def __getitem__(self, name: str) -> Verified:
+        return next(one for one in self.scores if one.name == name)
+
+    def answer(self) -> Answer:
+        """Return it as it is kept and reported."""
+        from shapespace.statistics.identity.verify_answer import answer
+
+        return answer(self)
+
+
+def verify(
+    cohort: Cohort, options: IdentityOptions | None = None, *, on_step: Callable[[int, int], None] | None = None
+) -> Verification:
+    """Return how well scans of one person are told from scans of two.
+
+    Args:
+        cohort: scans of which the table says whom they show.
+        options: who is compared with whom; None for all against all, by folds of the people.
+        on_step: called with (done, total).
+
+    Raises:
+        InputError: as `trial_of`, or too few people to learn from.
+        ShapespaceError: scikit-learn is not installed.
+    """
+    options = options or IdentityOptions()
+    trial = trial_of(cohort, options)
+    pairs, scores = _pairs_and_scores(trial, options, options.modes)
+    values = trial.cohort.table.texts(options.by) if options.by else ()
+    chosen = {value: _with_value(values, value, pairs, all_pairs=trial.all_pairs) for value in sorted(set(values))}
+    people = people_drawn(trial.tested, options.draws, options.seed)
+    total, done = len(scores) * options.draws, 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if on_step is not None:
+            on_step(done, total)
+
+    curves: dict[int, Mapping[str, FloatArray]] = {
+        modes: _pairs_and_scores(trial, options, modes)[1] for modes in options.curve
+    }
+    found = tuple(
+        verified(name, score, pairs, trial.group, people, chosen=chosen, on_draw=step,
+                 curve={modes: Sweep(curves[modes][name], pairs.same).roc().eer for modes in curves})
+        for name, score in scores.items()
+    )  # fmt: skip
+    learned = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
+    return Verification(found, pairs, trial.people, learned, trial, options)
+
+
+def _pairs_and_scores(
+    trial: Trial, options: IdentityOptions, modes: int | None
+) -> tuple[Pairs, dict[str, FloatArray]]:
+    parts: list[Pairs] = []
+    scores: dict[str, list[FloatArray]] = {name: [] for name in options.scores}
+    for round_, found in scores_of(trial, options, modes):
+        pairs, at = trial.pairs(round_)
+        parts.append(pairs)
+        for name, matrix in found.items():
+            scores[name].append(matrix[at[:, 0], at[:, 1]])
+    one, other, rows = (
+        np.concatenate([getattr(part, field) for part in parts]) for field in ("one", "other", "rows")
+    )
+    return Pairs(one, other, rows), {name: np.concatenate(told) for name, told in scores.items()}
+
+
+def verified(
+    name: str,
+    score: FloatArray,
+    pairs: Pairs,
+    group: IntArray,
+    people: FloatArray,
+    *,
+    chosen: Mapping[str, BoolArray] | None = None,
+    curve: Mapping[int, float] | None = None,
+    on_draw: Callable[[], None] | None = None,
+) -> Verified:
+    """Return the figures of one score.
+
+    Args:
+        name: of it.
+        score: (M,) of all pairs.
+        pairs: of whom.
+        group: (P,) of each person, for calibration on people of other groups.
+        people: (draws, P) from `people_drawn`.
+        chosen: value -> (M,) pairs that have figures of their own.
+        curve: number of modes -> EER.
+        on_draw: called after each draw.
+
+    Raises:
+        InputError: no pairs of one person or of two, or scores that are not finite.
+        ShapespaceError: scikit-learn is not installed.
+    """
+    sweep = Sweep(score, pairs.same)
+    roc = sweep.roc()
+    llr = calibrated(score, pairs, group)
+    cost = None if llr is None else cllr(llr, pairs.same)
+
+    def of(weights: FloatArray) -> FloatArray:
+        rates = sweep.roc(weights)
+        own = np.nan if llr is None else cllr(llr, pairs.same, weights)
+        return np.concatenate([[own], _figures(rates), rates.tar_at(GRID)])
+
+    drawn = resampled(pairs, people, of, 2 + len(FAR) + len(GRID), on_draw)
+    eer, tar = _told(roc, pairs, drawn[:, 1:])
+    usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
+    band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
+    by: dict[str, Part] = {}
+    for value, own in (chosen or {}).items():
+        part = pairs.take(own)
+        genuine = int(part.same.sum())
+        if genuine in (0, len(part)):
+            continue
+        own_sweep = Sweep(score[own], part.same)
+        spread = resampled(part, people[:_BY_DRAWS], lambda w, s=own_sweep: _figures(s.roc(w)), 1 + len(FAR))
+        by[value] = Part(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
+    least = cllr_min(score, pairs.same)
+    return Verified(name, score, llr, roc, eer, tar, figure(cost, drawn[:, 0]), least, band, by, dict(curve or {}))
+
+
+def _figures(rates: Roc) -> FloatArray:
+    return np.concatenate([[rates.eer], rates.tar_at(np.array(FAR))])
+
+
+def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float, Figure]]:
+    """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
+    impostors = int((~pairs.same).sum())
+    tar = {
+        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k]) if impostors * far >= 1 else Figure(None)
+        for k, far in enumerate(FAR)
+    }
+    return figure(roc.eer, drawn[:, 0]), tar
+
+
+def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:
+    """Return (M,) which pairs have a value: their probe, or one of both where there is no gallery."""
+    has = np.array([one == value for one in values])[pairs.rows]
+    return has.any(axis=1) if all_pairs else has[:, 1]
+
+

@@ -1,0 +1,233 @@
+"""The answer of verification as it is kept and reported."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.statistics.answer import Answer
+from shapespace.statistics.identity.told import (
+    called,
+    cells,
+    hashes,
+    in_percent,
+    interval,
+    none_missed,
+    role_of,
+    seen,
+    settings,
+    thinned,
+    who_was_tested,
+)
+from shapespace.statistics.identity.verify import FAR, GRID, Verification, Verified
+
+_LEAST_RATE = 1e-4
+_BINS = 40
+_ERRORS = 30
+
+
+def answer(found: Verification) -> Answer:
+    """Return what `shapespace recognise verify` writes."""
+    trial, first = found.trial, found.scores[0]
+    pairs = found.pairs
+    genuine = int(pairs.same.sum())
+    impostor = len(pairs) - genuine
+    tested = int(trial.tested.sum())
+    summary = seen(
+        [
+            f"By {called(first.name)} the equal error rate is {in_percent(first.eer)}, over {genuine} pairs of one person "
+            f"and {impostor} pairs of two.",
+            *(
+                f"At a false accept rate of {100 * far:g} % it accepts {in_percent(one)} of the pairs of one person."
+                for far, one in first.tar.items()
+                if one.value is not None
+            ),
+            _cost(first),
+            *(f"By {called(one.name)} the equal error rate is {in_percent(one.eer)}." for one in found.scores[1:]),
+            who_was_tested(trial, found.trained_on),
+        ]
+    )
+    thin = [far for far in FAR if impostor * far < _ERRORS]
+    notes = seen(
+        [
+            *trial.notes,
+            none_missed((first.eer.value or 0.0) > 0, tested),
+            f"{impostor} pairs of two people make {', '.join(f'{impostor * far:.1f}' for far in thin)} false accepts at a "
+            f"rate of {', '.join(f'{far:g}' for far in thin)}, and 30 are wanted for a rate to be trusted; below one "
+            "nothing is stated."
+            if thin
+            else "",
+            "There are too few people to calibrate scores on others than those tested, so there are no likelihood ratios."
+            if first.llr is None
+            else "",
+        ]
+    )
+    arrays = {
+        "rows": pairs.rows,
+        "same": pairs.same,
+        **{f"score_{one.name}": one.score for one in found.scores},
+        **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
+    }
+    told = ("score", "figure", "value", "low", "high")
+    scans = [
+        (name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)
+    ]
+    return Answer(
+        question="recognise verify",
+        title="Who is it? Verification",
+        summary=summary,
+        parts=_parts(found),
+        tables={
+            "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
+            "scans.csv": (("scan", "subject", "role"), scans),
+        },
+        arrays={"pairs.npz": arrays},
+        notes=notes,
+        settings=settings(found.options),
+        model_hashes=hashes(trial),
+    )
+
+
+def _cost(one: Verified) -> str:
+    if one.cllr.value is None:
+        return ""
+    return (
+        f"Its calibrated likelihood ratios miss {one.cllr.value:.3f} bits of 1 (Cllr), of which {one.cllr_min:.3f} would "
+        "be missed by the best calibration."
+    )
+
+
+def _rows(one: Verified) -> list[list[object]]:
+    rows: list[list[object]] = [[one.name, "eer", *cells(one.eer)]]
+    rows += [[one.name, f"tar at far {far:g}", *cells(told)] for far, told in one.tar.items()]
+    rows += [[one.name, "cllr", *cells(one.cllr)], [one.name, "cllr_min", one.cllr_min, "", ""]]
+    rows += [[one.name, f"eer with {modes} modes", eer, "", ""] for modes, eer in one.curve.items()]
+    for value, part in one.by.items():
+        rows.append([one.name, f"eer of {value}", *cells(part.eer)])
+        rows += [[one.name, f"tar at far {far:g} of {value}", *cells(told)] for far, told in part.tar.items()]
+    return rows
+
+
+def _parts(found: Verification) -> tuple[Part, ...]:
+    parts: list[Part] = [_table(found), _det(found), _roc(found)]
+    if any(one.curve for one in found.scores):
+        parts.append(
+            CurvePart(
+                title="Equal error rate by the number of modes",
+                note="Leading coefficients of identity; the plain distance uses the whole shapes.",
+                series=tuple(
+                    Series(x=tuple(map(float, one.curve)), y=tuple(one.curve.values()), label=called(one.name))
+                    for one in found.scores
+                ),
+                x="modes",
+                y="equal error rate",
+                x_scale="log",
+            )
+        )
+    if any(one.by for one in found.scores):
+        parts.append(_by(found))
+    parts += [_histogram(one, found) for one in found.scores[:2]]
+    parts.append(
+        TextPart(
+            title="How it was measured",
+            text=(
+                who_was_tested(found.trial, found.trained_on),
+                "Intervals hold 95 % of what is found when people are drawn anew with replacement. Likelihood ratios are "
+                "calibrated by a logistic regression on pairs of people of other groups. Whether the shape model was "
+                "built from people who are tested here cannot be seen from its file; it must not have been.",
+            ),
+        )
+    )
+    return tuple(parts)
+
+
+def _table(found: Verification) -> TablePart:
+    columns = [TableColumn(name="score"), TableColumn(name="EER", kind="percent"),
+               TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    for far in FAR:
+        columns += [TableColumn(name=f"TAR at FAR {far:g}", kind="percent"), TableColumn(name="95 %", kind="interval")]
+    columns += [TableColumn(name="Cllr, bits", kind="number"), TableColumn(name="Cllr-min, bits", kind="number")]
+    rows: list[tuple[object, ...]] = []
+    for one in found.scores:
+        told = [cell for figure in (one.eer, *one.tar.values()) for cell in (figure.value, interval(figure))]
+        rows.append((called(one.name), *told, one.cllr.value, one.cllr_min))
+    return TablePart(
+        title="How well one person is told from two",
+        note="EER: where as many pairs of one person are refused as pairs of two accepted. TAR: pairs of one person "
+        "accepted, at a rate FAR of pairs of two accepted. Cllr: what the likelihood ratios miss, 0 to 1 and more.",
+        columns=tuple(columns),
+        rows=tuple(rows),
+    )
+
+
+def _det(found: Verification) -> CurvePart:
+    genuine = int(found.pairs.same.sum())
+    # A rate of 0 has no place on this scale, and a score without an error would have no line.
+    ends = [0.5 / (len(found.pairs) - genuine), 0.5 / genuine]
+    series: list[Series] = []
+    for one in found.scores:
+        rates = (one.roc.far[1:-1], 1 - one.roc.tar[1:-1])
+        far, missed = (np.clip(rate, end, 1 - end) for rate, end in zip(rates, ends, strict=True))
+        series.append(thinned(far, missed, called(one.name)))
+    return CurvePart(
+        title="DET curve",
+        note="Both errors at their normal deviates; none at all stands at half a pair.",
+        series=tuple(series),
+        x="false accept rate",
+        y="false reject rate",
+        x_scale="probit",
+        y_scale="probit",
+        diagonal=True,
+    )
+
+
+def _roc(found: Verification) -> CurvePart:
+    least = max(1.0 / int((~found.pairs.same).sum()), _LEAST_RATE)
+    series: list[Series] = []
+    for one in found.scores:
+        shown = np.unique(np.concatenate([[least], GRID[GRID >= least]]))
+        at = np.searchsorted(GRID, shown)
+        band = [tuple(side[np.minimum(at, len(GRID) - 1)].tolist()) for side in one.band]
+        known = bool(np.isfinite(one.band).all())
+        series.append(
+            Series(
+                x=tuple(shown.tolist()),
+                y=tuple(one.roc.tar_at(shown).tolist()),
+                label=called(one.name),
+                low=band[0] if known else None,
+                high=band[1] if known else None,
+            )
+        )
+    return CurvePart(title="ROC curve", series=tuple(series), x="false accept rate", y="true accept rate", x_scale="log")
+
+
+def _by(found: Verification) -> TablePart:
+    columns = [TableColumn(name=found.options.by or ""), TableColumn(name="score"),
+               TableColumn(name="pairs of one", kind="count"), TableColumn(name="pairs of two", kind="count"),
+               TableColumn(name="EER", kind="percent"), TableColumn(name="95 %", kind="interval"),
+               TableColumn(name="TAR at FAR 0.01", kind="percent"),
+               TableColumn(name="95 %", kind="interval")]  # fmt: skip
+    rows = [
+        (value, called(one.name), part.genuine, part.impostor, part.eer.value, interval(part.eer),
+         part.tar[1e-2].value, interval(part.tar[1e-2]))
+        for value in (found.scores[0].by)
+        for one in found.scores
+        for part in (one.by[value],)
+    ]  # fmt: skip
+    return TablePart(title=f"By {found.options.by}", columns=tuple(columns), rows=tuple(rows))
+
+
+def _histogram(one: Verified, found: Verification) -> HistogramPart:
+    values = one.score if one.llr is None else one.llr / np.log(10.0)
+    edges = np.linspace(float(values.min()), float(values.max()) + 1e-12, _BINS + 1)
+    counts = [
+        Counts(counts=tuple((np.histogram(values[kind], edges)[0] / kind.sum()).tolist()), label=label)
+        for kind, label in ((found.pairs.same, "one person"), (~found.pairs.same, "two people"))
+    ]
+    return HistogramPart(
+        title=f"Scores: {called(one.name)}",
+        note="Shares of each kind of pair.",
+        edges=tuple(edges.tolist()),
+        series=tuple(counts),
+        x="score" if one.llr is None else "calibrated likelihood ratio, powers of ten",
+    )
