@@ -266,3 +266,13 @@ def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regress
     assert rows[0] == "scan,subject,observed,predicted,low,high,baseline" and len(rows) == 61
     alone = predicted_answer(learned.predictor, new, learned.predictor.predict(new))
     assert "of 4 shapes" in alone.summary[0] and list(alone.tables) == ["new.csv"]
+
+
+def test_a_target_that_all_subjects_go_through_is_dealt_out_within_them_too() -> None:
+    base = drawn(15, 4, repeats=2)
+    visit = np.tile([0.0, 1.0], 15)
+    moved = base.coefficients + 12.0 * visit[:, None] * np.eye(K)[1]
+    for shapes, finds in ((moved, True), (base.coefficients, False)):
+        table = replace(base.table, columns={**base.table.columns, "visit": numbers_as_text(visit)})
+        found = regress(replace(base, coefficients=read_only(shapes), table=table), "visit", permutations=39)
+        assert found.p is not None and (found.p <= 0.05) == finds

@@ -375,7 +375,7 @@ def _p_of(
         return None
     beyond = 1
     for start in range(0, permutations, _BLOCK):
-        orders = [_dealt(codes, rng) for _ in range(min(_BLOCK, permutations - start))]
+        orders = [_dealt(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))]
         targets = np.stack([y[order] for order in orders], axis=1)
         done = nested(X, targets, share, outer, inner, on_fold=steps.fold)
         r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
@@ -383,15 +383,20 @@ def _p_of(
     return beyond / (1 + permutations)
 
 
-def _dealt(codes: IndexArray, rng: np.random.Generator) -> IndexArray:
-    """Return rows (N,) whose targets take the place of each row's: of another subject with as many rows, whole."""
+def _dealt(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> IndexArray:
+    """Return rows (N,) whose targets take the place of each row's: those of a subject with as many rows together.
+
+    Where they differ within a subject they are dealt out anew within it too, or of subjects who all have the same ones
+    every order would be that observed.
+    """
     order = np.arange(len(codes))
     counts = np.bincount(codes)
     rows = [np.flatnonzero(codes == subject) for subject in range(len(counts))]
     for count in np.unique(counts):
         alike = np.flatnonzero(counts == count)
         for to, source in zip(alike, rng.permutation(alike), strict=True):
-            order[rows[to]] = rows[source]
+            given = rows[source]
+            order[rows[to]] = rng.permutation(given) if np.ptp(y[given]) else given
     return order
 
 
