@@ -26,13 +26,17 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
     from shapespace.statistics.change import Change, ChangeSettings, change
+    from shapespace.statistics.predictor import Predictor
+    from shapespace.statistics.regression import Regression, regress
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
 __all__ = [
     "CLASSIFIERS",
     "AdditiveModel",
+    "Asymmetry",
     "Change",
     "ChangeSettings",
     "CorrespondSettings",
@@ -42,7 +46,9 @@ __all__ = [
     "Mesh",
     "ModelQuality",
     "Paper",
+    "Predictor",
     "QualitySettings",
+    "Regression",
     "Results",
     "Robust",
     "ShapeModel",
@@ -56,10 +62,12 @@ __all__ = [
     "correspond",
     "fit_scan",
     "load_faces",
+    "measure_asymmetry",
     "measure_quality",
     "read_landmarks",
     "read_mesh",
     "read_volume",
+    "regress",
     "simulate_scan",
     "surface_distances",
     "surface_of_volume",
@@ -69,6 +77,7 @@ __all__ = [
 
 _HOMES = {
     "AdditiveModel": "model.additive",
+    "Asymmetry": "statistics.asymmetry",
     "CLASSIFIERS": "recognise.classifiers",
     "Change": "statistics.change",
     "ChangeSettings": "statistics.change",
@@ -79,7 +88,9 @@ _HOMES = {
     "Mesh": "types",
     "ModelQuality": "model.quality",
     "Paper": "fit.paper_method",
+    "Predictor": "statistics.predictor",
     "QualitySettings": "model.quality",
+    "Regression": "statistics.regression",
     "Results": "store.results",
     "Robust": "fit.robust_method",
     "ShapeModel": "model.shape_model",
@@ -92,10 +103,12 @@ _HOMES = {
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
     "load_faces": "datasets.faces",
+    "measure_asymmetry": "statistics.asymmetry",
     "measure_quality": "model.quality",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
     "read_volume": "io.volumes",
+    "regress": "statistics.regression",
     "simulate_scan": "datasets.simulated_scan",
     "surface_distances": "geometry.distance",
     "surface_of_volume": "geometry.volume_surface",

@@ -109,6 +109,10 @@ def test_a_number_that_shape_does_not_tell_is_rarely_claimed_to_be() -> None:
     assert claimed <= 6
 
 
+def test_a_number_that_shape_tells_is_claimed_to_be(learned: Regression) -> None:
+    assert learned.p == 1 / 20 and learned.measures["r2"].low > 0
+
+
 def test_the_shape_that_goes_with_the_number_is_what_was_put_in() -> None:
     found = regress(drawn(400, 5), "age", permutations=0, folds=3)
     expected = SLOPES * STDDEV / ((SLOPES**2).sum() + 25.0)
