@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
-    from shapespace.statistics.change import Change, ChangeSettings, change
+    from shapespace.statistics.change import Change, change
+    from shapespace.statistics.change_found import ChangeSettings
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -71,7 +72,7 @@ _HOMES = {
     "AdditiveModel": "model.additive",
     "CLASSIFIERS": "recognise.classifiers",
     "Change": "statistics.change",
-    "ChangeSettings": "statistics.change",
+    "ChangeSettings": "statistics.change_found",
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
