@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, TypeVar, cast, get_args
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast, get_args
 
 import msgspec
 from msgspec import Struct
@@ -770,15 +770,15 @@ class Recognition(Struct, frozen=True, kw_only=True):
     versions: Mapping[str, Any] = {}
     model_hashes: tuple[str, ...] = ()
 
-    @staticmethod
-    def from_json(content: object, where: str = "recognition.json", again: str = STUDY_AGAIN) -> Recognition:
+    @classmethod
+    def from_json(cls, content: object, where: str = "recognition.json", again: str = STUDY_AGAIN) -> Self:
         """Return a study, with all of its parts checked.
 
         Raises:
             FileFormatError: it is no study of recognition, of another version, or damaged.
         """
-        check_format(content, Recognition, where, again)
-        study = read(Recognition, content, where, again)
+        check_format(content, cls, where, again)
+        study = read(cls, content, where, again)
         for part in study.parts:
             read_part(part, where, again)
         return study
@@ -798,3 +798,8 @@ class Analysis(Recognition, frozen=True, kw_only=True):
     format: str = FORMAT
     question: str = ""
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_json(cls, content: object, where: str = "analysis.json", again: str = ANALYSIS_AGAIN) -> Self:
+        """Return an analysis, with all of its parts checked; errors as of a study."""
+        return super().from_json(content, where, again)

@@ -29,7 +29,6 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
-from shapespace.store.corresponding import json_of
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
@@ -40,6 +39,7 @@ from shapespace.report.saved import Folder, find_fits
 from shapespace.report.staged import StagedFit
 from shapespace.schemas import (
     CORRESPOND_AGAIN,
+    Analysis,
     CorrespondenceRecord,
     CorrespondRecord,
     Demo,
@@ -49,6 +49,7 @@ from shapespace.schemas import (
     json_text,
     read,
 )
+from shapespace.store.corresponding import json_of
 from synthetic_shapes import blob_model, raw_scan
 
 MOST_SECONDS = 5.0
@@ -341,6 +342,16 @@ KINDS: dict[str, tuple[dict[str, Any], Callable[[object], object]]] = {
              {"kind": "lines", "points": [{"b": [1.0, 2.0], "z": [0.1, 0.2], "intensity": 0.5}]},
              {"kind": "curve", "series": [{"x": [1, 2], "y": [0.5, 0.7]}]}]},
         lambda content: Recognition.from_json(content),
+    ),
+    "analysis.json": (
+        {"format": "shapespace analysis", "format_version": 1, "question": "compare", "title": "T",
+         "summary": ["They differ."], "notes": ["One is left out."], "settings": {"seed": 3}, "parts": [
+             {"kind": "surface_map", "arrays": "a.npz", "mask": "m", "limit": 2.5, "signed": False},
+             {"kind": "morph", "arrays": "a.npz", "low_label": "young", "times": 2.0},
+             {"kind": "histogram", "edges": [0, 1, 2], "series": [{"counts": [3, 4]}], "observed": 1.5},
+             {"kind": "curve", "series": [{"x": [1], "y": [0.5], "low": [None], "high": [0.7], "points": True}],
+              "x_scale": "log", "y_scale": "probit", "diagonal": True}]},
+        lambda content: Analysis.from_json(content),
     ),
     "one.correspond.json": (
         {"format": "shapespace corresponding", "format_version": 1, "name": "one", "path": "../one.ply", "hash": "ab",

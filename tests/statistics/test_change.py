@@ -165,13 +165,14 @@ def test_the_volume_swept_is_the_difference_of_volumes_of_closed_surfaces_and_th
 
 
 def test_a_surface_that_grew_as_a_whole_tells_its_volume_and_share() -> None:
-    mesh = person(0)
-    scans = [mesh.vertices, 1.02 * mesh.vertices, person(1).vertices, person(1).vertices + 1.0]
+    mesh, nearly = person(0), person(1).vertices + 1.0
+    nearly[0] += 0.01  # or it would be refused as a copy
+    scans = [mesh.vertices, 1.02 * mesh.vertices, person(1).vertices, nearly]
     cohort = cohort_of(scans, {"subject": ["a", "a", "b", "b"], "visit": ["before", "after"] * 2})
     grown = asked(cohort, stable="all").by_name["a"]
     assert grown.change.volumes_mm3[0] / grown.before_mm3 == pytest.approx(1.02**3 - 1, rel=1e-6)
     still = asked(cohort, stable="all").by_name["b"]
-    assert still.rms_mm < 1e-9 and abs(still.change.volumes_mm3[0]) < 1e-4
+    assert still.rms_mm < 1e-3 and abs(still.change.volumes_mm3[0]) < 10
 
 
 def test_regions_and_landmarks_tell_where_it_changed() -> None:
@@ -299,7 +300,8 @@ def test_a_series_gives_rates_and_dates_give_years() -> None:
     days = (0, 365.25, 730.5, 1461)
     scans = [pushed(mesh, day / 365.25 * 0.5 * bump()) + 0.02 * rng.standard_normal((V, 3)) for day in days]
     dates = ("2020-01-01", "2020-12-31", "2021-12-31", "2024-01-01")
-    cohort = cohort_of([*scans, scans[0] + 5.0, scans[1]], {
+    others = [scan + 0.02 * rng.standard_normal((V, 3)) for scan in scans[:2]]
+    cohort = cohort_of([*scans, *others], {
         "subject": [*"aaaa", *"bb"], "date": [*dates, *dates[:2]], "months": [0, 12, 24, 48, 0, 12],
     })  # fmt: skip
     weights = bump()
@@ -308,10 +310,10 @@ def test_a_series_gives_rates_and_dates_give_years() -> None:
         for subject in found.subjects:
             assert subject.rate is not None
             assert weights @ subject.rate.along_mm / (weights @ weights) == pytest.approx(
-                per_unit, rel=0.08 if subject.name == "b" else 0.02
+                per_unit, rel=0.12 if subject.name == "b" else 0.02
             )
         assert found.unit == unit and found.group is not None
-        assert found.group.effect[TIP] == pytest.approx(per_unit, rel=0.1)
+        assert found.group.effect[TIP] == pytest.approx(per_unit, rel=0.15)
     assert [visit.label for visit in found.by_name["a"].visits] == ["0", "12", "24", "48"]
     assert any(part.title == "Over time" for part in found.answer().parts)
 

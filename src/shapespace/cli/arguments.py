@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from shapespace.cli import run
-from shapespace.cli.answers import change
+from shapespace.cli.answers import change, score
 from shapespace.version import __version__
 
 _EXECUTORS = ("local", "serial", "dask")
@@ -36,6 +36,10 @@ def parser() -> argparse.ArgumentParser:
     change.add(
         _add(commands, "change", "what changed between visits of the same subjects, in mm, and what of it is noise",
              "shapespace change visits.csv -o change --order before,after --stable forehead.csv")
+    )  # fmt: skip
+    score.add(
+        _add(commands, "score", "where new subjects lie in a reference population: distance, percentile, map",
+             "shapespace score patients -o scored --reference controls.csv --reference-shapes fits")
     )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)

@@ -16,10 +16,13 @@ import numpy.typing as npt
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 _ORTHONORMAL = 1e-9
+# Of the size; single precision keeps a copy nearer than this.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,7 @@ class Fitted:
         b_stddev: (N, K) standard deviations of them, mm.
         status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
         folder: of the results, as it was given.
+        beyond_mm: (N,) RMS of what the model left of the residuals, mm, NaN where a fit does not say; None for none.
     """
 
     model: ShapeModel
@@ -39,6 +43,7 @@ class Fitted:
     b_stddev: FloatArray
     status: tuple[str, ...]
     folder: str
+    beyond_mm: FloatArray | None = None
 
     @cached_property
     def z(self) -> FloatArray:
@@ -53,6 +58,7 @@ class Fitted:
             b=read_only(self.b[at]),
             b_stddev=read_only(self.b_stddev[at]),
             status=tuple(self.status[row] for row in rows),
+            beyond_mm=None if self.beyond_mm is None else read_only(self.beyond_mm[at]),
         )
 
 
@@ -169,6 +175,7 @@ class Cohort:
         gauge: Gauge = "shape",
         align: bool = True,
         landmarks: Mapping[str, int] | None = None,
+        onto: Cohort | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -180,18 +187,24 @@ class Cohort:
             gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
             align: False takes them as they stand.
             landmarks: name -> vertex.
+            onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
 
         Raises:
-            InputError: fewer than two shapes, values that are not finite, columns of another length, or two shapes
-                that are the same.
+            InputError: fewer than two shapes, values that are not finite, columns of another length, two shapes that
+                are the same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
-        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < 2 or not np.isfinite(shapes).all():
-            raise InputError(f"A cohort needs two or more finite shapes (N, V, 3), not {shapes.shape}.")
+        fewest = 2 if onto is None else 1
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or not np.isfinite(shapes).all():
+            least = "two" if onto is None else "one"
+            raise InputError(f"A cohort needs {least} or more finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
         sizes = read_only([centroid_size(shape) for shape in shapes])
-        if align:
+        if onto is not None:
+            gauge = onto.gauge
+            _bring_onto(shapes, onto)
+        elif align:
             align_in_place(shapes, gauge)
             if gauge == "shape":
                 scale_to_tangent(shapes)
@@ -204,13 +217,19 @@ class Cohort:
         return cohort
 
     @staticmethod
-    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape") -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes.
+    def of_meshes(meshes: Sequence[Mesh], table: Table, gauge: Gauge = "shape", onto: Cohort | None = None) -> Cohort:
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto` as of `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
-            InputError: as `of_shapes`.
+            InputError: as `of_shapes`, or meshes with missing vertices.
         """
+        holed = [mesh.name for mesh in meshes if not np.isfinite(mesh.vertices).all()]
+        if holed:
+            raise InputError(
+                f"{len(holed)} of {len(meshes)} meshes lack vertices that their scans do not show ({named(holed)}); "
+                "build a model of all and fit it to the scans, or leave these out."
+            )
         first = meshes[0]
         for mesh in meshes[1:]:
             if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
@@ -220,13 +239,16 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        return replace(Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge), table=table)
+        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto)
+        return replace(found, table=table)
 
     @staticmethod
     def of_fits(
         fitted: Fitted, names: Sequence[str], table: Table, sizes_mm: FloatArray, gauge: Gauge = "shape"
     ) -> Cohort:
         """Return the cohort of fits: in the model's frame, where their poses are divided out already.
+
+        Sizes that a model of forms holds in its modes are divided out in the `shape` gauge.
 
         Args:
             fitted: the coefficients.
@@ -243,18 +265,24 @@ class Cohort:
         rows = model.vertex_basis[:, :modes].T
         b = fitted.b
         reference = model.mean_vertices
-        if gauge == "form":
-            if not np.isfinite(sizes_mm).all():
-                lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
-                raise InputError(
-                    f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
-                    "or compare shapes with --gauge shape."
-                )
-            shapes = [reference + (row @ rows).reshape(-1, 3) for row in b]
-            scales = sizes_mm / np.array([centroid_size(shape) for shape in shapes])
-            b = np.column_stack([b * scales[:, None], scales - scales.mean()])
-            rows = np.vstack([rows, reference.reshape(1, -1)])
-            reference = reference * float(scales.mean())
+        if gauge == "form" and not np.isfinite(sizes_mm).all():
+            lacking = [name for name, size in zip(names, sizes_mm, strict=True) if not np.isfinite(size)]
+            raise InputError(
+                f"The size of {named(lacking)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                "or compare shapes with --gauge shape."
+            )
+        if gauge == "form" or model.gauge == "form":
+            centre = reference.mean(axis=0)
+            middle = (reference - centre).ravel()
+            if gauge == "form":
+                scales = sizes_mm / np.array([centroid_size(reference + (row @ rows).reshape(-1, 3)) for row in b])
+            else:
+                # Of a model whose modes hold size, shapes are taken in the tangent plane at its mean.
+                scales = 1 / (1 + b @ (rows @ middle) / (middle @ middle))
+            mean = float(scales.mean())
+            b = np.column_stack([b * scales[:, None], scales - mean])
+            rows = np.vstack([rows, middle])
+            reference = centre + mean * (reference - centre)
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
@@ -264,17 +292,36 @@ class Cohort:
         return cohort
 
 
+def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
+    """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
+    mean = onto.vertices(onto.coefficients.mean(axis=0))
+    if shapes.shape[1:] != mean.shape:
+        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {len(mean)}.")
+    middle = mean - mean.mean(axis=0)
+    for k, shape in enumerate(shapes):
+        if centroid_size(shape) <= 0:
+            raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
+        moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
+        if onto.gauge == "shape":
+            along = float(np.vdot(moved, middle)) / float(np.vdot(middle, middle))
+            moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
+        shapes[k] = moved
+
+
 def refuse_twice(cohort: Cohort) -> None:
-    """Check that no two shapes are the same, as of a scan that was copied.
+    """Check that no two shapes are the same but for rounding, as of a scan that was copied, in another pose perhaps.
 
     Raises:
         InputError: two are; the sentence names them.
     """
-    first: dict[bytes, str] = {}
-    for name, row in zip(cohort.names, cohort.coefficients, strict=True):
-        known = first.setdefault(row.tobytes(), name)
-        if known != name:
-            raise InputError(f"{known} and {name} are the same to the last digit; leave out one of them.")
+    from scipy.spatial import cKDTree
+
+    near = _SAME * centroid_size(cohort.reference)
+    pairs = cKDTree(cohort.coefficients).query_pairs(near, output_type="ndarray")
+    if len(pairs):
+        least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
+        first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]
+        raise InputError(f"{first} and {second} are the same shape but for rounding; leave out one of them.")
 
 
 def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:

@@ -49,7 +49,11 @@ class CohortOptions:
 
 
 def read_cohort(
-    data: Path | str, options: CohortOptions | None = None, *, on_shape: Callable[[int, int], None] | None = None
+    data: Path | str,
+    options: CohortOptions | None = None,
+    *,
+    onto: Cohort | None = None,
+    on_shape: Callable[[int, int], None] | None = None,
 ) -> Cohort:
     """Return the shapes of the rows of a table, or of all fits in a folder with what their records know.
 
@@ -60,6 +64,7 @@ def read_cohort(
         data: a CSV table whose column `file`, `scan`, `name` or `id` names a shape in each row (coefficients.csv is
             one), or a folder of results of fits, whose metadata are the table.
         options: which shapes; None for the defaults.
+        onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.
 
     Raises:
@@ -77,12 +82,12 @@ def read_cohort(
         )
     results = Results(folder)
     if len(results):
-        return _of_results(results, table, keys, options, on_shape)
+        return _of_results(results, table, keys, options, onto, on_shape)
     if table is None:
         raise InputError(
             f"{folder} holds no results of fits; give a CSV table of its meshes, and the folder as --shapes."
         )
-    return _of_surfaces(folder, table, keys, options, on_shape)
+    return _of_surfaces(folder, table, keys, options, onto, on_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +101,7 @@ class _Row:
     b_stddev: FloatArray
     size_mm: float
     mm_per_unit: float
+    beyond_mm: float
     known: Mapping[str, str]
 
 
@@ -103,7 +109,7 @@ def _rows(results: Results) -> list[_Row]:
     modes = range(1, modes_of(results) + 1)
     known = sorted(column for column in results.column_names() if column.startswith(META))
     texts = ("scan", "status", "scan_name", "scan_hash", "model_hash")
-    columns = (*texts, "centroid_size_mm", "mm_per_scan_unit", "modes", *known)
+    columns = (*texts, "centroid_size_mm", "mm_per_scan_unit", "beyond_model_mm", "modes", *known)
     numbers = [*(f"b{k}" for k in modes), *(f"b{k}_stddev" for k in modes)]
     found: list[_Row] = []
     for part in results.iter_rows((*columns, *numbers)):
@@ -121,6 +127,7 @@ def _rows(results: Results) -> list[_Row]:
                     values[1, :own, at],
                     _number(part["centroid_size_mm"][at]),
                     _number(part["mm_per_scan_unit"][at]),
+                    _number(part["beyond_model_mm"][at]),
                     {column.removeprefix(META): str(part[column][at] or "").strip() for column in known},
                 )
             )
@@ -132,6 +139,7 @@ def _of_results(
     table: Table | None,
     keys: Sequence[str],
     options: CohortOptions,
+    onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     rows = _rows(results)
@@ -152,9 +160,10 @@ def _of_results(
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         who = named([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
-    if len(kept) < 2:
+    fewest = 2 if onto is None else 1
+    if len(kept) < fewest:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and two are the least; "
+            f"{results.folder}: {len(kept)} of its fits can be used, and {('one is', 'two are')[fewest - 1]} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in kept]
@@ -170,6 +179,7 @@ def _of_results(
         read_only([np.pad(row.b_stddev, (0, width - len(row.b_stddev))) for row in fits]),
         tuple(row.status for row in fits),
         str(results.folder),
+        read_only([row.beyond_mm for row in fits]),
     )
     if options.surfaces == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
@@ -178,6 +188,12 @@ def _of_results(
         if lacking:
             raise InputError(f"{results.folder} holds no {options.surfaces} surface of {named(lacking)}; fit them again"
                              f"{' with --dense' if options.surfaces == 'dense' else ''}.")  # fmt: skip
+        unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
+        if unknown and options.gauge == "form":
+            raise InputError(
+                f"The size of {named(unknown)} is not known in mm, so forms cannot be compared; fit with --unit, "
+                "or compare shapes with --gauge shape."
+            )
         meshes: list[Mesh] = []
         for at, row in enumerate(fits):
             mesh = results.surface(row.name, options.surfaces)
@@ -186,7 +202,10 @@ def _of_results(
             if on_shape is not None:
                 on_shape(at + 1, len(fits))
         cohort = replace(
-            Cohort.of_meshes(meshes, stated, options.gauge), fitted=fitted, landmarks=dict(model.landmarks)
+            Cohort.of_meshes(meshes, stated, options.gauge, onto),
+            fitted=fitted,
+            landmarks=dict(model.landmarks),
+            sizes_mm=sizes,
         )
     return replace(cohort, notes=(*notes, *cohort.notes))
 
@@ -196,6 +215,7 @@ def _of_surfaces(
     table: Table,
     keys: Sequence[str],
     options: CohortOptions,
+    onto: Cohort | None,
     on_shape: Callable[[int, int], None] | None,
 ) -> Cohort:
     found = surface_files([folder])
@@ -205,7 +225,7 @@ def _of_surfaces(
     files = {_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
     kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
     _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
-    if len(kept) < 2:
+    if len(kept) < 2 and onto is None:
         raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and two are the least.")
     meshes: list[Mesh] = []
     for done, (file, _) in enumerate(kept, 1):
@@ -214,7 +234,7 @@ def _of_surfaces(
         meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=_stem(file)))
         if on_shape is not None:
             on_shape(done, len(kept))
-    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge)
+    cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto)
     return replace(cohort, notes=(*notes, *cohort.notes))
 
 

@@ -134,11 +134,14 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     # Scans of one name in different folders are called by their folders too, as their fits are.
     several = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
     keys = tuple(_with_folders(place) if stem_of(place) in several else stem_of(place) for place in places)
+    if "" in keys:
+        raise FileFormatError(
+            f"{path} has no {names} in row {keys.index('') + 1}; name the shape, or leave the row out."
+        )
     twice = [key for key, count in Counter(keys).items() if count > 1]
     if twice:
         raise FileFormatError(
-            f"{path} has {'two or more rows' if twice[0] else 'a row without a name, or more,'} "
-            f"{'of ' + repr(twice[0][:80]) if twice[0] else ''}{_more(len(twice) - 1)}; keep one row for each shape."
+            f"{path} has two or more rows of {twice[0][:80]!r}{_more(len(twice) - 1)}; keep one row for each shape."
         )
     columns: dict[str, tuple[str, ...]] = {}
     for at, head in enumerate(heads):

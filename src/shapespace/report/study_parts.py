@@ -380,7 +380,7 @@ class StudyParts:
             raise self.kept.wrong("the arrays of a surface are no places and triangles")
         if not np.isfinite(vertices).all():
             raise self.kept.wrong("some vertices of a surface are not finite")
-        return Mesh(vertices.astype(np.float64), faces.astype(np.int64) if faces.size else None, name="the surface")
+        return Mesh(vertices.astype(np.float64), faces if faces.size else None, name="the surface")
 
 
 _MAKERS: Mapping[type[Part], Callable[[StudyParts, Any, str, str], list[Block]]] = {

@@ -36,8 +36,14 @@ def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
                      help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
 
 
-def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None) -> Cohort:
-    """Return the cohort that `add_cohort` asked for; `gauge` stands for `add_gauge` where a command has no choice."""
+def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None) -> Cohort:
+    """Return the cohort that `add_cohort` asked for.
+
+    Args:
+        arguments: with what `add_cohort` added.
+        gauge: stands for `add_gauge` where a command has no choice.
+        onto: a cohort that it is to be compared with.
+    """
     from shapespace.batch.progress import progress
     from shapespace.cohort.read import CohortOptions, read_cohort
 
@@ -50,7 +56,7 @@ def cohort_of(arguments: argparse.Namespace, gauge: Gauge | None = None) -> Coho
             bar.total = total
             bar.update(done - bar.n)
 
-        return read_cohort(arguments.data, options, on_shape=step)
+        return read_cohort(arguments.data, options, onto=onto, on_shape=step)
 
 
 def finish(answer: Answer, arguments: argparse.Namespace) -> int:

@@ -1,0 +1,49 @@
+"""`shapespace score`: where new subjects lie in a reference population."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
+
+
+def add(sub: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_cohort(sub)
+    sub.add_argument("--reference", type=Path, required=True, metavar="DATA",
+                     help="the population: a CSV table or a folder of fits, as DATA; doubtful fits are left out")  # fmt: skip
+    sub.add_argument("--reference-shapes", type=Path, metavar="DIR",
+                     help="its results of fits, or meshes (default: the folder of the reference)")  # fmt: skip
+    sub.add_argument("--modes", type=int, metavar="N",
+                     help="of the reference to measure by (default: 95 %% of its variance, one for five people at most)")  # fmt: skip
+    sub.add_argument("--subject", metavar="COLUMN", help="says who is scanned, where people have several scans")
+    sub.add_argument("--nearest", type=int, default=3, metavar="N", help="of the reference to name (default 3)")
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the draws of uncertain fits")
+    add_gauge(sub)
+    sub.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Score subjects against a reference."""
+    from shapespace.batch.progress import progress
+    from shapespace.statistics.score import ScoreOptions, score
+    from shapespace.statistics.score_answer import answer_of
+
+    options = ScoreOptions(
+        modes=arguments.modes,
+        subject=arguments.subject,
+        nearest=arguments.nearest,
+        seed=arguments.seed,
+        drop_missing=arguments.drop_missing,
+    )
+    known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
+    reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
+    subjects = cohort_of(arguments, onto=reference)
+    with progress(len(subjects), "scoring", "subject", quiet=arguments.quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        scores = score(reference, subjects, options, on_step=step)
+    return finish(answer_of(scores), arguments)

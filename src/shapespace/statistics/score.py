@@ -1,0 +1,519 @@
+"""Where new subjects lie in a reference population: distances, percentiles, maps, and what lies outside of it.
+
+Each of the reference's people is left out in turn and measured by the others as a new subject is, so that the
+percentiles hold whatever the distances are distributed like (Vovk, Gammerman and Shafer, Algorithmic Learning in a
+Random World, 2005; with refitting, Barber et al., Annals of Statistics 49(1), 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import f as f_distribution
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.table import named
+from shapespace.errors import CorrespondenceError, InputError
+from shapespace.fit.posterior import new_shapes
+from shapespace.geometry.procrustes import centroid_size
+from shapespace.geometry.surface import vertex_normals
+from shapespace.types import FloatArray, IntArray, Mesh, read_only
+
+FEWEST_PEOPLE, SMALL = 5, 30
+"""The least reference, and one below which the answer says that it is small."""
+
+LEVEL = 0.05
+_SHARE, _PEOPLE_PER_MODE, _MOST_FOLDS = 0.95, 5, 100
+_LEAST_TOLD, _AS_WELL_SEEN = 1e-4, 0.95
+_VERTICES_AT_ONCE = 2000
+_SAME = 1e-6
+_OUTSIDE = 0.01
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """How subjects are measured by a reference.
+
+    Args:
+        modes: of the reference, by which distances are measured; None takes those of 95 % of its variance, at most one
+            for five people.
+        subject: column of both tables that says who is scanned; None takes each scan for another person.
+        nearest: how many of the reference are named for each subject.
+        draws: of the reference as it would look if it were seen as badly as a subject is.
+        seed: of the draws.
+        drop_missing: leave out scans of which `subject` is missing.
+    """
+
+    modes: int | None = None
+    subject: str | None = None
+    nearest: int = 3
+    draws: int = 20
+    seed: int = 0
+    drop_missing: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """One of the reference beside a subject: its name, its distance in standard deviations, and the RMS in mm."""
+
+    name: str
+    distance: float
+    rms_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Where M subjects lie in a reference of N scans of P people.
+
+    Args:
+        names: of the subjects.
+        reference_names: N.
+        people: P.
+        modes: q, of the reference.
+        variance_share: of the reference's variance, in these modes.
+        mean: the reference's mean shape, mm.
+        distance: (M,) Mahalanobis distances in the modes, with each fit's own uncertainty.
+        farther: (M,) share of the reference's people, the subject among them, who lie as far out or farther when left
+            out, from 1 / (P + 1) to 1; a p value.
+        p_value: (M,) the same by the F distribution of normal shapes.
+        rest_mm: (M,) RMS over the vertices of what the modes cannot make, mm.
+        rest_farther: (M,) as `farther`, of that.
+        beyond_mm: (M,) RMS of what the fit's model left of its residuals, mm; NaN where that is not known.
+        beyond_farther: (M,) as `farther`, of that.
+        size_mm: (M,) centroid sizes; NaN where not known.
+        size_z: (M,) sizes in standard deviations of the reference's; NaN where not known.
+        z: (M, V) displacement along the mean's normals in standard deviations, outwards positive.
+        z_limit: |z| below which 95 % of the reference's people stay everywhere when left out; NaN for fewer than 19.
+        nearest: for each subject those of the reference nearest to it.
+        outside: for each subject sentences on how it lies outside what reference or model know; none where it does not.
+        reference_distance: (N,) Mahalanobis distance of each of the reference by the others.
+        reference_rest_mm: (N,) as `rest_mm`.
+        subjects: the cohort of them.
+        options: of the scoring.
+        notes: who was left out and why, and what should be known.
+    """
+
+    names: tuple[str, ...]
+    reference_names: tuple[str, ...]
+    people: int
+    modes: int
+    variance_share: float
+    mean: Mesh
+    distance: FloatArray
+    farther: FloatArray
+    p_value: FloatArray
+    rest_mm: FloatArray
+    rest_farther: FloatArray
+    beyond_mm: FloatArray
+    beyond_farther: FloatArray
+    size_mm: FloatArray
+    size_z: FloatArray
+    z: FloatArray
+    z_limit: float
+    nearest: tuple[tuple[Near, ...], ...]
+    outside: tuple[tuple[str, ...], ...]
+    reference_distance: FloatArray
+    reference_rest_mm: FloatArray
+    subjects: Cohort
+    options: ScoreOptions
+    notes: tuple[str, ...]
+
+    @property
+    def percentile(self) -> FloatArray:
+        """(M,) Percent of the reference's people who lie nearer to its mean."""
+        return read_only(100 * (1 - self.farther))
+
+    @property
+    def beyond_2(self) -> FloatArray:
+        """(M,) Share of the vertices beyond 2 standard deviations."""
+        return read_only((np.abs(self.z) > 2).mean(axis=1))
+
+
+def score(
+    reference: Cohort,
+    subjects: Cohort,
+    options: ScoreOptions | None = None,
+    *,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Scores:
+    """Return where `subjects` lie in the population that `reference` is a sample of.
+
+    Distances are measured in q principal components of the reference, by its covariance there and the fit's own
+    uncertainty: d^2 = y' (S (1 + 1 / P) + D)^-1 y. For the percentiles each person of the reference is left out, made
+    as uncertain as the subject, and measured by the others; of more than 100 people, a hundredth at a time.
+
+    Args:
+        reference: N shapes.
+        subjects: M shapes, read with `onto=reference`.
+        options: how; None for the defaults.
+        on_step: called with (done, total).
+
+    Raises:
+        InputError: fewer than five people, more modes than there can be, cohorts of different models or gauges, a
+            subject who is in the reference, or something missing in the column that says who is scanned.
+        CorrespondenceError: shapes of different vertices.
+    """
+    options = options or ScoreOptions()
+    if options.subject is not None:
+        reference = reference.complete([options.subject], drop_missing=options.drop_missing)
+        subjects = subjects.complete([options.subject], drop_missing=options.drop_missing)
+    _refuse_unlike(reference, subjects)
+    people = _people(reference, options.subject)
+    own, outside_basis = _in_basis_of(reference, subjects)
+    _refuse_known(reference, subjects, own, outside_basis, options.subject)
+    ruler = _Ruler(reference, people, _modes(reference, people, options.modes))
+    theirs, ours = _Seen.of(reference), _Seen.of(subjects)
+    notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]
+    if theirs is None or ours is None or not np.array_equal(theirs.prior, ours.prior):
+        if reference.fitted is not None:
+            notes.append("How uncertain each fit is was not taken into account; that needs coefficients of fits.")
+        theirs = ours = None
+    m, draws = len(subjects), _draws(theirs, options)
+    found = np.empty((5, m))
+    nearest: list[tuple[Near, ...]] = []
+    plain = None if theirs is not None else ruler.left_out(reference.coefficients[None], None)
+    for k in range(m):
+        noise = None
+        if theirs is not None and ours is not None:
+            noise = ours.covariance(k)
+            d2, rest = ruler.left_out(theirs.as_seen(reference.coefficients, ours.told[k], draws), noise)
+        else:
+            d2, rest = plain if plain is not None else ruler.left_out(reference.coefficients[None], None)
+        y = ruler.whole.scores(own[k])
+        own_d2 = float(ruler.whole.squared(y[None], noise)[0])
+        left = float(np.sum((own[k] - ruler.whole.mean) ** 2) - y @ y) + outside_basis[k]
+        own_rest = float(ruler.rms(np.array(left)))
+        found[:, k] = (
+            np.sqrt(own_d2), ruler.share(d2 >= own_d2), ruler.p_value(own_d2),
+            own_rest, ruler.share(rest >= own_rest),
+        )  # fmt: skip
+        nearest.append(_nearest(ruler, reference, own[k], outside_basis[k], noise, options.nearest))
+        if on_step is not None:
+            on_step(k + 1, m)
+    beyond = np.array([_beyond(subjects), np.full(m, np.nan)])
+    theirs_beyond = _beyond(reference)
+    if np.isfinite(theirs_beyond).all():
+        for k in np.flatnonzero(np.isfinite(beyond[0])):
+            beyond[1, k] = ruler.share(theirs_beyond[None] >= beyond[0, k])
+    own_d2, own_rest = ruler.left_out(reference.coefficients[None], None if theirs is None else theirs.typical())
+    z, limit = _maps(reference, subjects, people, ours)
+    sizes = reference.sizes_mm
+    size_z = (subjects.sizes_mm - sizes.mean()) / max(float(sizes.std(ddof=1)), 1e-12)
+    scores = Scores(
+        names=subjects.names, reference_names=reference.names, people=ruler.people, modes=ruler.modes,
+        variance_share=ruler.variance_share,
+        mean=Mesh(reference.vertices(ruler.whole.mean), reference.faces, name="mean"),
+        distance=read_only(found[0]), farther=read_only(found[1]), p_value=read_only(found[2]),
+        rest_mm=read_only(found[3]), rest_farther=read_only(found[4]), beyond_mm=read_only(beyond[0]),
+        beyond_farther=read_only(beyond[1]), size_mm=subjects.sizes_mm, size_z=read_only(size_z), z=z, z_limit=limit,
+        nearest=tuple(nearest), outside=(), reference_distance=read_only(np.sqrt(own_d2[0])),
+        reference_rest_mm=read_only(own_rest[0]), subjects=subjects, options=options,
+        notes=(*notes, *_on_size(ruler.people)),
+    )  # fmt: skip
+    return replace(scores, outside=tuple(tuple(_outside(scores, k)) for k in range(m)))
+
+
+def _refuse_unlike(reference: Cohort, subjects: Cohort) -> None:
+    if reference.n_vertices != subjects.n_vertices:
+        raise CorrespondenceError(
+            f"The subjects have {subjects.n_vertices} vertices and the reference {reference.n_vertices}; fit both with "
+            "one model, or bring both into correspondence together."
+        )
+    if reference.gauge != subjects.gauge:
+        raise InputError(
+            f"The reference is in the gauge {reference.gauge}, the subjects in {subjects.gauge}; take one."
+        )
+    if (reference.fitted is None) != (subjects.fitted is None):
+        raise InputError("Fits cannot be compared with other surfaces; fit both with one model.")
+    if reference.fitted is not None and subjects.fitted is not None:
+        one, other = reference.fitted.model.content_hash, subjects.fitted.model.content_hash
+        if one != other:
+            raise InputError(
+                f"The subjects are fits by another model ({other[:12]}) than the reference ({one[:12]}); fit all scans "
+                "with one model."
+            )
+
+
+def _people(reference: Cohort, column: str | None) -> IntArray:
+    """Return (N,) a number for each person of the reference."""
+    who = reference.names if column is None else reference.table.texts(column)
+    codes = np.unique(np.array(who), return_inverse=True)[1].ravel()
+    count = int(codes.max()) + 1
+    if count < FEWEST_PEOPLE:
+        raise InputError(
+            f"A reference of {count} {'shapes' if column is None else 'people'} is too small to tell what is usual; "
+            f"give {FEWEST_PEOPLE} or more, better {SMALL} and more."
+        )
+    return codes.astype(np.int32)
+
+
+def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
+    """Return how many principal components of the reference carry distances."""
+    count = int(people.max()) + 1
+    centred = reference.coefficients - reference.coefficients.mean(axis=0)
+    variance = np.linalg.svd(centred, compute_uv=False) ** 2
+    there = int((variance > 1e-12 * variance.sum()).sum())
+    most = min(there, count - 3)
+    if wanted is not None:
+        if not 1 <= wanted <= most:
+            raise InputError(f"A reference of {count} people has 1 to {most} modes to measure by, not {wanted}.")
+        return wanted
+    enough = int(np.searchsorted(np.cumsum(variance) / variance.sum(), _SHARE)) + 1
+    return max(1, min(enough, count // _PEOPLE_PER_MODE, most))
+
+
+def _in_basis_of(reference: Cohort, subjects: Cohort) -> tuple[FloatArray, FloatArray]:
+    """Return the subjects' coefficients (M, K) in the reference's basis, and the squares (M,) of what lies outside."""
+    into = subjects.basis @ reference.basis.T
+    shift = (subjects.reference - reference.reference).ravel()
+    own = subjects.coefficients @ into + reference.basis @ shift
+    apart = [float(np.sum((subjects.vertices(k) - reference.reference) ** 2)) for k in range(len(subjects))]
+    left = np.array(apart) - (own**2).sum(axis=1)
+    # Below rounding it is nothing.
+    return own, np.where(left > 1e-12 * np.array(apart), left, 0.0)
+
+
+def _refuse_known(
+    reference: Cohort, subjects: Cohort, own: FloatArray, outside: FloatArray, column: str | None
+) -> None:
+    """Refuse subjects who are in the reference, as scans or as people."""
+    far, at = cKDTree(reference.coefficients).query(own)
+    near = np.sqrt(np.square(far) + outside) < _SAME * centroid_size(reference.reference)
+    if near.any():
+        k = int(np.flatnonzero(near)[0])
+        raise InputError(
+            f"{subjects.names[k]} is in the reference too, as {reference.names[int(at[k])]}"
+            f"{f', and {int(near.sum()) - 1} more are' if near.sum() > 1 else ''}; leave it out of one of them."
+        )
+    if column is not None:
+        both = sorted({*reference.table.texts(column)} & {*subjects.table.texts(column)})
+        if both:
+            raise InputError(
+                f"{named(both)} of {column} is among the subjects and in the reference; leave out one scan."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Measure:
+    """Mean (K,), components (q, K) and variances (q,) of some people; the last count that the mean is uncertain."""
+
+    mean: FloatArray
+    components: FloatArray
+    variance: FloatArray
+
+    @staticmethod
+    def of(coefficients: FloatArray, people: int, modes: int) -> _Measure:
+        mean = coefficients.mean(axis=0)
+        _, s, vt = np.linalg.svd(coefficients - mean, full_matrices=False)
+        variance = s[:modes] ** 2 / (len(coefficients) - 1)
+        floor = 1e-12 * max(float(variance.max()), 1e-300)
+        return _Measure(mean, vt[:modes], np.maximum(variance, floor) * (1 + 1 / people))
+
+    def scores(self, coefficients: FloatArray) -> FloatArray:
+        return (coefficients - self.mean) @ self.components.T
+
+    def squared(self, scores: FloatArray, noise: FloatArray | None) -> FloatArray:
+        """Return squared Mahalanobis distances (...,) of scores (..., q), with noise (K, K) of coefficients."""
+        if noise is None:
+            return (scores**2 / self.variance).sum(axis=-1)
+        covariance = np.diag(self.variance) + self.components @ noise @ self.components.T
+        return (
+            scores * np.linalg.solve(covariance, scores.reshape(-1, len(covariance)).T).T.reshape(scores.shape)
+        ).sum(axis=-1)
+
+
+class _Ruler:
+    """The reference as it measures: all of it, and without some of its people in turn."""
+
+    def __init__(self, reference: Cohort, people: IntArray, modes: int) -> None:
+        self.people, self.modes = int(people.max()) + 1, modes
+        self.n_vertices = reference.n_vertices
+        x = reference.coefficients
+        self.whole = _Measure.of(x, self.people, modes)
+        centred = x - x.mean(axis=0)
+        self.least = 1e-12 * float((centred**2).sum()) / len(x)
+        self.variance_share = float((self.whole.scores(x) ** 2).sum() / (centred**2).sum())
+        counts = np.bincount(people)
+        self.weight = 1 / counts[people]
+        parts = people % min(self.people, _MOST_FOLDS)
+        self.folds: list[tuple[IntArray, _Measure]] = []
+        for part in range(int(parts.max()) + 1):
+            inside = parts == part
+            left = len(np.unique(people[~inside]))
+            self.folds.append((np.flatnonzero(inside).astype(np.int32), _Measure.of(x[~inside], left, modes)))
+
+    def left_out(self, coefficients: FloatArray, noise: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return squared distances and RMS of the rest in mm, (R, N) each, of (R, N, K) measured by the others."""
+        d2 = np.empty(coefficients.shape[:2])
+        rest = np.empty_like(d2)
+        for rows, measure in self.folds:
+            y = measure.scores(coefficients[:, rows])
+            d2[:, rows] = measure.squared(y, noise)
+            left = ((coefficients[:, rows] - measure.mean) ** 2).sum(axis=-1) - (y**2).sum(axis=-1)
+            rest[:, rows] = self.rms(left)
+        return d2, rest
+
+    def rms(self, squares: FloatArray) -> FloatArray:
+        """Return sums of squares as RMS over the vertices, mm; what is left by rounding alone is nothing."""
+        return np.sqrt(np.where(squares > self.least, squares, 0.0) / self.n_vertices)
+
+    def share(self, farther: FloatArray) -> float:
+        """Return the share of people, a new one among them, who are `farther` (R, N); those of a person count once."""
+        return (1 + float((farther.mean(axis=0) * self.weight).sum())) / (self.people + 1)
+
+    def p_value(self, squared: float) -> float:
+        """Return the chance of a squared distance as large by the F distribution."""
+        q, n = self.modes, self.people
+        return float(f_distribution.sf(squared * (n - q) / ((n - 1) * q), q, n - q))
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """How well fits were seen.
+
+    Args:
+        b: (N, K) coefficients, mm.
+        told: (N, K) 1 where the scan told a coefficient, near 0 where only the model did.
+        variance: (N, K) of the coefficients, mm^2.
+        prior: (K,) of a new shape, mm^2.
+        into: (K, K') from the model's coefficients to those of the cohort.
+    """
+
+    b: FloatArray
+    told: FloatArray
+    variance: FloatArray
+    prior: FloatArray
+    into: FloatArray
+
+    @staticmethod
+    def of(cohort: Cohort) -> _Seen | None:
+        """Return how well the fits of a cohort were seen; None for other surfaces than the model's own."""
+        fitted = cohort.fitted
+        if fitted is None or not np.isfinite(fitted.b_stddev).all():
+            return None
+        modes = fitted.b.shape[1]
+        rows = fitted.model.vertex_basis[:, :modes].T
+        into = rows @ cohort.basis.T
+        if np.abs((into**2).sum(axis=1) - (rows**2).sum(axis=1)).max() > 1e-6:
+            return None
+        scale = centroid_size(cohort.reference) / centroid_size(fitted.model.mean_vertices)
+        prior = np.maximum(new_shapes(fitted.model)[:modes], (fitted.b_stddev**2).max(axis=0))
+        told = np.clip(1 - fitted.b_stddev**2 / prior, _LEAST_TOLD, 1.0)
+        return _Seen(fitted.b, told, fitted.b_stddev**2, prior, into * scale)
+
+    def covariance(self, k: int) -> FloatArray:
+        """Return the covariance (K', K') of the coefficients of fit k."""
+        return (self.into.T * self.variance[k]) @ self.into
+
+    def typical(self) -> FloatArray:
+        """Return the same of a usual fit."""
+        return (self.into.T * np.median(self.variance, axis=0)) @ self.into
+
+    def as_seen(self, coefficients: FloatArray, told: FloatArray, draws: FloatArray) -> FloatArray:
+        """Return (R, N, K') coefficients as they would be if scans had told only `told` (K,) of each mode."""
+        ratio = np.minimum(told / self.told, 1.0)
+        if ratio.min() > _AS_WELL_SEEN:
+            return coefficients[None]
+        # What a scan does not tell goes to the model's mean, with what is left of the spread of such estimates.
+        moved = (ratio - 1) * self.b + np.sqrt(self.prior * told * (1 - ratio)) * draws
+        return coefficients + moved @ self.into
+
+
+def _draws(seen: _Seen | None, options: ScoreOptions) -> FloatArray:
+    """Return standard normal numbers (R, N, K)."""
+    shape = (0, 0) if seen is None else seen.told.shape
+    return np.random.default_rng(options.seed).standard_normal((options.draws, *shape))
+
+
+def _beyond(cohort: Cohort) -> FloatArray:
+    none = cohort.fitted is None or cohort.fitted.beyond_mm is None
+    return np.full(len(cohort), np.nan) if none else np.asarray(cohort.fitted.beyond_mm)
+
+
+def _nearest(
+    ruler: _Ruler, reference: Cohort, own: FloatArray, outside: float, noise: FloatArray | None, count: int
+) -> tuple[Near, ...]:
+    between = own - reference.coefficients
+    far = np.sqrt(ruler.whole.squared(between @ ruler.whole.components.T, noise))
+    rms = np.sqrt(((between**2).sum(axis=1) + outside) / ruler.n_vertices)
+    order = np.argsort(far, kind="stable")[:count]
+    return tuple(Near(reference.names[k], float(far[k]), float(rms[k])) for k in order)
+
+
+def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | None) -> tuple[FloatArray, float]:
+    """Return standard deviations (M, V) along the mean's normals, and the limit that 95 % of the people stay within."""
+    mean = reference.vertices(reference.coefficients.mean(axis=0))
+    mesh = Mesh(mean, reference.faces)
+    if reference.faces is not None:
+        normals = vertex_normals(mesh)
+    else:
+        # Points have no surface; outwards is away from their middle.
+        away = mean - mean.mean(axis=0)
+        normals = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    n, count = len(reference), int(people.max()) + 1
+    z = np.empty((len(subjects), len(mean)))
+    largest = np.zeros(n)
+    rows = None if seen is None else seen.into @ reference.basis
+    groups = np.zeros((count, n))
+    groups[people, np.arange(n)] = 1
+    size = groups.sum(axis=1, keepdims=True)
+    for start in range(0, len(mean), _VERTICES_AT_ONCE):
+        part = slice(start, start + _VERTICES_AT_ONCE)
+        own = normals[part]
+        x = np.einsum("nmi,mi->nm", reference.displacements(part), own)
+        x -= np.einsum("mi,mi->m", (mean - reference.reference)[part], own)
+        squares, total = (x**2).sum(axis=0), x.sum(axis=0)
+        variance = np.maximum((squares - total**2 / n) / (n - 1), 1e-18)
+        moved = np.einsum("nmi,mi->nm", subjects.displacements(part), own)
+        moved += np.einsum("mi,mi->m", (subjects.reference - mean)[part], own)
+        uncertain = 0.0
+        if seen is not None and rows is not None:
+            along = np.einsum("kmi,mi->km", rows.reshape(len(rows), -1, 3)[:, part], own)
+            uncertain = seen.variance @ along**2
+        z[:, part] = moved / np.sqrt(variance * (1 + 1 / count) + uncertain)
+        rest = n - size
+        others = (total - groups @ x) / rest
+        spread = np.maximum((squares - groups @ x**2 - rest * others**2) / np.maximum(rest - 1, 1), 1e-18)
+        left_out = (x - others[people]) / np.sqrt(spread[people] * (1 + 1 / (count - 1)))
+        largest = np.maximum(largest, np.abs(left_out).max(axis=1))
+    by_person = np.sort(np.array([largest[people == k].mean() for k in range(count)]))
+    at = int(np.ceil((1 - LEVEL) * (count + 1)))
+    return read_only(z), float(by_person[at - 1]) if at <= count else float("nan")
+
+
+def _on_size(people: int) -> list[str]:
+    if people >= SMALL:
+        return []
+    step = 100 / (people + 1)
+    return [
+        f"The reference is small: with {people} people shares are told in steps of {step:.0f} %, and what is usual is "
+        "known roughly."
+    ]
+
+
+def _outside(scores: Scores, k: int) -> list[str]:
+    """Return sentences on how a subject lies outside what reference or model know."""
+    out: list[str] = []
+    # A small reference can say no more than that a subject lies beyond all of it.
+    rare = max(_OUTSIDE, 1 / (scores.people + 1)) + 1e-9
+
+    def beyond(share: float) -> str:
+        return "all" if share <= 1 / (scores.people + 1) + 1e-9 else f"{100 * (1 - share):.0f} %"
+
+    if scores.rest_farther[k] <= rare:
+        out.append(
+            f"the {scores.modes} modes of the reference leave {scores.rest_mm[k]:.2f} mm of its shape (RMS), more than "
+            f"of {beyond(float(scores.rest_farther[k]))} of the reference"
+        )
+    if scores.beyond_farther[k] <= rare:
+        out.append(
+            f"the model of its fit left {scores.beyond_mm[k]:.2f} mm of the scan (RMS), more than of "
+            f"{beyond(float(scores.beyond_farther[k]))} of the reference"
+        )
+    fitted = scores.subjects.fitted
+    if fitted is not None and fitted.status[k] == "doubtful":
+        out.append("its fit is doubtful")
+    return out

@@ -1,0 +1,213 @@
+"""Scores of subjects as an answer: sentences, tables, maps and morphs of its report."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import structs
+
+from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.score import SMALL, Scores
+
+_MOST_MAPS, _MOST_MORPHS, _MOST_TOLD, _BINS = 12, 3, 12, 24
+_LIMIT_SD = 4.0
+_FILE = "score.npz"
+
+
+def answer_of(scores: Scores) -> Answer:
+    """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
+    shown = _shown(scores)
+    tables, arrays = _tables(scores), _arrays(scores, shown)
+    parts: list[Part] = [
+        TextPart(title="The subjects", level=2, text=_how(scores)),
+        _table(scores),
+        _histogram(scores),
+        *_maps(scores, shown),
+        *_morphs(scores, shown),
+    ]
+    fitted = scores.subjects.fitted
+    many = len(scores.names) != 1
+    return Answer(
+        question="score",
+        title=f"{f'{len(scores.names)} subjects' if many else scores.names[0]} beside a reference of {scores.people}",
+        summary=tuple(_sentence(scores, k) for k in shown[:_MOST_TOLD]),
+        parts=tuple(parts),
+        tables=tables,
+        arrays={_FILE: arrays},
+        notes=scores.notes,
+        settings={
+            "gauge": scores.subjects.gauge,
+            "modes": scores.modes,
+            "variance_share": scores.variance_share,
+            "subject": scores.options.subject,
+            "draws": scores.options.draws,
+            "seed": scores.options.seed,
+        },
+        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+    )
+
+
+def _shown(scores: Scores) -> list[int]:
+    """Return the subjects, those who lie farthest out first."""
+    order = np.lexsort((-scores.distance, scores.farther))
+    return sorted(map(int, order), key=lambda k: not scores.outside[k])
+
+
+def _sentence(scores: Scores, k: int) -> str:
+    near = ", ".join(one.name for one in scores.nearest[k])
+    small = " (a small reference)" if scores.people < SMALL else ""
+    told = (
+        f"{scores.names[k]} lies {scores.distance[k]:.1f} standard deviations from the reference's mean in "
+        f"{scores.modes} modes, farther out than {scores.percentile[k]:.0f} % of its {scores.people} people{small}; by "
+        f"the F distribution p = {scores.p_value[k]:.3g}. Nearest to it: {near}."
+    )
+    if not scores.outside[k]:
+        return told
+    return f"{told} It lies outside what is known: {'; '.join(scores.outside[k])}."
+
+
+def _how(scores: Scores) -> tuple[str, ...]:
+    limit = (
+        f"Beyond {scores.z_limit:.1f} standard deviations lies nowhere any vertex of 95 % of the reference's people."
+        if math.isfinite(scores.z_limit)
+        else "The reference is too small to say how far out a single vertex may lie by chance (19 people are the least)."
+    )
+    return (
+        f"Distances are Mahalanobis distances in the {scores.modes} modes of the reference that hold "
+        f"{100 * scores.variance_share:.0f} % of its variance, by its covariance and each fit's own uncertainty.",
+        "Percentiles are found by leaving out the reference's people in turn, as uncertain as the subject, and hold "
+        "whatever the distribution; p is by the F distribution of normal shapes.",
+        limit,
+    )
+
+
+def _table(scores: Scores) -> TablePart:
+    columns = [
+        TableColumn(name="Subject", kind="text"),
+        TableColumn(name="Distance (SD)", kind="number"),
+        TableColumn(name="Percentile", kind="percent"),
+        TableColumn(name="p (F)", kind="p"),
+        TableColumn(name="Left by the modes", kind="mm"),
+        TableColumn(name="Its percentile", kind="percent"),
+        TableColumn(name="Beyond 2 SD", kind="percent"),
+        TableColumn(name="Size (SD)", kind="number"),
+        TableColumn(name="Nearest", kind="text"),
+        TableColumn(name="Outside", kind="text"),
+    ]
+    sized = bool(np.isfinite(scores.size_z).all())
+    rows = [
+        (
+            name, scores.distance[k], 1 - scores.farther[k], scores.p_value[k], scores.rest_mm[k],
+            1 - scores.rest_farther[k], scores.beyond_2[k], scores.size_z[k],
+            ", ".join(one.name for one in scores.nearest[k]), "; ".join(scores.outside[k]),
+        )
+        for k, name in enumerate(scores.names)
+    ]  # fmt: skip
+    if not sized:
+        del columns[7]
+        rows = [(*row[:7], *row[8:]) for row in rows]
+    return TablePart(
+        title="Scores", columns=tuple(columns), rows=tuple(rows),
+        note="Percentiles: share of the reference's people who lie nearer to its mean. 4.6 % of the vertices lie beyond "
+        "2 standard deviations in a usual shape.",
+    )  # fmt: skip
+
+
+def _histogram(scores: Scores) -> HistogramPart:
+    every = np.concatenate([scores.reference_distance, scores.distance])
+    edges = np.linspace(0.0, float(every.max()) * 1.02, _BINS + 1)
+    series = [_counts(scores.reference_distance, edges, "reference, each by the others")]
+    one = len(scores.names) == 1
+    if not one:
+        series.append(_counts(scores.distance, edges, "subjects"))
+    return HistogramPart(
+        title="Distances", edges=tuple(edges.tolist()), series=tuple(series), x="Mahalanobis distance (SD)",
+        observed=float(scores.distance[0]) if one else None, observed_label=scores.names[0] if one else "",
+    )  # fmt: skip
+
+
+def _counts(values: npt.NDArray[Any], edges: npt.NDArray[Any], label: str) -> Counts:
+    return Counts(counts=tuple(map(float, np.histogram(values, edges)[0])), label=label)
+
+
+def _maps(scores: Scores, shown: list[int]) -> list[Part]:
+    parts: list[Part] = [TextPart(title="Maps", level=2, text=_of_maps(scores, shown))]
+    for k in shown[:_MOST_MAPS]:
+        beyond = float((np.abs(scores.z[k]) > scores.z_limit).mean()) if math.isfinite(scores.z_limit) else 0.0
+        part = SurfaceMapPart(
+            title=scores.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
+            limit=_LIMIT_SD,
+        )  # fmt: skip
+        parts.append(structs.replace(part, mask=f"beyond_{k + 1}") if beyond else part)
+    return parts
+
+
+def _of_maps(scores: Scores, shown: list[int]) -> str:
+    rest = len(shown) - _MOST_MAPS
+    more = f" Maps of {rest} more are in {_FILE}." if rest > 0 else ""
+    return (
+        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference "
+        "and the fit's own uncertainty. Where a map has pale parts, the rest lies farther out than chance takes any "
+        f"vertex of 95 % of the reference's people.{more}"
+    )
+
+
+def _morphs(scores: Scores, shown: list[int]) -> list[Part]:
+    if scores.mean.faces is None:
+        return []
+    return [
+        MorphPart(
+            title=f"From the reference's mean to {scores.names[k]}", arrays=_FILE, low="vertices",
+            high=f"shape_{k + 1}", low_label="the reference's mean", high_label=scores.names[k],
+        )
+        for k in shown[:_MOST_MORPHS]
+    ]  # fmt: skip
+
+
+def _arrays(scores: Scores, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
+    faces = scores.mean.faces
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "vertices": scores.mean.vertices,
+        "faces": np.zeros((0, 3), dtype=np.int32) if faces is None else faces,
+    }
+    for k in range(len(scores.names)):
+        arrays[f"z_{k + 1}"] = scores.z[k].astype(np.float32)
+    for k in shown[:_MOST_MAPS]:
+        arrays[f"beyond_{k + 1}"] = np.abs(scores.z[k]) > scores.z_limit
+    for k in shown[:_MOST_MORPHS]:
+        arrays[f"shape_{k + 1}"] = scores.subjects.vertices(k)
+    return arrays
+
+
+def _tables(scores: Scores) -> dict[str, Rows]:
+    head = (
+        "subject", "distance_sd", "percentile", "p_left_out", "p_f", "rest_mm", "rest_p", "beyond_model_mm",
+        "beyond_model_p", "vertices_beyond_2sd", "centroid_size_mm", "size_sd", "outside", "map",
+    )  # fmt: skip
+    rows = [
+        (
+            name, scores.distance[k], scores.percentile[k], scores.farther[k], scores.p_value[k], scores.rest_mm[k],
+            scores.rest_farther[k], _known(scores.beyond_mm[k]), _known(scores.beyond_farther[k]), scores.beyond_2[k],
+            _known(scores.size_mm[k]), _known(scores.size_z[k]), "; ".join(scores.outside[k]), f"z_{k + 1}",
+        )
+        for k, name in enumerate(scores.names)
+    ]  # fmt: skip
+    near = [
+        (name, rank, one.name, one.distance, one.rms_mm)
+        for name, found in zip(scores.names, scores.nearest, strict=True)
+        for rank, one in enumerate(found, 1)
+    ]
+    reference = zip(scores.reference_names, scores.reference_distance, scores.reference_rest_mm, strict=True)
+    return {
+        "scores.csv": (head, rows),
+        "nearest.csv": (("subject", "rank", "reference", "distance_sd", "rms_mm"), near),
+        "reference.csv": (("reference", "distance_sd", "rest_mm"), list(reference)),
+    }
+
+
+def _known(value: float) -> float | str:
+    return float(value) if math.isfinite(value) else ""

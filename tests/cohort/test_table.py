@@ -1,0 +1,117 @@
+"""Tables of what is known of shapes: numbers, classes, missing cells, and what is refused by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapespace.cohort.table import Table, named, numbers_as_text, read_table
+from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.files import write_text
+
+LINES = "file,sex,age\nscans/a.ply,f,20\nb.ply,m,\nc.stl,NA,41.5\n"
+
+
+def written(folder: Path, text: str = LINES) -> Path:
+    write_text(folder / "data.csv", text)
+    return folder / "data.csv"
+
+
+def test_rows_are_called_by_their_files_and_cells_that_say_nothing_are_empty(tmp_path: Path) -> None:
+    table, keys = read_table(written(tmp_path))
+    assert keys == table.rows == ("a", "b", "c") and list(table.columns) == ["sex", "age"]
+    assert table.texts("sex") == ("f", "m", "") and table.texts("age") == ("20", "", "41.5")
+    assert np.array_equal(table.numbers("age"), [20, np.nan, 41.5], equal_nan=True)
+    assert table.kind("sex") == "text" and table.kind("age") == "number"
+    assert table.missing(["sex"]) == [2] and table.missing(["sex", "age"]) == [1, 2] and table.missing([]) == []
+
+
+@pytest.mark.parametrize("word", ["", " ", "NA", "nan", "N/A", "null", "None"])
+def test_missing_is_written_in_many_ways(tmp_path: Path, word: str) -> None:
+    table, _ = read_table(written(tmp_path, f"id,age\na,{word}\nb,3\n"))
+    assert table.missing(["age"]) == [0]
+
+
+@pytest.mark.parametrize(
+    ("heads", "own"), [("file,scan,name,id", 0), ("scan,name,id,other", 0), ("name,id,a,b", 0), ("x,y,z,id", 3)]
+)
+def test_the_first_of_the_columns_that_may_name_a_shape_does(tmp_path: Path, heads: str, own: int) -> None:
+    table, keys = read_table(written(tmp_path, f"{heads}\np,q,r,s\n"))
+    assert keys == ("pqrs"[own],) and heads.split(",")[own] not in table.columns and len(table.columns) == 3
+
+
+def test_scans_of_one_name_in_different_folders_are_told_apart_by_them(tmp_path: Path) -> None:
+    _, keys = read_table(written(tmp_path, "file\nanna/smile.ply\nbert/smile.ply\nbert\\calm.ply\n"))
+    assert keys == ("anna_smile", "bert_smile", "calm")
+
+
+def test_a_string_among_numbers_is_refused_by_its_row_and_many_make_classes() -> None:
+    names = ("a", "b", "c", "d", "e")
+    table = Table({"age": ("20", "30", "old", "41", ""), "site": ("1", "2", "x", "y", "z")}, names, "data.csv")
+    for ask in (table.kind, table.numbers):
+        with pytest.raises(InputError, match="'old' at c"):
+            ask("age")
+    assert table.kind("site") == "text"
+    assert Table({"x": ("", "")}, ("a", "b")).kind("x") == "text"
+    for odd in ("1_000", "inf", "nan1", "0x1"):
+        with pytest.raises(InputError, match="no number"):
+            Table({"x": ("1", odd)}, ("a", "b")).numbers("x")
+
+
+def test_numbers_written_as_cells_read_back_to_the_last_digit() -> None:
+    values = np.array([np.pi, 1e-300, -2.5e17, np.nan, 0.1 + 0.2])
+    table = Table({"x": numbers_as_text(values)}, tuple("abcde"))
+    assert np.array_equal(table.numbers("x"), values, equal_nan=True)
+
+
+def test_what_is_asked_for_in_vain_is_answered_with_what_there_is() -> None:
+    table = Table({"age": ("1",)}, ("a",), "data.csv")
+    with pytest.raises(InputError, match=r"data.csv has no column 'sex'; it has age\."):
+        table.texts("sex")
+    with pytest.raises(InputError, match="has 1 cells for 2 rows"):
+        Table({"age": ("1",)}, ("a", "b"))
+
+
+def test_rows_can_be_taken_in_any_order() -> None:
+    table = Table({"x": ("1", "2", "3")}, ("a", "b", "c"), "data.csv").take([2, 0])
+    assert table.rows == ("c", "a") and table.texts("x") == ("3", "1") and table.where == "data.csv"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("age,sex\n1,2\n", "no table of shapes"),
+        ("file,age\n", "no table of shapes"),
+        ("", "no table of shapes"),
+        ("file;age\na;1\n", "no table of shapes"),
+        ("file,age\na,1\na,2\n", "two or more rows of 'a'"),
+        ("file,age\na,1\n,2\n", "has no file in row 2"),
+        ("file,age\na.ply,1\na.stl,2\n", "two or more rows of 'a'"),
+        ("file,age,age\na,1,2\n", "two columns of one name"),
+        ("file,age\na,1,2\n", "3 cells in row 1"),
+        ('file,age\n"a,1\n', "not a CSV table"),
+    ],
+)
+def test_a_table_that_is_none_is_refused_in_one_sentence(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(FileFormatError, match=told) as error:
+        read_table(written(tmp_path, text))
+    assert str(error.value).endswith(".") and "\n" not in str(error.value)
+
+
+def test_a_table_in_another_encoding_or_none_at_all_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "data.csv").write_bytes("file,age\nä,1\n".encode("latin-1"))
+    with pytest.raises(FileFormatError, match="UTF-8"):
+        read_table(tmp_path / "data.csv")
+    (tmp_path / "data.csv").write_bytes(b"\xef\xbb\xbf" + LINES.encode())
+    assert read_table(tmp_path / "data.csv")[1] == ("a", "b", "c")
+    with pytest.raises(FileError):
+        read_table(tmp_path / "gone.csv")
+
+
+def test_what_a_spreadsheet_would_run_loses_its_apostrophe_and_columns_of_lists_their_mark(tmp_path: Path) -> None:
+    table, _ = read_table(written(tmp_path, "scan,meta_sex,meta_age,age\na,'=f(),1,2\n"))
+    assert table.texts("sex") == ("=f()",) and table.texts("meta_age") == ("1",) and table.texts("age") == ("2",)
+
+
+def test_names_are_told_until_they_are_many() -> None:
+    assert named(["a", "b", "c"]) == "a, b, c" and named(["a", "b", "c", "d"]) == "a, b, c and 1 more"
