@@ -106,9 +106,10 @@ def _summary(change: Found) -> list[str]:
         volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects]) / _MM3_PER_ML
         low, high = interval_of_mean(volumes)
         told.append(_of_test(change, change.group, "the mean change", "none"))
+        what = "The volume changed by" if change.closed else "The open surface swept"
         told.append(
-            f"The volume changed by {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to "
-            f"{high:+.2f}), {_p(float(change.group_volumes.p[0]))}."
+            f"{what} {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to {high:+.2f}), "
+            f"{_p(float(change.group_volumes.p[0]))}."
         )
     if change.between is not None and change.between_volumes is not None:
         first, second = change.groups
