@@ -42,7 +42,8 @@ from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate
 from shapespace.geometry.surface import vertex_normals
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
-from shapespace.statistics.change import Change, ChangeSettings, change
+from shapespace.statistics.change import Change, change
+from shapespace.statistics.change_found import ChangeSettings
 from shapespace.statistics.change_maps import volume_mm3
 from shapespace.types import FloatArray, Mesh
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from shapespace.statistics.change import Change, ChangeSettings, change
     from shapespace.statistics.predictor import Predictor
     from shapespace.statistics.regression import Regression, regress
+    from shapespace.statistics.change import Change, change
+    from shapespace.statistics.change_found import ChangeSettings
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -80,7 +82,7 @@ _HOMES = {
     "Asymmetry": "statistics.asymmetry",
     "CLASSIFIERS": "recognise.classifiers",
     "Change": "statistics.change",
-    "ChangeSettings": "statistics.change",
+    "ChangeSettings": "statistics.change_found",
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",

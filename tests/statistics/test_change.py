@@ -17,8 +17,9 @@ from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_areas, vertex_normals
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, read, read_part
-from shapespace.statistics.change import Change, ChangeSettings, change
+from shapespace.statistics.change import Change, change
 from shapespace.statistics.change_align import align_by, align_robustly
+from shapespace.statistics.change_found import ChangeSettings
 from shapespace.statistics.change_group import difference_test, mean_test
 from shapespace.statistics.change_maps import aligned, swept_mm3, volume_mm3
 from shapespace.statistics.change_visits import visits_of
@@ -106,17 +107,26 @@ def test_half_a_surface_that_moved_by_3_mm_is_brought_back_where_least_squares_s
     assert np.abs(smeared[~half]).mean() > 0.3
 
 
+def test_what_stays_is_found_where_more_than_half_moves_away_as_one() -> None:
+    mesh, rng = person(3), np.random.default_rng(0)
+    still = mesh.vertices[:, 1] > np.quantile(mesh.vertices[:, 1], 0.55)
+    turn = Rotation.from_rotvec([0.3, 0.0, 0.1]).as_matrix().T
+    after = np.where(still[:, None], mesh.vertices, mesh.vertices @ turn + 0.03 * mesh.vertices**2 / 100)
+    moved = posed(after + 0.05 * rng.standard_normal((V, 3)), rng)
+    T, weights = align_robustly(moved, mesh.vertices, vertex_areas(mesh))
+    assert np.linalg.norm(T.apply(moved) - mesh.vertices, axis=1)[still].max() < 0.4
+    assert weights[~still].sum() < 0.02 * weights.sum()
+
+
 def test_without_a_change_the_robust_alignment_is_nearly_as_sharp_as_least_squares() -> None:
     mesh, rng = person(3), np.random.default_rng(0)
     area, every = vertex_areas(mesh), np.arange(V, dtype=np.int32)
-    off = {"robust": 0.0, "squares": 0.0}
+    off_mm2 = 0.0
     for _ in range(10):
         moved = posed(mesh.vertices + rng.standard_normal((V, 3)), rng)
-        for name, stable in (("robust", None), ("squares", every)):
-            T, _ = align_by(moved, mesh.vertices, area, stable)
-            true = fit_similarity(moved, mesh.vertices, with_scale=False)
-            off[name] += float(((T.apply(moved) - true.apply(moved)) ** 2).sum())
-    assert off["robust"] < 100 * V * 10 * 1e-4, off
+        robust, squares = (align_by(moved, mesh.vertices, area, stable)[0].apply(moved) for stable in (None, every))
+        off_mm2 += float(((robust - squares) ** 2).sum()) / (10 * V)
+    assert np.sqrt(off_mm2) < 0.1  # of noise of 1 mm; the error of least squares itself is about 0.12
 
 
 @pytest.mark.parametrize("stable", ["auto", "landmarks:back,90"])
@@ -155,14 +165,14 @@ def test_the_volume_swept_is_the_difference_of_volumes_of_closed_surfaces_and_th
 
 
 def test_a_surface_that_grew_as_a_whole_tells_its_volume_and_share() -> None:
-    mesh = person(0)
-    barely = person(1).vertices + 1.0 + 1e-3 * np.random.default_rng(0).standard_normal((V, 3))
-    scans = [mesh.vertices, 1.02 * mesh.vertices, person(1).vertices, barely]
+    mesh, nearly = person(0), person(1).vertices + 1.0
+    nearly[0] += 0.01  # or it would be refused as a copy
+    scans = [mesh.vertices, 1.02 * mesh.vertices, person(1).vertices, nearly]
     cohort = cohort_of(scans, {"subject": ["a", "a", "b", "b"], "visit": ["before", "after"] * 2})
     grown = asked(cohort, stable="all").by_name["a"]
     assert grown.change.volumes_mm3[0] / grown.before_mm3 == pytest.approx(1.02**3 - 1, rel=1e-6)
     still = asked(cohort, stable="all").by_name["b"]
-    assert still.rms_mm < 2e-3 and abs(still.change.volumes_mm3[0]) < 1e-4 * still.before_mm3
+    assert still.rms_mm < 1e-3 and abs(still.change.volumes_mm3[0]) < 10
 
 
 def test_regions_and_landmarks_tell_where_it_changed() -> None:
@@ -290,8 +300,8 @@ def test_a_series_gives_rates_and_dates_give_years() -> None:
     days = (0, 365.25, 730.5, 1461)
     scans = [pushed(mesh, day / 365.25 * 0.5 * bump()) + 0.02 * rng.standard_normal((V, 3)) for day in days]
     dates = ("2020-01-01", "2020-12-31", "2021-12-31", "2024-01-01")
-    again = [scan + 5.0 + 1e-3 * rng.standard_normal((V, 3)) for scan in scans[:2]]
-    cohort = cohort_of([*scans, *again], {
+    others = [scan + 0.02 * rng.standard_normal((V, 3)) for scan in scans[:2]]
+    cohort = cohort_of([*scans, *others], {
         "subject": [*"aaaa", *"bb"], "date": [*dates, *dates[:2]], "months": [0, 12, 24, 48, 0, 12],
     })  # fmt: skip
     weights = bump()
@@ -300,10 +310,10 @@ def test_a_series_gives_rates_and_dates_give_years() -> None:
         for subject in found.subjects:
             assert subject.rate is not None
             assert weights @ subject.rate.along_mm / (weights @ weights) == pytest.approx(
-                per_unit, rel=0.08 if subject.name == "b" else 0.02
+                per_unit, rel=0.12 if subject.name == "b" else 0.02
             )
         assert found.unit == unit and found.group is not None
-        assert found.group.effect[TIP] == pytest.approx(per_unit, rel=0.1)
+        assert found.group.effect[TIP] == pytest.approx(per_unit, rel=0.15)
     assert [visit.label for visit in found.by_name["a"].visits] == ["0", "12", "24", "48"]
     assert any(part.title == "Over time" for part in found.answer().parts)
 

@@ -123,7 +123,7 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
     Raises:
         InputError: the vertices lie on a line.
     """
-    if len(fixed) > SEARCHED:
+    if np.count_nonzero(area) > SEARCHED:
         some = np.random.default_rng(0).choice(len(fixed), SEARCHED, replace=False, p=area / area.sum())
         p, q, a = moving[some], fixed[some], np.ones(SEARCHED)
     else:

@@ -20,7 +20,7 @@ from shapespace.schemas import (
     TextPart,
 )
 from shapespace.statistics.answer import Answer, Rows
-from shapespace.statistics.change import Change, SubjectChange, effect_of, interval_of_mean
+from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
 from shapespace.statistics.change_group import MapTest
 from shapespace.types import Mesh
 
@@ -40,7 +40,7 @@ _SOURCES = {
 }
 
 
-def answer_of(change: Change) -> Answer:
+def answer_of(change: Found) -> Answer:
     """Return the report, tables, arrays and meshes of what changed."""
     settings = change.settings
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -93,7 +93,7 @@ def answer_of(change: Change) -> Answer:
     )
 
 
-def _summary(change: Change) -> list[str]:
+def _summary(change: Found) -> list[str]:
     subjects = change.subjects
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
@@ -106,9 +106,10 @@ def _summary(change: Change) -> list[str]:
         volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects]) / _MM3_PER_ML
         low, high = interval_of_mean(volumes)
         told.append(_of_test(change, change.group, "the mean change", "none"))
+        what = "The volume changed by" if change.closed else "The open surface swept"
         told.append(
-            f"The volume changed by {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to "
-            f"{high:+.2f}), {_p(float(change.group_volumes.p[0]))}."
+            f"{what} {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to {high:+.2f}), "
+            f"{_p(float(change.group_volumes.p[0]))}."
         )
     if change.between is not None and change.between_volumes is not None:
         first, second = change.groups
@@ -130,7 +131,7 @@ def _summary(change: Change) -> list[str]:
     return told
 
 
-def _of_test(change: Change, test: MapTest, what: str, other: str) -> str:
+def _of_test(change: Found, test: MapTest, what: str, other: str) -> str:
     at = int(np.abs(test.t).argmax())
     found = test.p <= _LEVEL
     where = (
@@ -150,21 +151,19 @@ def _p(p: float) -> str:
     return f"p = {p:.3g}"
 
 
-def _per(change: Change) -> str:
+def _per(change: Found) -> str:
     return f" per {change.unit}" if change.settings.rate else ""
 
 
-def _of_group(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     unit = f"mm{_per(change)}"
     arrays |= {"mean": test.effect, "mean_t": test.t, "mean_p": test.p, "mean_found": test.p <= _LEVEL}
     least = 1 / test.permutations
-    note = (
-        f"Mean of {test.n[0]} subjects along the normals, outwards positive. No p can be below {least:.2g} with so few, "
-        "so that nothing is marked."
+    note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. " + (
+        f"No p can be below {least:.2g} with so few, so that nothing is marked."
         if least > _LEVEL
-        else f"Mean of {test.n[0]} subjects along the normals, outwards positive. In full colour where the family-wise p is "
-        f"at most {_LEVEL:g}, by the maximum over vertices of |t| in {test.permutations} sign flips"
-        f"{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
+        else f"In full colour where the family-wise p is at most {_LEVEL:g}, by the maximum over vertices of |t| in "
+        f"{test.permutations} sign flips{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
     )
     parts: list[Part] = [
         SurfaceMapPart(
@@ -191,7 +190,7 @@ def _of_group(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]
     return parts
 
 
-def _region_table(change: Change, test: MapTest) -> Part:
+def _region_table(change: Found, test: MapTest) -> Part:
     rows: list[tuple[Any, ...]] = []
     for at, name in enumerate(change.parts):
         own = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[at] for one in change.subjects])
@@ -209,7 +208,7 @@ def _region_table(change: Change, test: MapTest) -> Part:
     )
 
 
-def _group_landmarks(change: Change, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
+def _group_landmarks(change: Found, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
     rows: list[list[Any]] = []
     for at, (name, vertex) in enumerate(change.landmarks.items()):
         values = np.array([effect_of(one, rate=change.settings.rate).along_mm[vertex] for one in change.subjects])
@@ -218,7 +217,7 @@ def _group_landmarks(change: Change, test: MapTest) -> tuple[Sequence[str], list
     return ("landmark", "mean", "stddev", "low", "high", "p"), rows
 
 
-def _between(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     first, second = change.groups
     arrays |= {"difference": test.effect, "difference_p": test.p, "difference_found": test.p <= _LEVEL}
     note = (
@@ -234,7 +233,7 @@ def _between(change: Change, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
     ]  # fmt: skip
 
 
-def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     found = change.repeatability
     if found is None:
         text = f"There are no rescans: nobody was scanned twice at a time. {_SOURCES[change.uncertainty]}"
@@ -267,8 +266,9 @@ def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]
         SurfaceMapPart(
             title="What is noise", level=2, arrays=ARRAYS, vertices="before",
             values="smallest_mm", signed=False,
-            note=f"The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of {found.scans} scans of {found.visits} "
-            f"visits. A change of one scan against another that is smaller is noise.{few}",
+            note="The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of "
+            f"{found.scans} scans of {found.visits} visits. A change of one scan against another that is "
+            f"smaller is noise.{few}",
         ),
         TablePart(
             title="Repeatability",
@@ -281,7 +281,7 @@ def _of_noise(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]
     ]  # fmt: skip
 
 
-def _of_subjects(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     every = len(change.subjects)
     more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
     columns = [
@@ -336,7 +336,7 @@ def _of_subjects(change: Change, arrays: dict[str, npt.NDArray[Any]]) -> list[Pa
     return parts
 
 
-def _over_time(change: Change) -> list[Part]:
+def _over_time(change: Found) -> list[Part]:
     if not change.unit or all(len(one.visits) < 3 for one in change.subjects):
         return []
     series = tuple(
@@ -357,7 +357,7 @@ def _over_time(change: Change) -> list[Part]:
     ]  # fmt: skip
 
 
-def _subject_rows(change: Change) -> tuple[list[str], list[list[Any]]]:
+def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
     header = [
         "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
         "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
@@ -392,7 +392,7 @@ def _subject_rows(change: Change) -> tuple[list[str], list[list[Any]]]:
     return header, rows
 
 
-def _tables(change: Change) -> dict[str, Rows]:
+def _tables(change: Found) -> dict[str, Rows]:
     tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
     tables["visits.csv"] = (
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
@@ -422,7 +422,7 @@ def _tables(change: Change) -> dict[str, Rows]:
     return tables
 
 
-def _landmark_rows(change: Change, subject: SubjectChange) -> list[Sequence[object]]:
+def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[object]]:
     found, known = subject.change, change.repeatability
     smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
     return [
@@ -440,7 +440,7 @@ def _landmark_rows(change: Change, subject: SubjectChange) -> list[Sequence[obje
     ]
 
 
-def _maps(change: Change) -> dict[str, npt.NDArray[Any]]:
+def _maps(change: Found) -> dict[str, npt.NDArray[Any]]:
     found = {
         "subjects": np.array([one.name for one in change.subjects]),
         "change_mm": np.stack([one.change.along_mm for one in change.subjects]).astype(np.float32),
@@ -454,7 +454,7 @@ def _maps(change: Change) -> dict[str, npt.NDArray[Any]]:
     return found
 
 
-def _notes(change: Change) -> list[str]:
+def _notes(change: Found) -> list[str]:
     notes: list[str] = []
     if change.single:
         alone, every = len(change.single), len(change.subjects) + len(change.single)

@@ -36,7 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Answer, and write the report."""
     from shapespace.batch.progress import progress
     from shapespace.io.regions import read_region
-    from shapespace.statistics.change import ChangeSettings, change
+    from shapespace.statistics.change import change
+    from shapespace.statistics.change_found import ChangeSettings
 
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:
