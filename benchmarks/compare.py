@@ -119,7 +119,7 @@ def _cut(face: Mesh, missing: float, rng: np.random.Generator) -> Cut:
 # False positives: shapes of real fits, covariates drawn by lot.
 
 ALONE, SUBJECTS, SCANS = 40, 24, (2, 6)
-EVERY = 8
+EVERY = 16
 """Vertices of which maps are tested, so that a thousand maps take minutes."""
 
 
@@ -178,7 +178,7 @@ def null_studies(folders: list[Path], studies: int, permutations: int) -> Mappin
     for seed in range(studies):
         rng = np.random.default_rng([11, seed])
         options = CompareOptions(permutations=permutations, seed=seed)
-        chosen = [people[k] for k in rng.permutation(len(people))[:ALONE]]
+        chosen = [people[int(k)] for k in rng.permutation(len(people))[:ALONE]]
         rows = [int(rng.choice(scans[one])) for one in chosen]
         sex = rng.choice(["f", "m"], ALONE)
         known = {"sex": tuple(sex), "age": tuple(f"{age:.2f}" for age in rng.uniform(20, 70, ALONE))}
@@ -232,10 +232,10 @@ def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
         both, some = float((found & truth).sum()), float(found.sum())
         rows.append(
             (
-                study.test("group").p <= options.level,
-                (made.shown.p_family <= options.level).any(),
-                found.any(),
-                truth[int(made.bump.f.argmax())],
+                float(study.test("group").p <= options.level),
+                float((made.shown.p_family <= options.level).any()),
+                float(found.any()),
+                float(truth[int(made.bump.f.argmax())]),
                 2 * both / (some + float(truth.sum())) if some else np.nan,
                 both / some if some else np.nan,
             )
@@ -283,7 +283,7 @@ def main() -> None:
         print("speed:", speed(*((100, 1000, 200) if asked.quick else (400, 10_000, 1000))), flush=True)
     if asked.only in (None, "null") and asked.fits:
         print("false positives at 5 %: term, map (family-wise)")
-        for name, found in null_studies(asked.fits, 20 if asked.quick else 1000, 40 if asked.quick else 200).items():
+        for name, found in null_studies(asked.fits, 20 if asked.quick else 1000, 40 if asked.quick else 100).items():
             print(f"  {name:20} {found.told()}", flush=True)
     if asked.only in (None, "power"):
         print("power: term, map, bump found, its peak in the nose, Dice, share of what is found that is true")

@@ -30,6 +30,7 @@ def test_a_table_becomes_a_report_with_all_its_numbers(run: Run, tmp_path: Path)
         rows = list(csv.DictReader(lines))
     assert [row["term"] for row in rows] == ["sex", "residual", "total"]
     low, high = (read_mesh(tmp_path / "answer" / f"effect_1_{end}.ply") for end in ("low", "high"))
+    assert low.faces is not None and high.faces is not None
     assert np.array_equal(low.faces, high.faces)
 
 

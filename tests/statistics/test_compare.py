@@ -17,7 +17,7 @@ from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
 from shapespace.statistics.compare_answer import answer_of
 from shapespace.statistics.compare_formula import FUNCTIONS
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 
@@ -25,10 +25,10 @@ QUICK = CompareOptions(permutations=20, maps=False)
 SIDE = 6
 
 
-def surface() -> tuple[FloatArray, Any]:
+def surface() -> tuple[FloatArray, IntArray]:
     """A small curved surface of 36 vertices."""
     x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
-    points = np.stack([x, y, 0.1 * (x - 2.5) ** 2], axis=-1).reshape(-1, 3) * 10.0
+    points: FloatArray = np.stack([x, y, 0.1 * (x - 2.5) ** 2], axis=-1).reshape(-1, 3).astype(np.float64) * 10.0
     at = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
     a, b, c, d = (at[i : SIDE - 1 + i, j : SIDE - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
     return points, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)]).astype(np.int32)
@@ -155,7 +155,7 @@ def test_p_and_z_are_those_of_a_plain_loop_over_permuted_residuals() -> None:
     columns = pieces(table, [("age",), ("sex",)])
     x0 = np.hstack([np.ones((30, 1)), columns["age",]])
     fit = x0 @ np.linalg.lstsq(x0, flat, rcond=None)[0]
-    rng, drawn = np.random.default_rng(8), []
+    rng, drawn = np.random.default_rng(8), list[float]()
     for k in range(2000):
         y = fit + (flat - fit)[rng.permutation(30) if k else np.arange(30)]
         (without, _), (with_it, df) = left(y, [columns["age",]]), left(y, list(columns.values()))
@@ -547,12 +547,12 @@ def fits_with_a_bump(mm: float, seed: int = 0) -> tuple[Cohort, FloatArray]:
     points, faces = surface()
     rng = np.random.default_rng(seed)
     smooth = np.stack([np.ones(36), points[:, 0] / 25 - 1, points[:, 1] / 25 - 1], axis=1)
-    training = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
+    training: FloatArray = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
     training += rng.normal(size=training.shape) * 0.3
     model = ShapeModel.fit([Mesh(one, faces) for one in training], modes=30, align=False)
     group = np.repeat([0, 1], 30)
     near = np.exp(-0.5 * (np.linalg.norm(points - points[14], axis=1) / 8.0) ** 2)
-    shapes = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
+    shapes: FloatArray = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
     shapes += rng.normal(size=shapes.shape) * 0.3 + mm * (group[:, None] * near)[..., None] * [0, 0, 1]
     b = (shapes - model.mean_vertices).reshape(60, -1) @ model.vertex_basis
     fitted = Fitted(model, b, np.full_like(b, 0.1), ("converged",) * 60, "")

@@ -162,7 +162,8 @@ _Lens = Callable[[slice], tuple[FloatArray, FloatArray]]
 
 def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -> dict[str, _Lens]:
     def any_way(part: slice) -> tuple[FloatArray, FloatArray]:
-        return cohort.basis[:, 3 * part.start : 3 * part.stop], np.ones(part.stop - part.start)
+        rows: FloatArray = cohort.basis[:, 3 * part.start : 3 * part.stop]
+        return rows, np.ones(rows.shape[1] // 3)
 
     lenses: dict[str, _Lens] = {"any_way": any_way}
     if cohort.faces is None:
@@ -172,7 +173,8 @@ def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -
 
     def along(part: slice) -> tuple[FloatArray, FloatArray]:
         rows = any_way(part)[0].reshape(len(cohort.basis), -1, 3)
-        return np.einsum("kvc,vc->kv", rows, normals[part]), np.ones(part.stop - part.start)
+        seen: FloatArray = np.einsum("kvc,vc->kv", rows, normals[part])
+        return seen, np.ones(seen.shape[1])
 
     lenses["along"] = along
     if bump_width_mm is not None:
@@ -191,8 +193,8 @@ def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: Floa
     def bump(part: slice) -> tuple[FloatArray, FloatArray]:
         near = tree.sparse_distance_matrix(cKDTree(mean[part]), _REACH * width_mm, output_type="coo_matrix")
         near.data = np.exp(-0.5 * (near.data / width_mm) ** 2)
-        shapes = np.asarray((near.tocsr().T @ ahead.T).T)
-        filters = precision @ shapes
+        shapes: FloatArray = np.asarray((near.tocsr().T @ ahead.T).T)
+        filters: FloatArray = precision @ shapes
         return filters, np.maximum((filters * shapes).sum(axis=0), 1e-300)
 
     return bump
@@ -212,7 +214,7 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
         prior = (known * variance) @ known.T + max(beside, _FLOOR * float(variance.mean())) * prior
     factor = np.linalg.cholesky(prior)
     white = np.linalg.solve(factor, residual.T).T
-    shrunk = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_
+    shrunk: FloatArray = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_
     half = np.linalg.solve(factor, np.eye(len(factor)))
     return half.T @ np.linalg.solve(shrunk, half)
 
