@@ -7,18 +7,27 @@ own, whose fits are kept in `--pool`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import argparse
+import resource
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pooch
+from scipy.spatial import ConvexHull, Delaunay
 
 from shapespace import ShapeModel, fit_scan, load_faces, simulate_scan
+from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.table import Table
 from shapespace.datasets.simulated_scan import Cut
 from shapespace.errors import FitError
 from shapespace.fit.fit import FitConfig
 from shapespace.geometry.surface import vertex_normals
+from shapespace.statistics.compare import CompareOptions, Comparison, compare
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 GROUP = 40
@@ -94,7 +103,9 @@ def make_pool(folder: Path, missing: float, people: int = POOL) -> Pool:
             folder.mkdir(parents=True, exist_ok=True)
             np.savez(file, b=b, b_stddev=stddev, dense=dense, used=used)
         groups.append(np.load(file))
-    b, stddev, dense, used = (np.stack([group[name] for group in groups]) for name in ("b", "b_stddev", "dense", "used"))
+    b, stddev, dense, used = (
+        np.stack([group[name] for group in groups]) for name in ("b", "b_stddev", "dense", "used")
+    )
     return Pool(model, b, stddev, dense, used, nose_change(model.mean_vertices, tip))
 
 
@@ -103,3 +114,185 @@ def _cut(face: Mesh, missing: float, rng: np.random.Generator) -> Cut:
     turn = rng.uniform(0.0, 2.0 * np.pi)
     normal = np.array([np.cos(turn), np.sin(turn), 0.0])
     return Cut(normal * np.quantile(face.vertices @ normal, 1.0 - missing), normal)
+
+
+# False positives: shapes of real fits, covariates drawn by lot.
+
+ALONE, SUBJECTS, SCANS = 40, 24, (2, 6)
+EVERY = 16
+"""Vertices of which maps are tested, so that a thousand maps take minutes."""
+
+
+def people_of(folders: list[Path]) -> tuple[Cohort, list[str]]:
+    """Return all fits of people by models that know none of them, as if they were by one model, and who each is of."""
+    model = ShapeModel.load(folders[0] / "fold_0.h5")
+    K = len(model.stddev)
+    b, stddev, who = list[FloatArray](), list[FloatArray](), list[str]()
+    for folder in folders:
+        for file in sorted((folder / "fits").glob("person_*.npz")):
+            kept = np.load(file)
+            fold = int((kept["status"] >= 0).all(axis=1).argmax())
+            for row in np.flatnonzero(kept["status"][fold] <= 1):
+                pair = [kept[name][fold, row][:K] for name in ("z", "z_stddev")]
+                own, spread = (np.pad(one.astype(np.float64), (0, K - len(one))) * model.stddev for one in pair)
+                b.append(own)
+                stddev.append(spread)
+                who.append(f"{folder.name}/{file.stem}")
+    names = tuple(f"scan {at}" for at in range(len(b)))
+    table = Table({"subject": tuple(who)}, names)
+    fitted = Fitted(model, np.stack(b), np.stack(stddev), ("converged",) * len(b), "")
+    seen = np.arange(0, len(model.mean_vertices), EVERY)
+    x = model.mean_vertices[seen]
+    faces = Delaunay(x[:, :2]).simplices.astype(np.int32)
+    basis = model.vertex_basis.T.reshape(K, -1, 3)[:, seen].reshape(K, -1)
+    return Cohort(names, x, basis, fitted.b, np.full(len(b), np.nan), table, "shape", faces, fitted=fitted), who
+
+
+@dataclass
+class Found:
+    """How many studies found an effect that is not there: by the test of the term, and somewhere on the map."""
+
+    studies: int = 0
+    omnibus: int = 0
+    somewhere: int = 0
+
+    def count(self, study: Comparison, term: str) -> None:
+        made = next(effect.map for effect in study.effects if effect.name == term)
+        assert made is not None
+        self.studies += 1
+        self.omnibus += study.test(term).p <= study.options.level
+        self.somewhere += bool((made.shown.p_family <= study.options.level).any())
+
+    def told(self) -> str:
+        return f"{100 * self.omnibus / self.studies:5.1f} %   {100 * self.somewhere / self.studies:5.1f} %"
+
+
+def null_studies(folders: list[Path], studies: int, permutations: int) -> Mapping[str, Found]:
+    """Return what is found in studies of covariates that are drawn by lot."""
+    everyone, who = people_of(folders)
+    scans: dict[str, list[int]] = {}
+    for at, one in enumerate(who):
+        scans.setdefault(one, []).append(at)
+    people = sorted(scans)
+    found = {name: Found() for name in ("independent people", "between subjects", "within subjects", "blocks ignored")}
+    for seed in range(studies):
+        rng = np.random.default_rng([11, seed])
+        options = CompareOptions(permutations=permutations, seed=seed)
+        chosen = [people[int(k)] for k in rng.permutation(len(people))[:ALONE]]
+        rows = [int(rng.choice(scans[one])) for one in chosen]
+        sex = rng.choice(["f", "m"], ALONE)
+        known = {"sex": tuple(sex), "age": tuple(f"{age:.2f}" for age in rng.uniform(20, 70, ALONE))}
+        found["independent people"].count(compare(_with(everyone.take(rows), known), "~ sex + age", options), "sex")
+        rows, sexes, visits = list[int](), list[str](), list[str]()
+        for at, one in enumerate(chosen[:SUBJECTS]):
+            own = rng.permutation(scans[one])[: rng.integers(SCANS[0], SCANS[1] + 1)]
+            rows += own.tolist()
+            sexes += [sex[at]] * len(own)
+            visits += rng.permutation((["one", "two"] * len(own))[: len(own)]).tolist()
+        cohort = _with(everyone.take(rows), {"sex": tuple(sexes), "visit": tuple(visits)})
+        blocks = compare(cohort, "~ sex + visit", replace(options, blocks="subject"))
+        found["between subjects"].count(blocks, "sex")
+        found["within subjects"].count(blocks, "visit")
+        found["blocks ignored"].count(compare(cohort, "~ sex + visit", options), "sex")
+    return found
+
+
+def _with(cohort: Cohort, columns: Mapping[str, tuple[str, ...]]) -> Cohort:
+    return replace(cohort, table=Table({**cohort.table.columns, **columns}, cohort.table.rows))
+
+
+# Power: a change of the nose between two groups.
+
+WIDTH_MM = 12.0
+
+
+def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
+    """Return in how many studies the change is found, and where, by the maps of changes and by those of bumps."""
+    count = pool.used.shape[1]
+    names = tuple(f"person {at}" for at in range(2 * count))
+    table = Table({"group": ("one",) * count + ("other",) * count}, names)
+    b, stddev = pool.b.reshape(2 * count, -1), pool.b_stddev.reshape(2 * count, -1)
+    fitted = Fitted(pool.model, b, stddev, ("converged",) * len(b), "")
+    if surfaces == "coefficients":
+        cohort = Cohort.of_fits(fitted, names, table, np.full(len(b), np.nan))
+    else:
+        shapes = pool.dense.reshape(2 * count, -1, 3).astype(np.float64)
+        made = Cohort.of_shapes(shapes, {}, names=names, faces=pool.model.faces)
+        cohort = replace(made, table=table, fitted=fitted)
+    truth = pool.change_mm > CHANGE_MM / 2
+    rows: list[tuple[float, ...]] = []
+    for seed in range(studies):
+        rng = np.random.default_rng([7, seed])
+        one, other = (rng.permutation(np.flatnonzero(used))[:GROUP] for used in pool.used)
+        options = CompareOptions(permutations=permutations, seed=seed, bump_width_mm=WIDTH_MM)
+        study = compare(cohort.take([*one.tolist(), *(count + other).tolist()]), "~ group", options)
+        made = study.effects[0].map
+        assert made is not None and made.bump is not None
+        found = made.bump.p_family <= options.level
+        both, some = float((found & truth).sum()), float(found.sum())
+        rows.append(
+            (
+                float(study.test("group").p <= options.level),
+                float((made.shown.p_family <= options.level).any()),
+                float(found.any()),
+                float(truth[int(made.bump.f.argmax())]),
+                2 * both / (some + float(truth.sum())) if some else np.nan,
+                both / some if some else np.nan,
+            )
+        )
+    values = np.array(rows, dtype=np.float64)
+    shares = "".join(f"{100 * value:7.0f} %" for value in values[:, :4].mean(axis=0))
+    inside = " ".join(f"{value:7.2f}" for value in np.nanmedian(values[:, 4:], axis=0))
+    return f"{shares} {inside}"
+
+
+# Speed.
+
+
+def speed(shapes: int, vertices: int, permutations: int) -> str:
+    """Return what it takes to compare shapes, one of which there is for each direction in which they vary."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(vertices, 3))
+    x *= 80.0 / np.linalg.norm(x, axis=1)[:, None]
+    names = tuple(f"shape {at}" for at in range(shapes))
+    known = {
+        "sex": tuple(rng.choice(["f", "m"], shapes)),
+        "age": tuple(f"{a:.2f}" for a in rng.uniform(20, 70, shapes)),
+    }
+    basis = np.linalg.qr(rng.normal(size=(3 * vertices, shapes)))[0].T
+    coefficients = rng.normal(size=(shapes, shapes)) * np.linspace(100.0, 1.0, shapes)
+    faces = ConvexHull(x).simplices.astype(np.int32)
+    cohort = Cohort(
+        names, x, basis, coefficients, np.full(shapes, np.nan), Table(known, names), "shape", faces
+    )  # fmt: skip
+    start = time.process_time()
+    compare(cohort, "~ sex + age", CompareOptions(permutations=permutations))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    return f"{time.process_time() - start:.1f} CPU s, {peak:.2f} GiB at the peak"
+
+
+def main() -> None:
+    """Print what was asked for."""
+    words = argparse.ArgumentParser(description=__doc__)
+    words.add_argument("--quick", action="store_true", help="few studies and people")
+    words.add_argument("--only", choices=("speed", "null", "power"))
+    words.add_argument("--fits", type=Path, nargs="*", default=[], help="folders of studies of expressive people")
+    words.add_argument("--pool", type=Path, default=Path(pooch.os_cache("shapespace")) / "benchmarks" / "compare")
+    asked = words.parse_args()
+    if asked.only in (None, "speed"):
+        print("speed:", speed(*((100, 1000, 200) if asked.quick else (400, 10_000, 1000))), flush=True)
+    if asked.only in (None, "null") and asked.fits:
+        print("false positives at 5 %: term, map (family-wise)")
+        for name, found in null_studies(asked.fits, 20 if asked.quick else 1000, 40 if asked.quick else 100).items():
+            print(f"  {name:20} {found.told()}", flush=True)
+    if asked.only in (None, "power"):
+        print("power: term, map, bump found, its peak in the nose, Dice, share of what is found that is true")
+        for missing in MISSING:
+            pool = make_pool(asked.pool, missing, 50 if asked.quick else POOL)
+            for surfaces in ("coefficients", "dense"):
+                told = power(pool, surfaces, 3 if asked.quick else 50, 100 if asked.quick else 200)
+                print(f"  {100 * missing:.0f} % missing, {surfaces:12} {told}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

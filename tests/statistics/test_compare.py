@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
+from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import PARTS, Analysis, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
 from shapespace.statistics.compare_answer import answer_of
 from shapespace.statistics.compare_formula import FUNCTIONS
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 
@@ -23,10 +25,10 @@ QUICK = CompareOptions(permutations=20, maps=False)
 SIDE = 6
 
 
-def surface() -> tuple[FloatArray, Any]:
+def surface() -> tuple[FloatArray, IntArray]:
     """A small curved surface of 36 vertices."""
     x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
-    points = np.stack([x, y, 0.1 * (x - 2.5) ** 2], axis=-1).reshape(-1, 3) * 10.0
+    points: FloatArray = np.stack([x, y, 0.1 * (x - 2.5) ** 2], axis=-1).reshape(-1, 3).astype(np.float64) * 10.0
     at = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
     a, b, c, d = (at[i : SIDE - 1 + i, j : SIDE - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
     return points, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)]).astype(np.int32)
@@ -153,7 +155,7 @@ def test_p_and_z_are_those_of_a_plain_loop_over_permuted_residuals() -> None:
     columns = pieces(table, [("age",), ("sex",)])
     x0 = np.hstack([np.ones((30, 1)), columns["age",]])
     fit = x0 @ np.linalg.lstsq(x0, flat, rcond=None)[0]
-    rng, drawn = np.random.default_rng(8), []
+    rng, drawn = np.random.default_rng(8), list[float]()
     for k in range(2000):
         y = fit + (flat - fit)[rng.permutation(30) if k else np.arange(30)]
         (without, _), (with_it, df) = left(y, [columns["age",]]), left(y, list(columns.values()))
@@ -270,6 +272,18 @@ def test_repeated_scans_taken_for_independent_find_what_is_not_there_and_blocks_
 def test_that_repeated_scans_are_taken_for_independent_is_said() -> None:
     table, noise = repeated(8, 2, 0)
     assert any("--blocks subject" in one for one in compare(cohort(table, noise), "~ sex", QUICK).warnings)
+
+
+def test_that_few_arrangements_differ_is_said() -> None:
+    table = {"sex": ["female", "female", "male", "male"], "subject": list("abcd")}
+    assert any("only 6 arrangements" in one for one in compare(cohort(table), "~ sex", QUICK).warnings)
+    assert not compare(cohort(people()), "~ sex", QUICK).warnings
+
+
+def test_type_iii_with_an_interaction_says_where_it_tests() -> None:
+    options = CompareOptions(squares="III", permutations=20, maps=False)
+    assert any("center(age)" in one for one in compare(cohort(people()), "~ sex * age", options).warnings)
+    assert not compare(cohort(people()), "~ sex * center(age)", options).warnings
 
 
 def test_subjects_who_lack_a_smile_do_not_seem_to_differ_by_it() -> None:
@@ -523,3 +537,46 @@ def test_what_a_formula_may_call_is_called() -> None:
         found = compare(cohort(table), "~ " + columns.get(name, f"{name}(age)"), QUICK)
         assert len(found.tests) == 1 and found.effects, name
     assert compare(cohort(table), "~ C(group)", QUICK).tests[0].df == 9
+
+
+# Bumps.
+
+
+def fits_with_a_bump(mm: float, seed: int = 0) -> tuple[Cohort, FloatArray]:
+    """Fits of two groups, whose shapes vary much by few modes; one has a bump that these do not make."""
+    points, faces = surface()
+    rng = np.random.default_rng(seed)
+    smooth = np.stack([np.ones(36), points[:, 0] / 25 - 1, points[:, 1] / 25 - 1], axis=1)
+    training: FloatArray = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
+    training += rng.normal(size=training.shape) * 0.3
+    model = ShapeModel.fit([Mesh(one, faces) for one in training], modes=30, align=False)
+    group = np.repeat([0, 1], 30)
+    near = np.exp(-0.5 * (np.linalg.norm(points - points[14], axis=1) / 8.0) ** 2)
+    shapes: FloatArray = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
+    shapes += rng.normal(size=shapes.shape) * 0.3 + mm * (group[:, None] * near)[..., None] * [0, 0, 1]
+    b = (shapes - model.mean_vertices).reshape(60, -1) @ model.vertex_basis
+    fitted = Fitted(model, b, np.full_like(b, 0.1), ("converged",) * 60, "")
+    names = tuple(f"p{k}" for k in range(60))
+    table = Table({"group": tuple("ab"[k] for k in group)}, names)
+    return Cohort.of_fits(fitted, names, table, np.full(60, np.nan)), near
+
+
+def test_a_bump_is_found_where_it_is_though_shapes_vary_more_than_it() -> None:
+    shapes, near = fits_with_a_bump(1.0)
+    made = compare(shapes, "~ group", CompareOptions(permutations=200, bump_width_mm=8.0)).effects[0].map
+    assert made is not None and made.bump is not None and made.bump_mm is not None and made.along is not None
+    assert not (made.along.p_family <= 0.05).any()
+    found = made.bump.p_family <= 0.05
+    assert found[14] and near[found].min() > 0.1
+    assert near[int(made.bump.f.argmax())] > 0.5
+    assert abs(made.bump_mm[14]) > 0.3
+
+
+def test_no_bump_is_found_where_there_is_none() -> None:
+    found = 0
+    for seed in range(20):
+        shapes, _ = fits_with_a_bump(0.0, seed)
+        made = compare(shapes, "~ group", CompareOptions(permutations=20, bump_width_mm=8.0)).effects[0].map
+        assert made is not None and made.bump is not None
+        found += bool((made.bump.p_family <= 0.05).any())
+    assert found <= 4

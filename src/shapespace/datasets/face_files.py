@@ -95,17 +95,18 @@ def write_faces(
     labels: list[tuple[str, ...]] = []
     for k in range(subjects):
         person = faces.draw_person(np.random.default_rng([seed, k]), f"subject_{k:03d}", wide=wide)
-        known_of = _sex_and_age(seed, k) if effect_mm is not None else ()
+        sex, age = _sex_and_age(seed, k)
         for name in expressions:
             shown = float(np.random.default_rng([seed, k, 1 + known.index(name), 2]).choice(list(intensities)))
             expression = faces.draw_expression(name, shown, np.random.default_rng([seed, k, 1 + known.index(name)]))
             file = f"{person.name}_{name}.ply"
             face = faces.face(person, expression)
-            if effect_mm is not None and known_of[0] == "male":
+            if effect_mm is not None and sex == "male":
                 face = with_chin(faces, face, effect_mm)
             face = faces.cut_to_face(face) if face_only else face
             rng = np.random.default_rng([seed, k, 1 + known.index(name), 1])
             write_mesh(folder / file, plain_scan(face, rng) if raw else face)
+            known_of = () if effect_mm is None else (sex, age)
             labels.append((file, person.name, name, "0" if name == "neutral" else f"{shown:g}", *known_of))
             if progress is not None:
                 progress(len(labels), subjects * len(expressions))

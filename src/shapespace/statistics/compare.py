@@ -461,13 +461,17 @@ def _warnings(
         if stratum.log_arrangements < math.log(_FEWEST):
             yield (
                 f"There are only {round(math.exp(stratum.log_arrangements))} arrangements"
-                f"{' ' + stratum.name if stratum.name else ''}, so no p can be small."
+                f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
             )
 
 
 def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
     for one in design.variables:
-        apart = any(one.column in term.variables and len(term.variables) > 1 for term in design.terms)
+        # Where a function has moved it, as center(age) does, 0 is where it says.
+        apart = any(
+            one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
+            for term in design.terms
+        )
         if options.squares == "III" and apart and not one.levels and one.low * one.high > 0:
             yield (
                 f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "

@@ -26,7 +26,9 @@ _VERTICES = 512
 _BYTES = 48 * 2**20
 _TIE = 1e-9
 _NONE = 1e-12
-_REACH = 3.0
+_BINS = 6000
+"""Of the logarithm of F, from a millionth to a million."""
+_REACH = 2.5
 """Standard deviations after which a bump ends."""
 _FLOOR = 1e-6
 
@@ -40,7 +42,8 @@ class Tested:
         p: (V,) share of arrangements with an F as large there.
         p_family: (V,) share of arrangements whose largest F of all vertices is as large: with `p_family` below 5 % a
             whole map without any effect shows a vertex in 5 % of studies.
-        q: (V,) false discovery rate at which the vertex is found.
+        q: (V,) false discovery rate at which the vertex is found; of shares among all vertices of all arrangements,
+            where F is spread alike without an effect, since those of one vertex end at 1 in as many as there are.
     """
 
     f: FloatArray
@@ -108,6 +111,7 @@ def effect_maps(
     seen = {name: np.empty((E, V, 3 if name == "any_way" else 1)) for name in lenses}
     observed, as_large = ({name: np.zeros((E, V)) for name in lenses} for _ in range(2))
     largest = {name: np.zeros((E, P)) for name in lenses}
+    pooled = {name: np.zeros((E, _BINS)) for name in lenses}
     flat = products.reshape(P * m, K)
     chunk = max(1, _BYTES // (m * 3 * _VERTICES * 8))
     for first in range(0, V, _VERTICES):
@@ -126,11 +130,16 @@ def effect_maps(
                 if start == 0:
                     observed[name][:, part] = f[:, 0]
                 as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
+                for at in range(E):
+                    pooled[name][at] += np.bincount(_bin(f[at]).ravel(), minlength=_BINS)
                 so_far = largest[name][:, start : start + chunk]
                 np.maximum(so_far, f.max(axis=2), out=so_far)
     made: list[EffectMap] = []
     for at in range(E):
-        tests = {name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at]) for name in lenses}
+        tests = {
+            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at])
+            for name in lenses
+        }
         own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
         change = seen["any_way"][at]
         made.append(
@@ -153,7 +162,8 @@ _Lens = Callable[[slice], tuple[FloatArray, FloatArray]]
 
 def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -> dict[str, _Lens]:
     def any_way(part: slice) -> tuple[FloatArray, FloatArray]:
-        return cohort.basis[:, 3 * part.start : 3 * part.stop], np.ones(part.stop - part.start)
+        rows: FloatArray = cohort.basis[:, 3 * part.start : 3 * part.stop]
+        return rows, np.ones(rows.shape[1] // 3)
 
     lenses: dict[str, _Lens] = {"any_way": any_way}
     if cohort.faces is None:
@@ -163,7 +173,8 @@ def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -
 
     def along(part: slice) -> tuple[FloatArray, FloatArray]:
         rows = any_way(part)[0].reshape(len(cohort.basis), -1, 3)
-        return np.einsum("kvc,vc->kv", rows, normals[part]), np.ones(part.stop - part.start)
+        seen: FloatArray = np.einsum("kvc,vc->kv", rows, normals[part])
+        return seen, np.ones(seen.shape[1])
 
     lenses["along"] = along
     if bump_width_mm is not None:
@@ -182,8 +193,8 @@ def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: Floa
     def bump(part: slice) -> tuple[FloatArray, FloatArray]:
         near = tree.sparse_distance_matrix(cKDTree(mean[part]), _REACH * width_mm, output_type="coo_matrix")
         near.data = np.exp(-0.5 * (near.data / width_mm) ** 2)
-        shapes = np.asarray((near.tocsr().T @ ahead.T).T)
-        filters = precision @ shapes
+        shapes: FloatArray = np.asarray((near.tocsr().T @ ahead.T).T)
+        filters: FloatArray = precision @ shapes
         return filters, np.maximum((filters * shapes).sum(axis=0), 1e-300)
 
     return bump
@@ -203,13 +214,20 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
         prior = (known * variance) @ known.T + max(beside, _FLOOR * float(variance.mean())) * prior
     factor = np.linalg.cholesky(prior)
     white = np.linalg.solve(factor, residual.T).T
-    shrunk = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_
+    shrunk: FloatArray = sklearn.LedoitWolf(assume_centered=True).fit(white).covariance_
     half = np.linalg.solve(factor, np.eye(len(factor)))
     return half.T @ np.linalg.solve(shrunk, half)
 
 
-def _tested(f: FloatArray, p: FloatArray, largest: FloatArray) -> Tested:
+def _bin(f: FloatArray) -> Any:
+    """Return the bins of F, narrow ones of its logarithm."""
+    return np.clip((np.log10(np.maximum(f, 1e-300)) + 6.0) * (_BINS / 12.0), 0, _BINS - 1).astype(np.intp)
+
+
+def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
     as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))
-    return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(false_discovery_control(p)))
+    of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
+    q = false_discovery_control(of_all[_bin(f)])
+    return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q))

@@ -64,8 +64,12 @@ class Stratum:
 
     @cached_property
     def log_arrangements(self) -> float:
-        """Logarithm of how many arrangements there are."""
-        return float(sum(math.lgamma(count + 1) for count in np.bincount(self.groups)))
+        """Logarithm of how many arrangements there are that differ; rows with the same covariates do not."""
+        matrix: FloatArray = np.round(self.matrix / np.abs(self.matrix).max(axis=0), 9)
+        rows = np.column_stack([self.groups.astype(np.float64), matrix])
+        alike = np.unique(rows, axis=0, return_counts=True)[1]
+        every = np.bincount(self.groups)
+        return float(sum(math.lgamma(n + 1) for n in every) - sum(math.lgamma(n + 1) for n in alike))
 
     def at(self, terms: Sequence[Term]) -> Rows:
         """Return the columns of `matrix` that some terms have."""
