@@ -160,10 +160,10 @@ def _of_results(
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         who = named([row.name for row, _ in pairs if row.status == status])
         notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({who}).")
-    fewest = 2 if onto is None else 1
+    fewest, least = (2, "two are") if onto is None else (1, "one is")
     if len(kept) < fewest:
         raise InputError(
-            f"{results.folder}: {len(kept)} of its fits can be used, and {('one is', 'two are')[fewest - 1]} the least; "
+            f"{results.folder}: {len(kept)} of its fits can be used, and {least} the least; "
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in kept]
