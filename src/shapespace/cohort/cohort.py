@@ -315,7 +315,7 @@ def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
             raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
         moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
         if onto.gauge == "shape":
-            along = float(np.vdot(moved, middle)) / float(np.vdot(middle, middle))
+            along = float(np.sum(moved * middle)) / float(np.sum(middle**2))
             moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
         shapes[k] = moved
 
@@ -329,7 +329,7 @@ def refuse_twice(cohort: Cohort) -> None:
     from scipy.spatial import cKDTree
 
     near = _SAME * centroid_size(cohort.reference)
-    pairs = cKDTree(cohort.coefficients).query_pairs(near, output_type="ndarray")
+    pairs: npt.NDArray[np.intp] = cKDTree(cohort.coefficients).query_pairs(near, output_type="ndarray")
     if len(pairs):
         least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
         first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from scipy.stats import f as f_distribution
 
 from shapespace.cohort.cohort import Cohort
@@ -20,7 +20,7 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
-from shapespace.types import FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
 
 FEWEST_PEOPLE, SMALL = 5, 30
 """The least reference, and one below which the answer says that it is small."""
@@ -280,12 +280,12 @@ def _refuse_known(
     reference: Cohort, subjects: Cohort, own: FloatArray, outside: FloatArray, column: str | None
 ) -> None:
     """Refuse subjects who are in the reference, as scans or as people."""
-    far, at = cKDTree(reference.coefficients).query(own)
-    near = np.sqrt(np.square(far) + outside) < _SAME * centroid_size(reference.reference)
+    apart = cdist(own, reference.coefficients)
+    near = np.sqrt(apart.min(axis=1) ** 2 + outside) < _SAME * centroid_size(reference.reference)
     if near.any():
         k = int(np.flatnonzero(near)[0])
         raise InputError(
-            f"{subjects.names[k]} is in the reference too, as {reference.names[int(at[k])]}"
+            f"{subjects.names[k]} is in the reference too, as {reference.names[int(apart[k].argmin())]}"
             f"{f', and {int(near.sum()) - 1} more are' if near.sum() > 1 else ''}; leave it out of one of them."
         )
     if column is not None:
@@ -360,7 +360,7 @@ class _Ruler:
         """Return sums of squares as RMS over the vertices, mm; what is left by rounding alone is nothing."""
         return np.sqrt(np.where(squares > self.least, squares, 0.0) / self.n_vertices)
 
-    def share(self, farther: FloatArray) -> float:
+    def share(self, farther: BoolArray) -> float:
         """Return the share of people, a new one among them, who are `farther` (R, N); those of a person count once."""
         return (1 + float((farther.mean(axis=0) * self.weight).sum())) / (self.people + 1)
 
@@ -429,8 +429,9 @@ def _draws(seen: _Seen | None, options: ScoreOptions) -> FloatArray:
 
 
 def _beyond(cohort: Cohort) -> FloatArray:
-    none = cohort.fitted is None or cohort.fitted.beyond_mm is None
-    return np.full(len(cohort), np.nan) if none else np.asarray(cohort.fitted.beyond_mm)
+    if cohort.fitted is None or cohort.fitted.beyond_mm is None:
+        return np.full(len(cohort), np.nan)
+    return cohort.fitted.beyond_mm
 
 
 def _nearest(
@@ -439,7 +440,7 @@ def _nearest(
     between = own - reference.coefficients
     far = np.sqrt(ruler.whole.squared(between @ ruler.whole.components.T, noise))
     rms = np.sqrt(((between**2).sum(axis=1) + outside) / ruler.n_vertices)
-    order = np.argsort(far, kind="stable")[:count]
+    order: list[int] = np.argsort(far, kind="stable")[:count].tolist()
     return tuple(Near(reference.names[k], float(far[k]), float(rms[k])) for k in order)
 
 

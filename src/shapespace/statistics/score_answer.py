@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import structs
 
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer, Rows
@@ -72,9 +71,9 @@ def _sentence(scores: Scores, k: int) -> str:
 
 def _how(scores: Scores) -> tuple[str, ...]:
     limit = (
-        f"Beyond {scores.z_limit:.1f} standard deviations lies nowhere any vertex of 95 % of the reference's people."
+        f"Of 95 % of the reference's people no vertex lies beyond {scores.z_limit:.1f} standard deviations."
         if math.isfinite(scores.z_limit)
-        else "The reference is too small to say how far out a single vertex may lie by chance (19 people are the least)."
+        else "With fewer than 19 people in the reference, how far out single vertices lie by chance is not known."
     )
     return (
         f"Distances are Mahalanobis distances in the {scores.modes} modes of the reference that hold "
@@ -112,8 +111,8 @@ def _table(scores: Scores) -> TablePart:
         rows = [(*row[:7], *row[8:]) for row in rows]
     return TablePart(
         title="Scores", columns=tuple(columns), rows=tuple(rows),
-        note="Percentiles: share of the reference's people who lie nearer to its mean. 4.6 % of the vertices lie beyond "
-        "2 standard deviations in a usual shape.",
+        note="Percentiles: share of the reference's people who lie nearer to its mean. On average 4.6 % of the "
+        "vertices of a usual shape lie beyond 2 SD.",
     )  # fmt: skip
 
 
@@ -137,12 +136,16 @@ def _counts(values: npt.NDArray[Any], edges: npt.NDArray[Any], label: str) -> Co
 def _maps(scores: Scores, shown: list[int]) -> list[Part]:
     parts: list[Part] = [TextPart(title="Maps", level=2, text=_of_maps(scores, shown))]
     for k in shown[:_MOST_MAPS]:
-        beyond = float((np.abs(scores.z[k]) > scores.z_limit).mean()) if math.isfinite(scores.z_limit) else 0.0
-        part = SurfaceMapPart(
-            title=scores.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
-            limit=_LIMIT_SD,
+        beyond = ""
+        if math.isfinite(scores.z_limit):
+            share = float((np.abs(scores.z[k]) > scores.z_limit).mean())
+            beyond = f"{100 * share:.1f} % of the vertices lie beyond {scores.z_limit:.1f} standard deviations."
+        parts.append(
+            SurfaceMapPart(
+                title=scores.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
+                limit=_LIMIT_SD, note=beyond,
+            )
         )  # fmt: skip
-        parts.append(structs.replace(part, mask=f"beyond_{k + 1}") if beyond else part)
     return parts
 
 
@@ -151,8 +154,7 @@ def _of_maps(scores: Scores, shown: list[int]) -> str:
     more = f" Maps of {rest} more are in {_FILE}." if rest > 0 else ""
     return (
         "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference "
-        "and the fit's own uncertainty. Where a map has pale parts, the rest lies farther out than chance takes any "
-        f"vertex of 95 % of the reference's people.{more}"
+        f"and the fit's own uncertainty.{more}"
     )
 
 
@@ -176,8 +178,6 @@ def _arrays(scores: Scores, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
     }
     for k in range(len(scores.names)):
         arrays[f"z_{k + 1}"] = scores.z[k].astype(np.float32)
-    for k in shown[:_MOST_MAPS]:
-        arrays[f"beyond_{k + 1}"] = np.abs(scores.z[k]) > scores.z_limit
     for k in shown[:_MOST_MORPHS]:
         arrays[f"shape_{k + 1}"] = scores.subjects.vertices(k)
     return arrays

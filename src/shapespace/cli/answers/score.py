@@ -12,11 +12,11 @@ def add(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_cohort(sub)
     sub.add_argument("--reference", type=Path, required=True, metavar="DATA",
-                     help="the population: a CSV table or a folder of fits, as DATA; doubtful fits are left out")  # fmt: skip
+                     help="the population: a table or a folder of fits, without its doubtful fits")  # fmt: skip
     sub.add_argument("--reference-shapes", type=Path, metavar="DIR",
                      help="its results of fits, or meshes (default: the folder of the reference)")  # fmt: skip
     sub.add_argument("--modes", type=int, metavar="N",
-                     help="of the reference to measure by (default: 95 %% of its variance, one for five people at most)")  # fmt: skip
+                     help="of the reference (default: of 95 %% of its variance, one for five people)")  # fmt: skip
     sub.add_argument("--subject", metavar="COLUMN", help="says who is scanned, where people have several scans")
     sub.add_argument("--nearest", type=int, default=3, metavar="N", help="of the reference to name (default 3)")
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the draws of uncertain fits")
