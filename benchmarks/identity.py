@@ -22,9 +22,6 @@ from typing import Any
 
 import numpy as np
 from identity_scans import CONDITIONS, fit_harder, fits_path, read_harder, study_config
-from simulated import StudyConfig, prepare_folder, run_fits
-from study_fits import STATUSES, model_path, person_path, read_fits
-from study_people import StudyPeople
 
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.identify import Searches, identified, joined, search
@@ -33,6 +30,9 @@ from shapespace.statistics.identity.samples import Samples
 from shapespace.statistics.identity.scores import SCORES
 from shapespace.statistics.identity.verify import Verified, verified
 from shapespace.types import FloatArray, IntArray
+from simulated import StudyConfig, prepare_folder, run_fits
+from study_fits import STATUSES, model_path, person_path, read_fits
+from study_people import StudyPeople
 
 AS_EXACT = "likelihood-ratio, fits taken for exact"
 MODES = (1, 2, 3, 5, 10, 20, 40, 80, 160)
@@ -54,7 +54,9 @@ def samples(model: AdditiveModel, z: FloatArray, z_stddev: FloatArray, subjects:
     k = model.shape.n_modes
     turn = model.rotation[: model.n_identity]
     z, variance = z[:, :k], z_stddev[:, :k] ** 2
-    return Samples(z @ turn.T, variance @ (turn**2).T, z * model.shape.stddev, tuple(subjects), len(model.shape.mean_vertices))
+    return Samples(
+        z @ turn.T, variance @ (turn**2).T, z * model.shape.stddev, tuple(subjects), len(model.shape.mean_vertices)
+    )
 
 
 def folds_of(
@@ -136,7 +138,9 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
         ranks = identified(name, joined(found), min(len(np.unique(g)) for g, _ in rows), drawn)
         out[name] = row_of(told) | {"rank_1": shown(ranks.rank_1)}
         out[name] |= {f"fnir_at_fpir_{rate:g}": shown(ranks.fnir[rate]) for rate in ranks.fnir}
-        least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(told.score[~pairs.same].std())
+        least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(
+            told.score[~pairs.same].std()
+        )
         out[name]["margin"] = least
     out["pairs"] = {"people": len(people), "genuine": int(pairs.same.sum()), "impostor": int((~pairs.same).sum())}
     return out
@@ -159,7 +163,10 @@ def shown(one: Figure) -> list[float | None]:
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the figures as lines of Markdown."""
-    lines = ["| condition | score | EER, % | TAR at FAR 1e-3, % | Cllr, bits | rank 1, % | FNIR at FPIR 1e-2, % |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| condition | score | EER, % | TAR at FAR 1e-3, % | Cllr, bits | rank 1, % | FNIR at FPIR 1e-2, % |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for condition, scores in found.items():
         for name, row in scores["scores"].items():
             if name == "pairs":
@@ -175,7 +182,9 @@ def percent(told: Sequence[float | None]) -> str:
     value, low, high = told
     if value is None:
         return "too few pairs"
-    return f"{100 * value:.2f}" + (f" ({100 * low:.2f} to {100 * high:.2f})" if low is not None and high is not None else "")
+    return f"{100 * value:.2f}" + (
+        f" ({100 * low:.2f} to {100 * high:.2f})" if low is not None and high is not None else ""
+    )
 
 
 def quick_study(folder: Path) -> Path:

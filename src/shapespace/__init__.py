@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.statistics.identity.identify import identify
+    from shapespace.statistics.identity.rounds import IdentityOptions
+    from shapespace.statistics.identity.verify import verify
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -35,6 +38,7 @@ __all__ = [
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
+    "IdentityOptions",
     "LabelVolume",
     "Mesh",
     "ModelQuality",
@@ -51,6 +55,7 @@ __all__ = [
     "as_mesh",
     "correspond",
     "fit_scan",
+    "identify",
     "load_faces",
     "measure_quality",
     "read_landmarks",
@@ -60,6 +65,7 @@ __all__ = [
     "surface_distances",
     "surface_of_volume",
     "train_classifier",
+    "verify",
     "write_mesh",
 ]
 
@@ -69,6 +75,7 @@ _HOMES = {
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
+    "IdentityOptions": "statistics.identity.rounds",
     "LabelVolume": "types",
     "Mesh": "types",
     "ModelQuality": "model.quality",
@@ -84,6 +91,7 @@ _HOMES = {
     "correspond": "correspondence.rounds",
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
+    "identify": "statistics.identity.identify",
     "load_faces": "datasets.faces",
     "measure_quality": "model.quality",
     "read_landmarks": "io.landmarks",
@@ -93,6 +101,7 @@ _HOMES = {
     "surface_distances": "geometry.distance",
     "surface_of_volume": "geometry.volume_surface",
     "train_classifier": "recognise.predict",
+    "verify": "statistics.identity.verify",
     "write_mesh": "io.meshes",
 }
 

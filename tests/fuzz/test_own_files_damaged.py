@@ -29,7 +29,6 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
-from shapespace.store.corresponding import json_of
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.model.shape_model import ShapeModel
@@ -49,6 +48,7 @@ from shapespace.schemas import (
     json_text,
     read,
 )
+from shapespace.store.corresponding import json_of
 from synthetic_shapes import blob_model, raw_scan
 
 MOST_SECONDS = 5.0

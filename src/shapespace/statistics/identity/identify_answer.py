@@ -25,11 +25,11 @@ def answer(found: Identification) -> Answer:
     strangers = int((~first.searches.enrolled).sum())
     summary = seen(
         [
-            f"By {called(first.name)} the right person is the first of {found.enrolled} in {in_percent(first.rank_1)} of "
-            f"{found.probes - strangers} searches.",
+            f"By {called(first.name)} the right person is the first of {found.enrolled} in "
+            f"{in_percent(first.rank_1)} of {found.probes - strangers} searches.",
             *(
-                f"Where {100 * rate:g} % of searches for strangers may find somebody, {in_percent(one)} of those enrolled "
-                "are missed."
+                f"Where {100 * rate:g} % of searches for strangers may find somebody, "
+                f"{in_percent(one)} of those enrolled are missed."
                 for rate, one in first.fnir.items()
                 if one.value is not None
             ),
@@ -45,15 +45,16 @@ def answer(found: Identification) -> Answer:
         [
             *trial.notes,
             none_missed((first.rank_1.value or 0.0) < 1, int(trial.tested.sum())),
-            f"There are too few searches for a false positive identification rate of {', '.join(f'{r:g}' for r in lost)}."
+            "There are too few searches for a false positive identification rate of "
+            f"{', '.join(f'{rate:g}' for rate in lost)}."
             if lost
             else "",
-            "" if strangers else "Nobody is a stranger, so each probe is searched for once more without its own person.",
+            ""
+            if strangers
+            else "Nobody is a stranger, so each probe is searched for once more without its own person.",
         ]
     )
-    rows = [
-        (name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)
-    ]
+    rows = [(name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)]
     told = ("score", "figure", "value", "low", "high")
     return Answer(
         question="recognise identify",
@@ -122,8 +123,8 @@ def _parts(found: Identification) -> tuple[Part, ...]:
                 who_was_tested(found.trial, found.trained_on),
                 f"{found.enrolled} people are enrolled"
                 + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
-                + " A person's score is that of the scan of them that is most like the probe; ties count against the right"
-                " one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
+                + " A person's score is that of the scan of them that is most like the probe; ties count against the"
+                " right one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
             ),
         ),
     )  # fmt: skip

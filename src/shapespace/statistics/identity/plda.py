@@ -1,9 +1,9 @@
 """The likelihood ratio of two scans being of one person, by normal within- and between-person covariance.
 
 A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows and the error of its fit. W differs from
-scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers, "The speaker
-partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006. Uncertainty that is
-stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
+scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers,
+"The speaker partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006.
+Uncertainty that is stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ def _roles(table: Table, role: str | None, options: IdentityOptions) -> tuple[li
     if options.probe and not gallery:
         raise InputError("Probes need a gallery; name it with --gallery.")
     taken = {*training, *gallery}
-    probes = [row for row in (rows_of(table, options.probe) if options.probe else range(len(table)))]
+    probes = rows_of(table, options.probe) if options.probe else range(len(table))
     return gallery, [row for row in probes if row not in taken], training
 
 

@@ -93,8 +93,8 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may be "
-        "ones with whom errors happen (95 %, rule of three)."
+        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may "
+        "be ones with whom errors happen (95 %, rule of three)."
     )
 
 
