@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.identify import Identification, Identified
@@ -78,8 +80,8 @@ def answer(found: Identification) -> Answer:
     )
 
 
-def _rows(one: Identified) -> list[list[object]]:
-    rows: list[list[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
+def _rows(one: Identified) -> list[Sequence[object]]:
+    rows: list[Sequence[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
     rows += [[one.name, f"within {k}", share, *ends] for k, (share, *ends) in enumerate(
         zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)]  # fmt: skip
     rows += [[one.name, f"fnir at fpir {rate:g}", *cells(told)] for rate, told in one.fnir.items()]

@@ -79,7 +79,7 @@ class TwoCovariance:
         values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
         stated = training.variance.mean(axis=0) @ basis**2
         noise = np.minimum(stated, _MOST_NOISE)
-        scale = np.divide(noise, stated, out=np.ones(k), where=stated > 0)
+        scale = np.divide(noise, stated, out=np.ones_like(noise), where=stated > 0)
         arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
         return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
 
@@ -110,6 +110,6 @@ class TwoCovariance:
 
 def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:
     """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
-    shares, vectors = cast(tuple[FloatArray, FloatArray], eigh(part, whole))
+    shares, vectors = eigh(part, whole)
     back = np.linalg.inv(vectors)
     return (back.T * np.maximum(1.0 - shares, least)) @ back

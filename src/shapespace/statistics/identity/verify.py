@@ -223,5 +223,6 @@ def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float
 
 def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:
     """Return (M,) which pairs have a value: their probe, or one of both where there is no gallery."""
-    has = np.array([one == value for one in values])[pairs.rows]
-    return has.any(axis=1) if all_pairs else has[:, 1]
+    has: BoolArray = np.array([one == value for one in values], dtype=np.bool_)
+    probe = has[pairs.rows[:, 1]]
+    return probe | has[pairs.rows[:, 0]] if all_pairs else probe

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
@@ -96,8 +98,8 @@ def _cost(one: Verified) -> str:
     )
 
 
-def _rows(one: Verified) -> list[list[object]]:
-    rows: list[list[object]] = [[one.name, "eer", *cells(one.eer)]]
+def _rows(one: Verified) -> list[Sequence[object]]:
+    rows: list[Sequence[object]] = [[one.name, "eer", *cells(one.eer)]]
     rows += [[one.name, f"tar at far {far:g}", *cells(told)] for far, told in one.tar.items()]
     rows += [[one.name, "cllr", *cells(one.cllr)], [one.name, "cllr_min", one.cllr_min, "", ""]]
     rows += [[one.name, f"eer with {modes} modes", eer, "", ""] for modes, eer in one.curve.items()]
