@@ -14,7 +14,7 @@ from shapespace.statistics.identity.told import (
     in_percent,
     interval,
     none_missed,
-    role_of,
+    scans_told,
     seen,
     settings,
     who_was_tested,
@@ -56,7 +56,6 @@ def answer(found: Identification) -> Answer:
             else "Nobody is a stranger, so each probe is searched for once more without its own person.",
         ]
     )
-    rows = [(name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)]
     told = ("score", "figure", "value", "low", "high")
     return Answer(
         question="recognise identify",
@@ -65,7 +64,7 @@ def answer(found: Identification) -> Answer:
         parts=_parts(found),
         tables={
             "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
-            "scans.csv": (("scan", "subject", "role"), rows),
+            "scans.csv": scans_told(trial),
         },
         arrays={
             "searches.npz": {

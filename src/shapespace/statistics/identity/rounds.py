@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -90,7 +91,7 @@ class Trial:
     all_pairs: bool
     notes: tuple[str, ...]
 
-    @property
+    @cached_property
     def subjects(self) -> tuple[str, ...]:
         """(N,) whom each scan shows."""
         return tuple(self.people[int(k)] for k in self.person)

@@ -15,7 +15,7 @@ from shapespace.statistics.identity.told import (
     in_percent,
     interval,
     none_missed,
-    role_of,
+    scans_told,
     seen,
     settings,
     thinned,
@@ -72,7 +72,6 @@ def answer(found: Verification) -> Answer:
         **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
     }
     told = ("score", "figure", "value", "low", "high")
-    scans = [(name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)]
     return Answer(
         question="recognise verify",
         title="Who is it? Verification",
@@ -80,7 +79,7 @@ def answer(found: Verification) -> Answer:
         parts=_parts(found),
         tables={
             "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
-            "scans.csv": (("scan", "subject", "role"), scans),
+            "scans.csv": scans_told(trial),
         },
         arrays={"pairs.npz": arrays},
         notes=notes,
