@@ -21,18 +21,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from identity_scans import CONDITIONS, fit_harder, fits_path, read_harder, study_config
-from simulated import StudyConfig, prepare_folder, run_fits
-from study_fits import STATUSES, model_path, person_path, read_fits
-from study_people import StudyPeople
+from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, study_config
 
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.identify import Searches, identified, joined, search
-from shapespace.statistics.identity.rates import Figure, Pairs, people_drawn
+from shapespace.statistics.identity.rates import Figure, Pairs, Sweep, people_drawn
 from shapespace.statistics.identity.samples import Samples
 from shapespace.statistics.identity.scores import SCORES
 from shapespace.statistics.identity.verify import Verified, verified
 from shapespace.types import FloatArray, IntArray
+from simulated import StudyConfig, prepare_folder, run_fits
+from study_fits import STATUSES, model_path, person_path, read_fits
+from study_people import StudyPeople
 
 AS_EXACT = "likelihood-ratio, fits taken for exact"
 MODES = (1, 2, 3, 5, 10, 20, 40, 80, 160)
@@ -54,7 +54,9 @@ def samples(model: AdditiveModel, z: FloatArray, z_stddev: FloatArray, subjects:
     k = model.shape.n_modes
     turn = model.rotation[: model.n_identity]
     z, variance = z[:, :k], z_stddev[:, :k] ** 2
-    return Samples(z @ turn.T, variance @ (turn**2).T, z * model.shape.stddev, tuple(subjects), len(model.shape.mean_vertices))
+    return Samples(
+        z @ turn.T, variance @ (turn**2).T, z * model.shape.stddev, tuple(subjects), len(model.shape.mean_vertices)
+    )
 
 
 def folds_of(
@@ -130,13 +132,15 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
         if name != "distance":
             for k in modes:
                 flat = np.concatenate([m.ravel() for m in score_matrices(folds, name, k)])
-                curve[k] = verified(name, flat, pairs, group, drawn[:0]).eer.value or 0.0
+                curve[k] = Sweep(flat, pairs.same).roc().eer
         told = verified(name, np.concatenate([m.ravel() for m in matrices]), pairs, group, drawn, curve=curve)
         found: list[Searches] = [search(m, *row) for m, row in zip(matrices, rows, strict=True)]
         ranks = identified(name, joined(found), min(len(np.unique(g)) for g, _ in rows), drawn)
         out[name] = row_of(told) | {"rank_1": shown(ranks.rank_1)}
         out[name] |= {f"fnir_at_fpir_{rate:g}": shown(ranks.fnir[rate]) for rate in ranks.fnir}
-        least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(told.score[~pairs.same].std())
+        least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(
+            told.score[~pairs.same].std()
+        )
         out[name]["margin"] = least
     out["pairs"] = {"people": len(people), "genuine": int(pairs.same.sum()), "impostor": int((~pairs.same).sum())}
     return out
@@ -159,7 +163,10 @@ def shown(one: Figure) -> list[float | None]:
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the figures as lines of Markdown."""
-    lines = ["| condition | score | EER, % | TAR at FAR 1e-3, % | Cllr, bits | rank 1, % | FNIR at FPIR 1e-2, % |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| condition | score | EER, % | TAR at FAR 1e-3, % | Cllr, bits | rank 1, % | FNIR at FPIR 1e-2, % |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for condition, scores in found.items():
         for name, row in scores["scores"].items():
             if name == "pairs":
@@ -175,7 +182,9 @@ def percent(told: Sequence[float | None]) -> str:
     value, low, high = told
     if value is None:
         return "too few pairs"
-    return f"{100 * value:.2f}" + (f" ({100 * low:.2f} to {100 * high:.2f})" if low is not None and high is not None else "")
+    return f"{100 * value:.2f}" + (
+        f" ({100 * low:.2f} to {100 * high:.2f})" if low is not None and high is not None else ""
+    )
 
 
 def quick_study(folder: Path) -> Path:
@@ -202,7 +211,9 @@ def told(what: str, done: int, total: int) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--study", type=Path, nargs="+", help="folders of the study that there are")
-    parser.add_argument("--harder", type=Path, nargs="+", help="folders of harder fits, one for each study")
+    parser.add_argument(
+        "--harder", type=Path, nargs="+", help="folders of harder fits, one for each study; used as they are"
+    )
     parser.add_argument("--conditions", nargs="*", default=list(CONDITIONS), help="that are harder")
     parser.add_argument("--work", type=Path, default=Path("identity-work"), help="where studies are made")
     parser.add_argument("--seeds", type=int, nargs="+", default=[2007], help="of studies to make")
@@ -223,10 +234,11 @@ def main() -> int:
         counts = dict.fromkeys(STATUSES, 0)
         for number, (study, other) in enumerate(zip(studies, harder, strict=False)):
             config = study_config(study)
-            if condition != STUDY and not (chosen.study and not complete(other, config, condition)):
-                fit_harder(study, other, config, [condition], workers=chosen.jobs)
-            elif condition != STUDY:
-                continue
+            if condition != STUDY:
+                if chosen.harder is None:
+                    fit_harder(study, other, config, [condition], workers=chosen.jobs)
+                if not people_there(other, config, condition):
+                    continue
             folds, own = folds_of(study, other, condition, number, doubtful=False)
             used += folds
             counts = {name: counts[name] + own[name] for name in counts}
@@ -241,11 +253,6 @@ def main() -> int:
     if chosen.json:
         chosen.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0
-
-
-def complete(folder: Path, config: StudyConfig, condition: str) -> bool:
-    """Return whether all fits of a condition are there."""
-    return all(fits_path(folder, condition, person).is_file() for person in range(config.people.people))
 
 
 if __name__ == "__main__":

@@ -116,9 +116,9 @@ def fit_harder(study: Path, output: Path, config: StudyConfig, conditions: Seque
 
 
 def read_harder(output: Path, config: StudyConfig, condition: str) -> HardFits:
-    """Return the fits of a condition."""
+    """Return the fits of a condition, of the people who were fitted."""
     parts: list[dict[str, Any]] = []
-    for person in range(config.people.people):
+    for person in people_there(output, config, condition):
         with np.load(io.BytesIO(read_bytes(fits_path(output, condition, person))), allow_pickle=False) as held:
             parts.append({name: held[name] for name in held.files} | {"person": person})
     joined: dict[str, FloatArray] = {}
@@ -135,6 +135,11 @@ def read_harder(output: Path, config: StudyConfig, condition: str) -> HardFits:
         person=np.concatenate([np.full(len(part["z"]), part["person"], dtype=np.int32) for part in parts]),
         shown=np.concatenate([part["shown"] for part in parts]),
     )
+
+
+def people_there(output: Path, config: StudyConfig, condition: str) -> list[int]:
+    """Return the people whose fits of a condition are there."""
+    return [person for person in range(config.people.people) if fits_path(output, condition, person).is_file()]
 
 
 @cache

@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from shapespace.recognise.shape_space import ShapeSpace
     from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
     from shapespace.statistics.change import Change, ChangeSettings, change
+    from shapespace.statistics.change_found import ChangeSettings
+    from shapespace.statistics.identity.identify import identify
+    from shapespace.statistics.identity.rounds import IdentityOptions
+    from shapespace.statistics.identity.verify import verify
     from shapespace.statistics.predictor import Predictor
     from shapespace.statistics.regression import Regression, regress
-    from shapespace.statistics.change import Change, change
-    from shapespace.statistics.change_found import ChangeSettings
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -44,6 +46,7 @@ __all__ = [
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
+    "IdentityOptions",
     "LabelVolume",
     "Mesh",
     "ModelQuality",
@@ -63,6 +66,7 @@ __all__ = [
     "change",
     "correspond",
     "fit_scan",
+    "identify",
     "load_faces",
     "measure_asymmetry",
     "measure_quality",
@@ -74,6 +78,7 @@ __all__ = [
     "surface_distances",
     "surface_of_volume",
     "train_classifier",
+    "verify",
     "write_mesh",
 ]
 
@@ -86,6 +91,7 @@ _HOMES = {
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
+    "IdentityOptions": "statistics.identity.rounds",
     "LabelVolume": "types",
     "Mesh": "types",
     "ModelQuality": "model.quality",
@@ -104,6 +110,7 @@ _HOMES = {
     "correspond": "correspondence.rounds",
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
+    "identify": "statistics.identity.identify",
     "load_faces": "datasets.faces",
     "measure_asymmetry": "statistics.asymmetry",
     "measure_quality": "model.quality",
@@ -115,6 +122,7 @@ _HOMES = {
     "surface_distances": "geometry.distance",
     "surface_of_volume": "geometry.volume_surface",
     "train_classifier": "recognise.predict",
+    "verify": "statistics.identity.verify",
     "write_mesh": "io.meshes",
 }
 

@@ -50,7 +50,8 @@ def test_a_table_and_fits_end_in_an_answer_and_a_report(command: str, folder: Pa
 
 def test_the_first_score_is_told_of_first(folder: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("recognise", "verify", folder / "people.csv", "--shapes", folder / "fits", "-o", tmp_path, *FEW,
-                  "--scores", "cosine,distance", "--curve", "1,2", "--by", "expression", "--no-uncertainty")  # fmt: skip
+                  "--scores", "cosine,distance", "--curve", "1,2", "--by", "expression",
+                  "--no-uncertainty")  # fmt: skip
     assert outcome.code == 0 and outcome.out.startswith("By cosine the equal error rate is")
     figures = (tmp_path / "figures.csv").read_text()
     assert "eer with 2 modes" in figures and "eer of smile" in figures and "likelihood" not in figures

@@ -28,7 +28,9 @@ def test_a_score_of_a_pair_does_not_depend_on_the_others(name, training):
     gallery, probes = people(5, 2, 1, error=0.2), people(7, 1, 2, error=0.2)
     score = SCORES[name](training)
     found = score(gallery, probes)
-    np.testing.assert_allclose(score(gallery.take([3, 0]), probes.take([6, 1, 2])), found[[3, 0]][:, [6, 1, 2]], atol=1e-9)
+    np.testing.assert_allclose(
+        score(gallery.take([3, 0]), probes.take([6, 1, 2])), found[[3, 0]][:, [6, 1, 2]], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", SCORES)

@@ -181,7 +181,13 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
     return any(b.language == "python" or any(c.startswith("shapespace") for c in commands(b)) for b in chosen)
 
 
-LONG = ("tutorial-faces.md", "tutorial-identity.md", "tutorial-recognition.md", "tutorial-spleens.md", "tutorial-volumes.md")
+LONG = (
+    "tutorial-faces.md",
+    "tutorial-identity.md",
+    "tutorial-recognition.md",
+    "tutorial-spleens.md",
+    "tutorial-volumes.md",
+)
 """Documents whose examples take long."""
 MARKS: dict[str, Any] = dict.fromkeys(LONG, pytest.mark.long)
 MARKS["tutorial-recognition.md"] = [pytest.mark.long, pytest.mark.pairs]

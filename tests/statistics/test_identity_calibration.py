@@ -12,7 +12,7 @@ pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 
 
 def well_calibrated(n, seed=0, distance=2.0):
-    """Scores of two unit normal distributions `distance` apart are their own log likelihood ratios, times `distance`."""
+    """Return scores of two unit normal distributions, their log likelihood ratios, and which is which."""
     rng = np.random.default_rng(seed)
     same = np.arange(2 * n) < n
     score = rng.normal(0, 1, 2 * n) + np.where(same, distance, 0.0)
@@ -27,9 +27,7 @@ def pairs_of(people, scans):
 
 def test_the_cost_is_that_of_its_definition():
     llr, same = np.array([2.0, -1.0, 0.5, -3.0]), np.array([True, True, False, False])
-    by_hand = 0.5 * (
-        np.mean(np.log2(1 + np.exp([-2.0, 1.0]))) + np.mean(np.log2(1 + np.exp([0.5, -3.0])))
-    )
+    by_hand = 0.5 * (np.mean(np.log2(1 + np.exp([-2.0, 1.0]))) + np.mean(np.log2(1 + np.exp([0.5, -3.0]))))
     assert cllr(llr, same) == pytest.approx(by_hand)
 
 

@@ -37,7 +37,9 @@ def test_it_is_the_ratio_of_normal_densities():
             together = multivariate_normal(
                 np.tile(learned.mean, 2), np.block([[one, between], [between, other]])
             ).logpdf(np.concatenate([g, p]))
-            apart = multivariate_normal(learned.mean, one).logpdf(g) + multivariate_normal(learned.mean, other).logpdf(p)
+            apart = multivariate_normal(learned.mean, one).logpdf(g) + multivariate_normal(learned.mean, other).logpdf(
+                p
+            )
             assert found[i, j] == pytest.approx(together - apart, abs=1e-8)
 
 
@@ -95,6 +97,7 @@ def test_errors_that_fits_state_help_where_they_differ():
         return replace(samples, x=x, variance=variance)
 
     training, tested = worse(people(100, 4)), worse(people(80, 3, 1))
+
     def without(samples):
         return replace(samples, variance=np.zeros_like(samples.x))
 

@@ -26,9 +26,7 @@ def by_hand(score, same, weights=None):
     rows = [(np.inf, 0.0, 0.0)]
     for t in sorted(set(score), reverse=True):
         accepted = score >= t
-        rows.append(
-            (t, w[accepted & ~same].sum() / w[~same].sum(), w[accepted & same].sum() / w[same].sum())
-        )
+        rows.append((t, w[accepted & ~same].sum() / w[~same].sum(), w[accepted & same].sum() / w[same].sum()))
     return np.array(rows)
 
 
@@ -118,7 +116,10 @@ def test_an_interval_over_people_covers_the_truth():
         score = np.where(pairs.same, 2 + own[pairs.one], 0) + rng.normal(0, 1, len(pairs))
         sweep = Sweep(score, pairs.same)
         drawn = resampled(
-            pairs, people_drawn(np.ones(30, dtype=bool), 100, seed), lambda w, s=sweep: s.roc(w).tar_at(np.array([0.1])), 1
+            pairs,
+            people_drawn(np.ones(30, dtype=bool), 100, seed),
+            lambda w, s=sweep: s.roc(w).tar_at(np.array([0.1])),
+            1,
         )
         told = figure(float(sweep.roc().tar_at(0.1)), drawn[:, 0])
         truth = norm.cdf((2 - norm.ppf(0.9)) / np.sqrt(2))

@@ -193,7 +193,9 @@ def test_an_additive_model_gives_its_identity_alone():
 
 def test_surfaces_without_fits_are_whitened_by_people_who_are_not_tested():
     told = people(12, 3, error=0.2)
-    shapes = 10 * np.random.default_rng(0).standard_normal((1, 20, 3)) + np.pad(told.x, ((0, 0), (0, 54))).reshape(36, 20, 3)
+    shapes = 10 * np.random.default_rng(0).standard_normal((1, 20, 3)) + np.pad(told.x, ((0, 0), (0, 54))).reshape(
+        36, 20, 3
+    )
     surfaces = Cohort.of_shapes(shapes, {"subject": told.subjects}, align=False)
     training = list(range(18))
     found = samples_of(surfaces, told.subjects, training)

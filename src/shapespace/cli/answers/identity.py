@@ -64,12 +64,15 @@ def _add_who(sub: argparse.ArgumentParser) -> None:
     add_cohort(sub)
     sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
     sub.add_argument("--gallery", metavar="EXPR",
-                     help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all)")  # fmt: skip
+                     help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all; of "
+                     "identify the first scan of each person)")  # fmt: skip
     sub.add_argument("--probe", metavar="EXPR", help="who is searched for (default: all others)")
     sub.add_argument("--train", metavar="EXPR", help="who is learned from (default: the people of other folds)")
     sub.add_argument("--role", metavar="COLUMN",
                      help="that says gallery, probe or train instead (default: role, if there is one)")  # fmt: skip
-    sub.add_argument("--folds", type=int, metavar="N", help="parts of the people, each tested by the others (default 4)")
+    sub.add_argument(
+        "--folds", type=int, metavar="N", help="parts of the people, each tested by the others (default 4)"
+    )
     sub.add_argument("--scores", type=_names, metavar="LIST",
                      help="likelihood-ratio, cosine, mahalanobis or distance, first the one that is told of first "
                      "(default: all)")  # fmt: skip

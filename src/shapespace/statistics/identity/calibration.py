@@ -31,7 +31,8 @@ def cllr_min(score: FloatArray, same: BoolArray) -> float:
         ShapespaceError: scikit-learn is not installed.
     """
     isotonic = other_package("sklearn.isotonic", _NEEDS, _INSTALL).IsotonicRegression
-    weights = np.where(same, 0.5 / same.sum(), 0.5 / (~same).sum())
+    genuine = int(same.sum())
+    weights = np.where(same, 0.5 / genuine, 0.5 / (len(same) - genuine))
     rule = isotonic(y_min=0.0, y_max=1.0).fit(score, same.astype(np.float64), sample_weight=weights)
     p = cast(FloatArray, rule.predict(score))
     p = np.clip(p, 0.0, 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.identify import Identification, Identified
@@ -12,7 +14,7 @@ from shapespace.statistics.identity.told import (
     in_percent,
     interval,
     none_missed,
-    role_of,
+    scans_told,
     seen,
     settings,
     who_was_tested,
@@ -25,11 +27,11 @@ def answer(found: Identification) -> Answer:
     strangers = int((~first.searches.enrolled).sum())
     summary = seen(
         [
-            f"By {called(first.name)} the right person is the first of {found.enrolled} in {in_percent(first.rank_1)} of "
-            f"{found.probes - strangers} searches.",
+            f"By {called(first.name)} the right person is the first of {found.enrolled} in "
+            f"{in_percent(first.rank_1)} of {found.probes - strangers} searches.",
             *(
-                f"Where {100 * rate:g} % of searches for strangers may find somebody, {in_percent(one)} of those enrolled "
-                "are missed."
+                f"Where {100 * rate:g} % of searches for strangers may find somebody, "
+                f"{in_percent(one)} of those enrolled are missed."
                 for rate, one in first.fnir.items()
                 if one.value is not None
             ),
@@ -45,15 +47,15 @@ def answer(found: Identification) -> Answer:
         [
             *trial.notes,
             none_missed((first.rank_1.value or 0.0) < 1, int(trial.tested.sum())),
-            f"There are too few searches for a false positive identification rate of {', '.join(f'{r:g}' for r in lost)}."
+            "There are too few searches for a false positive identification rate of "
+            f"{', '.join(f'{rate:g}' for rate in lost)}."
             if lost
             else "",
-            "" if strangers else "Nobody is a stranger, so each probe is searched for once more without its own person.",
+            ""
+            if strangers
+            else "Nobody is a stranger, so each probe is searched for once more without its own person.",
         ]
     )
-    rows = [
-        (name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)
-    ]
     told = ("score", "figure", "value", "low", "high")
     return Answer(
         question="recognise identify",
@@ -62,7 +64,7 @@ def answer(found: Identification) -> Answer:
         parts=_parts(found),
         tables={
             "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
-            "scans.csv": (("scan", "subject", "role"), rows),
+            "scans.csv": scans_told(trial),
         },
         arrays={
             "searches.npz": {
@@ -77,8 +79,8 @@ def answer(found: Identification) -> Answer:
     )
 
 
-def _rows(one: Identified) -> list[list[object]]:
-    rows: list[list[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
+def _rows(one: Identified) -> list[Sequence[object]]:
+    rows: list[Sequence[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
     rows += [[one.name, f"within {k}", share, *ends] for k, (share, *ends) in enumerate(
         zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)]  # fmt: skip
     rows += [[one.name, f"fnir at fpir {rate:g}", *cells(told)] for rate, told in one.fnir.items()]
@@ -122,8 +124,8 @@ def _parts(found: Identification) -> tuple[Part, ...]:
                 who_was_tested(found.trial, found.trained_on),
                 f"{found.enrolled} people are enrolled"
                 + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
-                + " A person's score is that of the scan of them that is most like the probe; ties count against the right"
-                " one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
+                + " A person's score is that of the scan of them that is most like the probe; ties count against the"
+                " right one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
             ),
         ),
     )  # fmt: skip

@@ -1,9 +1,9 @@
 """The likelihood ratio of two scans being of one person, by normal within- and between-person covariance.
 
 A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows and the error of its fit. W differs from
-scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers, "The speaker
-partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006. Uncertainty that is
-stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
+scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers,
+"The speaker partitioning problem", Odyssey 2010; Ioffe, "Probabilistic linear discriminant analysis", ECCV 2006.
+Uncertainty that is stated of each sample: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class TwoCovariance:
         values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
         stated = training.variance.mean(axis=0) @ basis**2
         noise = np.minimum(stated, _MOST_NOISE)
-        scale = np.divide(noise, stated, out=np.ones(k), where=stated > 0)
+        scale = np.divide(noise, stated, out=np.ones_like(noise), where=stated > 0)
         arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
         return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
 
@@ -110,6 +110,6 @@ class TwoCovariance:
 
 def _less(whole: FloatArray, part: FloatArray, least: float) -> FloatArray:
     """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
-    shares, vectors = cast(tuple[FloatArray, FloatArray], eigh(part, whole))
+    shares, vectors = eigh(part, whole)
     back = np.linalg.inv(vectors)
     return (back.T * np.maximum(1.0 - shares, least)) @ back

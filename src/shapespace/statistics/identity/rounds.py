@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -90,10 +91,10 @@ class Trial:
     all_pairs: bool
     notes: tuple[str, ...]
 
-    @property
+    @cached_property
     def subjects(self) -> tuple[str, ...]:
         """(N,) whom each scan shows."""
-        return tuple(self.people[k] for k in self.person.tolist())
+        return tuple(self.people[int(k)] for k in self.person)
 
     @property
     def tested(self) -> BoolArray:
@@ -151,11 +152,13 @@ def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -
     used = [options.subject, *([role] if role else []), *([options.by] if options.by else [])]
     cohort = cohort.complete(used, drop_missing=options.drop_missing)
     table, notes = cohort.table, list(cohort.notes)
-    people, person = np.unique(np.asarray(table.texts(options.subject)), return_inverse=True)
-    person = person.astype(np.int32)
+    subjects = table.texts(options.subject)
+    people = sorted(set(subjects))
+    place = {name: k for k, name in enumerate(people)}
+    person = np.array([place[name] for name in subjects], dtype=np.int32)
     gallery, probes, training = _roles(table, role, options)
     tested = sorted({*gallery, *probes})
-    both = sorted({people[person[row]] for row in tested} & {people[person[row]] for row in training})
+    both = sorted({subjects[row] for row in tested} & {subjects[row] for row in training})
     if both:
         raise InputError(
             f"{table.where}: {named(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put all "
@@ -170,7 +173,7 @@ def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -
     if all_pairs:
         gallery = probes
     group, rounds = _rounds(person, len(people), gallery, probes, training, options)
-    trial = Trial(cohort, tuple(people.tolist()), person, rounds, group, all_pairs, tuple(notes))
+    trial = Trial(cohort, tuple(people), person, rounds, group, all_pairs, tuple(notes))
     _refuse_too_few(trial, table)
     return trial
 
@@ -210,7 +213,7 @@ def _roles(table: Table, role: str | None, options: IdentityOptions) -> tuple[li
     if options.probe and not gallery:
         raise InputError("Probes need a gallery; name it with --gallery.")
     taken = {*training, *gallery}
-    probes = [row for row in (rows_of(table, options.probe) if options.probe else range(len(table)))]
+    probes = rows_of(table, options.probe) if options.probe else range(len(table))
     return gallery, [row for row in probes if row not in taken], training
 
 

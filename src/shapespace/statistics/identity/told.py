@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.schemas import Series
+from shapespace.statistics.answer import Rows
 from shapespace.statistics.identity.rates import Figure
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial
 from shapespace.types import FloatArray
@@ -78,14 +79,16 @@ def hashes(trial: Trial) -> tuple[str, ...]:
     return () if trial.cohort.fitted is None else (trial.cohort.fitted.model.content_hash,)
 
 
-def role_of(trial: Trial, row: int) -> str:
-    """Return what a scan was in the round in which its person was tested; empty where it was learned from alone."""
+def scans_told(trial: Trial) -> Rows:
+    """Return each scan with its subject, and what it was in the round in which its person was tested."""
+    role = dict.fromkeys(range(len(trial.cohort)), "train")
     for one in trial.rounds:
-        if row in one.gallery:
-            return "both" if trial.all_pairs else "gallery"
-        if row in one.probes:
-            return "probe"
-    return ""
+        role |= dict.fromkeys(one.gallery, "both" if trial.all_pairs else "gallery")
+        if not trial.all_pairs:
+            role |= dict.fromkeys(one.probes, "probe")
+    used = {row for one in trial.rounds for row in (*one.training, *one.gallery, *one.probes)}
+    told = zip(trial.cohort.names, trial.subjects, role.items(), strict=True)
+    return ("scan", "subject", "role"), [(name, who, what if row in used else "") for name, who, (row, what) in told]
 
 
 def none_missed(errors: bool, people: int) -> str:
@@ -93,8 +96,8 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may be "
-        "ones with whom errors happen (95 %, rule of three)."
+        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may "
+        "be ones with whom errors happen (95 %, rule of three)."
     )
 
 

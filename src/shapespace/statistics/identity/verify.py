@@ -141,9 +141,7 @@ def verify(
     return Verification(found, pairs, trial.people, learned, trial, options)
 
 
-def _pairs_and_scores(
-    trial: Trial, options: IdentityOptions, modes: int | None
-) -> tuple[Pairs, dict[str, FloatArray]]:
+def _pairs_and_scores(trial: Trial, options: IdentityOptions, modes: int | None) -> tuple[Pairs, dict[str, FloatArray]]:
     parts: list[Pairs] = []
     scores: dict[str, list[FloatArray]] = {name: [] for name in options.scores}
     for round_, found in scores_of(trial, options, modes):
@@ -151,9 +149,7 @@ def _pairs_and_scores(
         parts.append(pairs)
         for name, matrix in found.items():
             scores[name].append(matrix[at[:, 0], at[:, 1]])
-    one, other, rows = (
-        np.concatenate([getattr(part, field) for part in parts]) for field in ("one", "other", "rows")
-    )
+    one, other, rows = (np.concatenate([getattr(part, field) for part in parts]) for field in ("one", "other", "rows"))
     return Pairs(one, other, rows), {name: np.concatenate(told) for name, told in scores.items()}
 
 
@@ -227,7 +223,6 @@ def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float
 
 def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:
     """Return (M,) which pairs have a value: their probe, or one of both where there is no gallery."""
-    has = np.array([one == value for one in values])[pairs.rows]
-    return has.any(axis=1) if all_pairs else has[:, 1]
-
-
+    has: BoolArray = np.array([one == value for one in values], dtype=np.bool_)
+    probe = has[pairs.rows[:, 1]]
+    return probe | has[pairs.rows[:, 0]] if all_pairs else probe

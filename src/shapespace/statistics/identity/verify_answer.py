@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
@@ -13,7 +15,7 @@ from shapespace.statistics.identity.told import (
     in_percent,
     interval,
     none_missed,
-    role_of,
+    scans_told,
     seen,
     settings,
     thinned,
@@ -35,8 +37,8 @@ def answer(found: Verification) -> Answer:
     tested = int(trial.tested.sum())
     summary = seen(
         [
-            f"By {called(first.name)} the equal error rate is {in_percent(first.eer)}, over {genuine} pairs of one person "
-            f"and {impostor} pairs of two.",
+            f"By {called(first.name)} the equal error rate is {in_percent(first.eer)}, over {genuine} pairs of one "
+            f"person and {impostor} pairs of two.",
             *(
                 f"At a false accept rate of {100 * far:g} % it accepts {in_percent(one)} of the pairs of one person."
                 for far, one in first.tar.items()
@@ -52,12 +54,13 @@ def answer(found: Verification) -> Answer:
         [
             *trial.notes,
             none_missed((first.eer.value or 0.0) > 0, tested),
-            f"{impostor} pairs of two people make {', '.join(f'{impostor * far:.1f}' for far in thin)} false accepts at a "
-            f"rate of {', '.join(f'{far:g}' for far in thin)}, and 30 are wanted for a rate to be trusted; below one "
+            f"{impostor} pairs of two make {', '.join(f'{impostor * far:.1f}' for far in thin)} false accepts at "
+            f"a rate of {', '.join(f'{far:g}' for far in thin)}, and 30 are wanted for a rate to be trusted; below one "
             "nothing is stated."
             if thin
             else "",
-            "There are too few people to calibrate scores on others than those tested, so there are no likelihood ratios."
+            "There are too few people to calibrate scores on others than those tested, so there are no likelihood "
+            "ratios."
             if first.llr is None
             else "",
         ]
@@ -69,9 +72,6 @@ def answer(found: Verification) -> Answer:
         **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
     }
     told = ("score", "figure", "value", "low", "high")
-    scans = [
-        (name, trial.subjects[row], role_of(trial, row)) for row, name in enumerate(trial.cohort.names)
-    ]
     return Answer(
         question="recognise verify",
         title="Who is it? Verification",
@@ -79,7 +79,7 @@ def answer(found: Verification) -> Answer:
         parts=_parts(found),
         tables={
             "figures.csv": (told, [row for one in found.scores for row in _rows(one)]),
-            "scans.csv": (("scan", "subject", "role"), scans),
+            "scans.csv": scans_told(trial),
         },
         arrays={"pairs.npz": arrays},
         notes=notes,
@@ -92,13 +92,13 @@ def _cost(one: Verified) -> str:
     if one.cllr.value is None:
         return ""
     return (
-        f"Its calibrated likelihood ratios miss {one.cllr.value:.3f} bits of 1 (Cllr), of which {one.cllr_min:.3f} would "
-        "be missed by the best calibration."
+        f"Its calibrated likelihood ratios miss {one.cllr.value:.3f} bits of 1 (Cllr), of which {one.cllr_min:.3f} "
+        "would be missed by the best calibration."
     )
 
 
-def _rows(one: Verified) -> list[list[object]]:
-    rows: list[list[object]] = [[one.name, "eer", *cells(one.eer)]]
+def _rows(one: Verified) -> list[Sequence[object]]:
+    rows: list[Sequence[object]] = [[one.name, "eer", *cells(one.eer)]]
     rows += [[one.name, f"tar at far {far:g}", *cells(told)] for far, told in one.tar.items()]
     rows += [[one.name, "cllr", *cells(one.cllr)], [one.name, "cllr_min", one.cllr_min, "", ""]]
     rows += [[one.name, f"eer with {modes} modes", eer, "", ""] for modes, eer in one.curve.items()]
@@ -132,9 +132,9 @@ def _parts(found: Verification) -> tuple[Part, ...]:
             title="How it was measured",
             text=(
                 who_was_tested(found.trial, found.trained_on),
-                "Intervals hold 95 % of what is found when people are drawn anew with replacement. Likelihood ratios are "
-                "calibrated by a logistic regression on pairs of people of other groups. Whether the shape model was "
-                "built from people who are tested here cannot be seen from its file; it must not have been.",
+                "Intervals hold 95 % of what is found when people are drawn anew with replacement. Likelihood ratios "
+                "are calibrated by a logistic regression on pairs of people of other groups. Whether the shape model "
+                "was built from people tested here cannot be seen from its file; it must not have been.",
             ),
         )
     )
@@ -185,7 +185,7 @@ def _roc(found: Verification) -> CurvePart:
     least = max(1.0 / int((~found.pairs.same).sum()), _LEAST_RATE)
     series: list[Series] = []
     for one in found.scores:
-        shown = np.unique(np.concatenate([[least], GRID[GRID >= least]]))
+        shown = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
         at = np.searchsorted(GRID, shown)
         band = [tuple(side[np.minimum(at, len(GRID) - 1)].tolist()) for side in one.band]
         known = bool(np.isfinite(one.band).all())
@@ -198,7 +198,9 @@ def _roc(found: Verification) -> CurvePart:
                 high=band[1] if known else None,
             )
         )
-    return CurvePart(title="ROC curve", series=tuple(series), x="false accept rate", y="true accept rate", x_scale="log")
+    return CurvePart(
+        title="ROC curve", series=tuple(series), x="false accept rate", y="true accept rate", x_scale="log"
+    )
 
 
 def _by(found: Verification) -> TablePart:
