@@ -189,8 +189,8 @@ def percent(told: Sequence[float | None]) -> str:
 
 def quick_study(folder: Path) -> Path:
     """Make a small study and return its folder."""
-    people = StudyPeople(people=12, expressions=("smile", "surprise", "anger"), levels=(0.5, 1.0), triangles=4_000)
-    config = StudyConfig(people, folds=3, taught_levels=2, strangers=0)
+    people = StudyPeople(people=8, expressions=("smile", "surprise"), levels=(1.0,), triangles=4_000)
+    config = StudyConfig(people, folds=2, taught_levels=1, strangers=0)
     prepare_folder(folder, config)
     run_fits(folder, config, workers=1, on_progress=told)
     return folder
@@ -219,8 +219,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[2007], help="of studies to make")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--draws", type=int, default=1000, help="of people, for intervals")
+    parser.add_argument("--doubtful", action="store_true", help="take doubtful fits too")
     parser.add_argument("--json", type=Path, help="where all figures are written")
-    parser.add_argument("--quick", action="store_true", help="twelve people and a coarser scan, two minutes")
+    parser.add_argument("--quick", action="store_true", help="eight people and coarser scans, two minutes")
     chosen = parser.parse_args()
     if chosen.quick:
         studies = [quick_study(chosen.work / "quick")]
@@ -239,7 +240,7 @@ def main() -> int:
                     fit_harder(study, other, config, [condition], workers=chosen.jobs)
                 if not people_there(other, config, condition):
                     continue
-            folds, own = folds_of(study, other, condition, number, doubtful=False)
+            folds, own = folds_of(study, other, condition, number, doubtful=chosen.doubtful)
             used += folds
             counts = {name: counts[name] + own[name] for name in counts}
         if used:

@@ -97,13 +97,13 @@ def all_pairs(count, scans):
     return Pairs(who[rows[:, 0]], who[rows[:, 1]], rows)
 
 
-def test_a_person_drawn_twice_counts_as_two_who_meet_all_others_twice():
+def test_a_person_drawn_three_times_counts_as_three_who_meet_all_others():
     pairs = all_pairs(4, 2)
-    times = np.array([2.0, 0.0, 1.0, 1.0])
+    times = np.array([3.0, 0.0, 1.0, 2.0])
     weights = pairs.weights(times)
-    # Person 0 has one pair of their own, counted twice, and four with person 2.
-    assert weights[pairs.same].sum() == 2 + 0 + 1 + 1
-    assert weights[~pairs.same].sum() == 4 * (2 * 1 + 2 * 1 + 1 * 1)
+    # Each has one pair of their own, and four with each other person.
+    assert weights[pairs.same].sum() == 3 + 0 + 1 + 2
+    assert weights[~pairs.same].sum() == 4 * (3 * 1 + 3 * 2 + 1 * 2)
 
 
 def test_an_interval_over_people_covers_the_truth():
