@@ -9,17 +9,19 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.table import Table
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.mirror import find_mirror, mirror_pairs
 from shapespace.geometry.surface import vertex_normals
+from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
-from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, first_pattern, measure_asymmetry
+from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry
 from shapespace.statistics.asymmetry_answer import asymmetry_answer
 from shapespace.statistics.sides import find_sides, given_sides, read_pairs
-from shapespace.types import Mesh
+from shapespace.types import Mesh, read_only
 from symmetric_object import FLIP, Symmetric, cohort_of, posed, symmetric_object
 
 
@@ -127,6 +129,24 @@ def test_scores_come_back_and_their_intervals_hold_them(thing: Symmetric) -> Non
         assert abs(((scores.mm - truth) / truth)[mm == level].mean()) < 0.05
     assert ((scores.raw_mm - truth) / truth)[mm == 1.0].mean() > 0.1
     assert 0.90 <= ((scores.low <= truth) & (truth <= scores.high)).mean() <= 0.98
+
+
+def test_what_fits_know_of_themselves_makes_intervals_that_hold_the_truth(thing: Symmetric) -> None:
+    rng = np.random.default_rng(8)
+    shapes = thing.x + 2.0 * thing.smooth(rng, 12)
+    model = ShapeModel.fit([Mesh(x, thing.faces) for x in (*shapes, *thing.image(shapes))])
+    b = rng.standard_normal((150, model.n_modes)) * model.stddev
+    stddev = np.full_like(b, 0.1 * float(np.linalg.norm(model.stddev)) / np.sqrt(model.n_modes))
+
+    def measured(b: np.ndarray) -> Scores:
+        names = [f"fit {k}" for k in range(len(b))]
+        fitted = Fitted(model, read_only(b), read_only(stddev), ("converged",) * len(b), "fits")
+        cohort = Cohort.of_fits(fitted, names, Table({}, tuple(names)), read_only(np.full(len(b), np.nan)))
+        return measure_asymmetry(cohort, permutations=0).scores
+
+    truth, told = measured(b).mm, measured(b + stddev * rng.standard_normal(b.shape))
+    assert 0.90 <= ((told.low <= truth) & (truth <= told.high)).mean() <= 0.98
+    assert np.isnan(told.error_mm) and np.array_equal(told.mm, told.raw_mm)
 
 
 def test_directional_asymmetry_is_found_where_it_was_put_and_on_its_side(thing: Symmetric) -> None:
