@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
     from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
-    from shapespace.statistics.change import change
-    from shapespace.statistics.change_found import Change, ChangeSettings
+    from shapespace.statistics.change import Change, change
+    from shapespace.statistics.change_found import ChangeSettings
     from shapespace.statistics.identity.identify import identify
     from shapespace.statistics.identity.rounds import IdentityOptions
     from shapespace.statistics.identity.verify import verify

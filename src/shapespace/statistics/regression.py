@@ -395,7 +395,7 @@ def _dealt(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> IndexA
     for count in np.unique(counts):
         alike = np.flatnonzero(counts == count)
         for to, source in zip(alike, rng.permutation(alike), strict=True):
-            given = rows[source]
+            given = rows[int(source)]
             order[rows[to]] = rng.permutation(given) if np.ptp(y[given]) else given
     return order
 
