@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.statistics.score import ScoreOptions, Scores, score
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -42,6 +43,8 @@ __all__ = [
     "QualitySettings",
     "Results",
     "Robust",
+    "ScoreOptions",
+    "Scores",
     "ShapeModel",
     "ShapeSpace",
     "ShapespaceError",
@@ -56,6 +59,7 @@ __all__ = [
     "read_landmarks",
     "read_mesh",
     "read_volume",
+    "score",
     "simulate_scan",
     "surface_distances",
     "surface_of_volume",
@@ -76,6 +80,8 @@ _HOMES = {
     "QualitySettings": "model.quality",
     "Results": "store.results",
     "Robust": "fit.robust_method",
+    "ScoreOptions": "statistics.score",
+    "Scores": "statistics.score",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
@@ -89,6 +95,7 @@ _HOMES = {
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
     "read_volume": "io.volumes",
+    "score": "statistics.score",
     "simulate_scan": "datasets.simulated_scan",
     "surface_distances": "geometry.distance",
     "surface_of_volume": "geometry.volume_surface",
