@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from shapespace.statistics.identity.verify import verify
     from shapespace.statistics.predictor import Predictor
     from shapespace.statistics.regression import Regression, regress
+    from shapespace.statistics.score import ScoreOptions, Scores, score
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
@@ -56,6 +57,8 @@ __all__ = [
     "Regression",
     "Results",
     "Robust",
+    "ScoreOptions",
+    "Scores",
     "ShapeModel",
     "ShapeSpace",
     "ShapespaceError",
@@ -74,6 +77,7 @@ __all__ = [
     "read_mesh",
     "read_volume",
     "regress",
+    "score",
     "simulate_scan",
     "surface_distances",
     "surface_of_volume",
@@ -101,6 +105,8 @@ _HOMES = {
     "Regression": "statistics.regression",
     "Results": "store.results",
     "Robust": "fit.robust_method",
+    "ScoreOptions": "statistics.score",
+    "Scores": "statistics.score",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
@@ -118,6 +124,7 @@ _HOMES = {
     "read_mesh": "io.meshes",
     "read_volume": "io.volumes",
     "regress": "statistics.regression",
+    "score": "statistics.score",
     "simulate_scan": "datasets.simulated_scan",
     "surface_distances": "geometry.distance",
     "surface_of_volume": "geometry.volume_surface",
