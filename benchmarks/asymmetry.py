@@ -179,7 +179,7 @@ def fits(kind: Kind, subjects: int, people: int, seed: int) -> list[tuple[str, s
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, few subjects: about a minute")
+    parser.add_argument("--quick", action="store_true", help="one seed, few subjects: half a minute")
     parser.add_argument("--seeds", default="1,2")
     arguments = parser.parse_args()
     seeds = [1] if arguments.quick else [int(seed) for seed in arguments.seeds.split(",")]
