@@ -119,7 +119,7 @@ def effect_maps(
         for name, lens in lenses.items():
             rows, unit = lens(part)
             width = rows.shape[1] // (part.stop - part.start)
-            seen[name][:, part] = (changes @ rows).reshape(E, -1, width) / unit[:, None]
+            seen[name][:, part] = (changes @ rows).reshape(E, -1, width) / np.reshape(unit, (-1, 1))
             squares = ((residual @ rows) ** 2).sum(axis=0).reshape(-1, width).sum(axis=1)
             for start in range(0, P, chunk):
                 drawn = (flat[start * m : (start + chunk) * m] @ rows).reshape(-1, m, len(squares), width)
@@ -156,14 +156,13 @@ def effect_maps(
     return made
 
 
-_Lens = Callable[[slice], tuple[FloatArray, FloatArray]]
-"""Returns what vertices see of coefficients: (K, m c) columns, and what (m,) of it is 1 mm."""
+_Lens = Callable[[slice], tuple[FloatArray, FloatArray | float]]
+"""Returns what m vertices see of coefficients: (K, m c) columns, and what of it is 1 mm."""
 
 
 def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -> dict[str, _Lens]:
-    def any_way(part: slice) -> tuple[FloatArray, FloatArray]:
-        rows: FloatArray = cohort.basis[:, 3 * part.start : 3 * part.stop]
-        return rows, np.ones(rows.shape[1] // 3)
+    def any_way(part: slice) -> tuple[FloatArray, FloatArray | float]:
+        return cohort.basis[:, 3 * part.start : 3 * part.stop], 1.0
 
     lenses: dict[str, _Lens] = {"any_way": any_way}
     if cohort.faces is None:
@@ -171,10 +170,10 @@ def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -
     mean = cohort.vertices(cohort.coefficients.mean(axis=0))
     normals = vertex_normals(Mesh(mean, cohort.faces))
 
-    def along(part: slice) -> tuple[FloatArray, FloatArray]:
+    def along(part: slice) -> tuple[FloatArray, FloatArray | float]:
         rows = any_way(part)[0].reshape(len(cohort.basis), -1, 3)
         seen: FloatArray = np.einsum("kvc,vc->kv", rows, normals[part])
-        return seen, np.ones(seen.shape[1])
+        return seen, 1.0
 
     lenses["along"] = along
     if bump_width_mm is not None:

@@ -65,7 +65,7 @@ class Stratum:
     @cached_property
     def log_arrangements(self) -> float:
         """Logarithm of how many arrangements there are that differ; rows with the same covariates do not."""
-        matrix: FloatArray = np.round(self.matrix / np.abs(self.matrix).max(axis=0), 9)
+        matrix = np.asarray(np.round(self.matrix / np.abs(self.matrix).max(axis=0), 9), dtype=np.float64)
         rows = np.column_stack([self.groups.astype(np.float64), matrix])
         alike = np.unique(rows, axis=0, return_counts=True)[1]
         every = np.bincount(self.groups)
