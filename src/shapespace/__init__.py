@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
+    from shapespace.cohort.cohort import Cohort
+    from shapespace.cohort.read import CohortOptions, read_cohort
     from shapespace.correspondence.rounds import CorrespondSettings, correspond
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
@@ -44,6 +46,8 @@ __all__ = [
     "Asymmetry",
     "Change",
     "ChangeSettings",
+    "Cohort",
+    "CohortOptions",
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
@@ -73,6 +77,7 @@ __all__ = [
     "load_faces",
     "measure_asymmetry",
     "measure_quality",
+    "read_cohort",
     "read_landmarks",
     "read_mesh",
     "read_volume",
@@ -92,6 +97,8 @@ _HOMES = {
     "CLASSIFIERS": "recognise.classifiers",
     "Change": "statistics.change",
     "ChangeSettings": "statistics.change_found",
+    "Cohort": "cohort.cohort",
+    "CohortOptions": "cohort.read",
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
@@ -120,6 +127,7 @@ _HOMES = {
     "load_faces": "datasets.faces",
     "measure_asymmetry": "statistics.asymmetry",
     "measure_quality": "model.quality",
+    "read_cohort": "cohort.read",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",
     "read_volume": "io.volumes",
