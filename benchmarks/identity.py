@@ -221,7 +221,7 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=1000, help="of people, for intervals")
     parser.add_argument("--doubtful", action="store_true", help="take doubtful fits too")
     parser.add_argument("--json", type=Path, help="where all figures are written")
-    parser.add_argument("--quick", action="store_true", help="eight people and coarser scans, two minutes")
+    parser.add_argument("--quick", action="store_true", help="eight people, coarser scans, two minutes")
     chosen = parser.parse_args()
     if chosen.quick:
         studies = [quick_study(chosen.work / "quick")]
@@ -240,7 +240,7 @@ def main() -> int:
                     fit_harder(study, other, config, [condition], workers=chosen.jobs)
                 if not people_there(other, config, condition):
                     continue
-            folds, own = folds_of(study, other, condition, number, doubtful=chosen.doubtful)
+            folds, own = folds_of(study, other, condition, number, doubtful=chosen.doubtful or chosen.quick)
             used += folds
             counts = {name: counts[name] + own[name] for name in counts}
         if used:

@@ -27,6 +27,7 @@ NAVIGATION = {
         "docs/tutorial-volumes",
         "docs/correspondence",
         "docs/tutorial-recognition",
+        "docs/tutorial-identity",
         "docs/scale",
     ],
     "How to": [
@@ -47,6 +48,7 @@ NAVIGATION = {
         "docs/dense",
         "docs/bspline",
         "docs/recognise",
+        "docs/identity",
         "docs/other-tools",
         "docs/benchmarks",
         "docs/paper-map",
