@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.statistics.compare import CompareOptions, Comparison, compare
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity
 
 __all__ = [
     "CLASSIFIERS",
     "AdditiveModel",
+    "CompareOptions",
+    "Comparison",
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
@@ -49,6 +52,7 @@ __all__ = [
     "VolumeSurface",
     "__version__",
     "as_mesh",
+    "compare",
     "correspond",
     "fit_scan",
     "load_faces",
@@ -66,6 +70,8 @@ __all__ = [
 _HOMES = {
     "AdditiveModel": "model.additive",
     "CLASSIFIERS": "recognise.classifiers",
+    "CompareOptions": "statistics.compare",
+    "Comparison": "statistics.compare",
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
@@ -81,6 +87,7 @@ _HOMES = {
     "ShapespaceError": "errors",
     "Similarity": "types",
     "as_mesh": "io.beside",
+    "compare": "statistics.compare",
     "correspond": "correspondence.rounds",
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",
