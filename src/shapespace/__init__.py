@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
     from shapespace.statistics.change import Change, change
     from shapespace.statistics.change_found import ChangeSettings
+    from shapespace.statistics.compare import CompareOptions, Comparison, compare
     from shapespace.statistics.identity.identify import identify
     from shapespace.statistics.identity.rounds import IdentityOptions
     from shapespace.statistics.identity.verify import verify
@@ -48,6 +49,8 @@ __all__ = [
     "ChangeSettings",
     "Cohort",
     "CohortOptions",
+    "CompareOptions",
+    "Comparison",
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
@@ -71,6 +74,7 @@ __all__ = [
     "__version__",
     "as_mesh",
     "change",
+    "compare",
     "correspond",
     "fit_scan",
     "identify",
@@ -99,6 +103,8 @@ _HOMES = {
     "ChangeSettings": "statistics.change_found",
     "Cohort": "cohort.cohort",
     "CohortOptions": "cohort.read",
+    "CompareOptions": "statistics.compare",
+    "Comparison": "statistics.compare",
     "CorrespondSettings": "correspondence.rounds",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
@@ -120,6 +126,7 @@ _HOMES = {
     "Similarity": "types",
     "as_mesh": "io.beside",
     "change": "statistics.change",
+    "compare": "statistics.compare",
     "correspond": "correspondence.rounds",
     "VolumeSurface": "geometry.volume_surface",
     "fit_scan": "fit.fit",

@@ -515,6 +515,12 @@ def test_missing_rows_are_left_out_when_asked_and_said() -> None:
     assert any("2 of 37" in note for note in answer_of(found).notes)
 
 
+def test_sizes_that_are_not_known_are_asked_for() -> None:
+    shapes, _ = fits_with_a_bump(0.0)
+    with pytest.raises(InputError, match="60 of 60 shapes is not known in mm.*--unit"):
+        compare(shapes, "~ log_size", QUICK)
+
+
 def test_blocks_that_cannot_be_are_refused() -> None:
     table = people() | {"who": ["anna"] * 37, "pair": [f"p{k // 19}" for k in range(37)]}
     of = {name: CompareOptions(blocks=name, permutations=20, maps=False) for name in ("who", "pair", "nobody")}

@@ -226,8 +226,15 @@ def compare(
         ShapespaceError: the extra `statistics` is not installed.
     """
     options = options or CompareOptions()
+    own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)
     named = columns_of(formula, cohort.table)
+    unknown = int(np.isnan(cohort.sizes_mm).sum())
+    if unknown and not options.drop_missing and {"size", "log_size"} & set(named) - set(own):
+        raise InputError(
+            f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
+            "out with --drop-missing."
+        )
     cohort = cohort.complete([*named, *([options.blocks] if options.blocks else ())], drop_missing=options.drop_missing)
     design = design_of(formula, cohort.table)
     subjects = None if options.blocks is None else cohort.table.texts(options.blocks)
