@@ -15,6 +15,8 @@ from shapespace.errors import ShapespaceError
 
 LATE: Mapping[str, str] = MappingProxyType(
     {
+        "answer_of_identification": "statistics.identity.identify_answer",
+        "answer_of_verification": "statistics.identity.verify_answer",
         "html_of_fit": "report.notebook",
         "html_of_model": "report.notebook",
         "html_of_quality": "report.notebook",

@@ -9,6 +9,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
+from shapespace.late import late
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.rates import Figure, figure, people_drawn
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
@@ -113,9 +114,7 @@ class Identification:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        from shapespace.statistics.identity.identify_answer import answer
-
-        return answer(self)
+        return late("answer_of_identification")(self)
 
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:

@@ -21,7 +21,7 @@ from shapespace.statistics.identity.told import (
 )
 
 
-def answer(found: Identification) -> Answer:
+def answer_of_identification(found: Identification) -> Answer:
     """Return what `shapespace recognise identify` writes."""
     trial, first = found.trial, found.scores[0]
     strangers = int((~first.searches.enrolled).sum())

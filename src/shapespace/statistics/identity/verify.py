@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.late import late
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
@@ -96,9 +97,7 @@ class Verification:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        from shapespace.statistics.identity.verify_answer import answer
-
-        return answer(self)
+        return late("answer_of_verification")(self)
 
 
 def verify(

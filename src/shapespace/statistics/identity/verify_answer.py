@@ -28,7 +28,7 @@ _BINS = 40
 _ERRORS = 30
 
 
-def answer(found: Verification) -> Answer:
+def answer_of_verification(found: Verification) -> Answer:
     """Return what `shapespace recognise verify` writes."""
     trial, first = found.trial, found.scores[0]
     pairs = found.pairs
