@@ -75,11 +75,12 @@ def _how(scores: Scores) -> tuple[str, ...]:
         if math.isfinite(scores.z_limit)
         else "With fewer than 19 people in the reference, how far out single vertices lie by chance is not known."
     )
+    unsure = "" if scores.subjects.fitted is None else " and each fit's own uncertainty"
     return (
         f"Distances are Mahalanobis distances in the {scores.modes} modes of the reference that hold "
-        f"{100 * scores.variance_share:.0f} % of its variance, by its covariance and each fit's own uncertainty.",
-        "Percentiles are found by leaving out the reference's people in turn, as uncertain as the subject, and hold "
-        "whatever the distribution; p is by the F distribution of normal shapes.",
+        f"{100 * scores.variance_share:.0f} % of its variance, by its covariance{unsure}.",
+        "Percentiles are found by leaving out the reference's people in turn, and hold whatever the distribution; p is "
+        "by the F distribution of normal shapes, which is too large where the reference is small.",
         limit,
     )
 
@@ -153,8 +154,8 @@ def _of_maps(scores: Scores, shown: list[int]) -> str:
     rest = len(shown) - _MOST_MAPS
     more = f" Maps of {rest} more are in {_FILE}." if rest > 0 else ""
     return (
-        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference "
-        f"and the fit's own uncertainty.{more}"
+        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
+        f"{'' if scores.subjects.fitted is None else ' and what the fit is unsure of'}.{more}"
     )
 
 
