@@ -517,7 +517,7 @@ def test_missing_rows_are_left_out_when_asked_and_said() -> None:
 
 def test_sizes_that_are_not_known_are_asked_for() -> None:
     shapes, _ = fits_with_a_bump(0.0)
-    with pytest.raises(InputError, match="60 of 60 shapes is not known in mm.*--unit"):
+    with pytest.raises(InputError, match=r"60 of 60 shapes is not known in mm.*--unit"):
         compare(shapes, "~ log_size", QUICK)
 
 
