@@ -290,7 +290,7 @@ def main() -> None:
         for missing in MISSING:
             pool = make_pool(asked.pool, missing, 50 if asked.quick else POOL)
             for surfaces in ("coefficients", "dense"):
-                told = power(pool, surfaces, 3 if asked.quick else 50, 100 if asked.quick else 200)
+                told = power(pool, surfaces, 3 if asked.quick else 40, 100)
                 print(f"  {100 * missing:.0f} % missing, {surfaces:12} {told}", flush=True)
 
 
