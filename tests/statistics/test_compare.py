@@ -542,7 +542,10 @@ def test_what_a_formula_may_call_is_called() -> None:
     for name in FUNCTIONS:
         found = compare(cohort(table), "~ " + columns.get(name, f"{name}(age)"), QUICK)
         assert len(found.tests) == 1 and found.effects, name
-    assert compare(cohort(table), "~ C(group)", QUICK).tests[0].df == 9
+    found = compare(cohort(table), "~ C(group)", QUICK)
+    assert found.tests[0].df == 9
+    assert len(found.effects) == 15
+    assert any("pairs of the first 6" in one for one in found.warnings)
 
 
 # Bumps.

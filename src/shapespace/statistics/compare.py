@@ -253,7 +253,7 @@ def compare(
         remainders=tuple(_remainder(stratum) for stratum in strata),
         effects=effects,
         angles=(*_parallel(design, strata, options), *_between(effects)),
-        warnings=(*_warnings(cohort, strata, options, subjects), *_uncentred(design, options)),
+        warnings=(*_warnings(cohort, strata, options, subjects), *_uncentred(design, options), *_left_out(design)),
         subjects=len(set(subjects)) if subjects is not None else len(cohort),
     )
 
@@ -470,6 +470,12 @@ def _warnings(
                 f"There are only {round(math.exp(stratum.log_arrangements))} arrangements"
                 f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
             )
+
+
+def _left_out(design: Design) -> Iterator[str]:
+    for one in design.variables:
+        if len(one.levels) > _MOST_LEVELS:
+            yield f"{one.name} has {len(one.levels)} classes; pairs of the first {_MOST_LEVELS} are compared."
 
 
 def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
