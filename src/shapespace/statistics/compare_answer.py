@@ -96,7 +96,7 @@ def _summary(comparison: Comparison) -> Iterator[str]:
             at = int(effect.map.bump.f.argmax())
             if effect.map.bump.p_family[at] <= level:
                 mm = effect.map.bump_mm[at]
-                yield f"{effect.label}: a bump of {mm:+.2f} mm is found{_near(comparison.cohort, at)} {held}."
+                yield f"{effect.label}: a bump of {mm:+.2f} mm or more is found{_near(comparison.cohort, at)} {held}."
             else:
                 yield f"{effect.label}: no bump is found beside how shapes vary {held}."
     yield from comparison.warnings
