@@ -15,7 +15,11 @@ from shapespace.errors import ShapespaceError
 
 LATE: Mapping[str, str] = MappingProxyType(
     {
+        "answer_of_asymmetry": "statistics.asymmetry_answer",
+        "answer_of_comparison": "statistics.compare_answer",
         "answer_of_identification": "statistics.identity.identify_answer",
+        "answer_of_regression": "statistics.regression_answer",
+        "answer_of_scores": "statistics.score_answer",
         "answer_of_verification": "statistics.identity.verify_answer",
         "html_of_fit": "report.notebook",
         "html_of_model": "report.notebook",

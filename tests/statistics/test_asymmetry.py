@@ -19,7 +19,6 @@ from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry
-from shapespace.statistics.asymmetry_answer import asymmetry_answer
 from shapespace.statistics.sides import find_sides, given_sides, read_pairs
 from shapespace.types import Mesh, read_only
 from symmetric_object import FLIP, Symmetric, cohort_of, posed, symmetric_object
@@ -248,16 +247,16 @@ def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:
     found = measure_asymmetry(named, pairs=pairs, permutations=9)
     assert len(found.sides) == 6 and found.normals is None
     assert "are left out" in found.sides.notes[0]
-    answer = asymmetry_answer(found)
+    answer = found.answer()
     points = next(p for p in answer.parts if p.title == "Points")
     assert {row[0] for row in points.rows} >= {"left", "right", "chin"}  # type: ignore[attr-defined]
 
 
 def test_the_answer_can_be_read_and_says_what_is_not_known(thing: Symmetric, tmp_path: Path) -> None:
-    once = asymmetry_answer(measure_asymmetry(people(thing, 6, 1, 3), pairs=thing.pairs, permutations=9))
+    once = measure_asymmetry(people(thing, 6, 1, 3), pairs=thing.pairs, permutations=9).answer()
     assert "No subject was measured twice" in " ".join(once.summary)
     assert any("6 subjects are few" in note for note in once.notes)
-    twice = asymmetry_answer(measure_asymmetry(people(thing, 20, 2, 3), pairs=thing.pairs, permutations=9))
+    twice = measure_asymmetry(people(thing, 20, 2, 3), pairs=thing.pairs, permutations=9).answer()
     assert "fluctuating asymmetry" in twice.summary[2] and not twice.notes
     path = twice.save(tmp_path)
     told = json.loads(path.read_text())

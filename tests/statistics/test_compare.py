@@ -15,7 +15,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import PARTS, Analysis, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
-from shapespace.statistics.compare_answer import answer_of
 from shapespace.statistics.compare_formula import FUNCTIONS
 from shapespace.types import FloatArray, IntArray, Mesh
 
@@ -172,7 +171,7 @@ def test_a_seed_gives_the_same_numbers_and_another_one_others() -> None:
     one, same, other = (
         compare(shapes, "~ sex + age", CompareOptions(permutations=100, seed=seed)) for seed in (3, 3, 4)
     )
-    assert json_text(answer_of(one).analysis().parts) == json_text(answer_of(same).analysis().parts)
+    assert json_text(one.answer().analysis().parts) == json_text(same.answer().analysis().parts)
     for a, b in zip(one.effects, same.effects, strict=True):
         assert a.map is not None and b.map is not None
         np.testing.assert_array_equal(a.map.shown.p_family, b.map.shown.p_family)
@@ -405,12 +404,12 @@ def test_points_without_triangles_are_tested_by_the_length_of_their_change() -> 
     shapes = points + np.random.default_rng(0).normal(size=(30, len(points), 3))
     found = compare(Cohort.of_shapes(shapes, table, align=False), "~ sex", CompareOptions(permutations=50))
     assert found.effects[0].map is not None and found.effects[0].map.along is None
-    assert {type(part).__struct_config__.tag for part in answer_of(found).parts} <= set(PARTS)
+    assert {type(part).__struct_config__.tag for part in found.answer().parts} <= set(PARTS)
 
 
 def test_an_answer_is_written_with_all_that_its_parts_name(tmp_path: Path) -> None:
     found = compare(cohort(people()), "~ sex * age", CompareOptions(permutations=50))
-    answer = answer_of(found)
+    answer = found.answer()
     assert answer.save(tmp_path).name == Analysis.FILE
     for part in answer.parts:
         file = getattr(part, "arrays", "")
@@ -512,7 +511,7 @@ def test_missing_rows_are_left_out_when_asked_and_said() -> None:
     table = people() | {"holes": [None, None, *people()["age"][2:]]}
     found = compare(cohort(table), "~ holes", CompareOptions(permutations=20, maps=False, drop_missing=True))
     assert len(found.cohort) == 35
-    assert any("2 of 37" in note for note in answer_of(found).notes)
+    assert any("2 of 37" in note for note in found.answer().notes)
 
 
 def test_sizes_that_are_not_known_are_asked_for() -> None:

@@ -17,7 +17,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known
 from shapespace.statistics.regression import Regression, compare_with, regress
-from shapespace.statistics.regression_answer import predicted_answer, regression_answer
+from shapespace.statistics.regression_answer import predicted_answer
 from shapespace.statistics.smoothers import Choice, Decomposed, folds_of
 from shapespace.types import Mesh, read_only
 from symmetric_object import cohort_of, posed, symmetric_object
@@ -260,7 +260,7 @@ def test_options_that_cannot_be_are_refused(options: dict[str, int]) -> None:
 
 def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regression, tmp_path: Path) -> None:
     new = drawn(4, 9)
-    answer = regression_answer(learned, (new, learned.predictor.predict(new)))
+    answer = learned.answer((new, learned.predictor.predict(new)))
     said = " ".join(answer.summary)
     assert "60 subjects are a small sample (fewer than 100)" in said and "4 new shapes are predicted" in said
     assert "Their age is known: RMSE" in said

@@ -18,7 +18,6 @@ from shapespace.io.files import write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.schemas import Analysis
 from shapespace.statistics.score import ScoreOptions, Scores, score
-from shapespace.statistics.score_answer import answer_of
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
 from synthetic_shapes import similarity, training_meshes
@@ -157,7 +156,7 @@ def test_what_the_model_left_and_what_the_modes_cannot_make_are_said_to_be_outsi
         and "more than of all of the reference" in found.outside[0][0]
     )
     assert "left 9.00 mm of the scan" in found.outside[1][0] and found.outside[2] == ("its fit is doubtful",)
-    summary = answer_of(found).summary
+    summary = found.answer().summary
     assert sum("outside what is known" in sentence for sentence in summary) == 3
 
 
@@ -196,7 +195,7 @@ def test_a_small_reference_is_said_to_be_small() -> None:
     rng = np.random.default_rng(10)
     found = score(population(8, rng), population(2, rng, name="s"))
     assert "small" in found.notes[-1] and "8 people" in found.notes[-1] and np.isnan(found.z_limit)
-    assert "a small reference" in answer_of(found).summary[0]
+    assert "a small reference" in found.answer().summary[0]
     large = score(population(30, rng), population(2, rng, name="s"))
     assert not any("small" in note for note in large.notes)
 

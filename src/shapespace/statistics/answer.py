@@ -71,12 +71,13 @@ class Answer:
             model_hashes=self.model_hashes,
         )
 
-    def save(self, folder: Path) -> Path:
+    def save(self, folder: Path | str) -> Path:
         """Write all of it to a folder, analysis.json last, and return the path of that.
 
         Raises:
             FileError: the folder cannot be written, or the disk is full.
         """
+        folder = Path(folder)
         make_folder(folder)
         for name, (header, rows) in self.tables.items():
             write_rows(folder / name, header, rows)

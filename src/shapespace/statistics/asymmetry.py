@@ -22,6 +22,8 @@ from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
+from shapespace.late import late
+from shapespace.statistics.answer import Answer
 from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import FloatArray, Mesh, read_only
 
@@ -134,6 +136,10 @@ class Asymmetry:
     def effect(self, source: str) -> Effect:
         """Return the row of the ANOVA of that name."""
         return next(effect for effect in self.anova if effect.source == source)
+
+    def answer(self) -> Answer:
+        """Return it as it is kept and reported."""
+        return late("answer_of_asymmetry")(self)
 
 
 def measure_asymmetry(

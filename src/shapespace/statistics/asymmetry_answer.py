@@ -31,7 +31,7 @@ _FILE = "asymmetry.npz"
 _FEW_REPEATS = 10
 
 
-def asymmetry_answer(found: Asymmetry) -> Answer:
+def answer_of_asymmetry(found: Asymmetry) -> Answer:
     """Return the answer to how symmetric the objects of a cohort are."""
     order = np.argsort(-found.scores.mm, kind="stable")
     arrays, pictures = _pictures(found, order)

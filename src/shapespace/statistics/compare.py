@@ -18,6 +18,8 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
+from shapespace.late import late
+from shapespace.statistics.answer import Answer
 from shapespace.statistics.compare_formula import Design, Term, Variable, columns_of, design_of
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less, strata_of
@@ -200,6 +202,10 @@ class Comparison:
         if not found:
             raise InputError(f"There is no term {term!r}; there is {', '.join(one.term for one in self.tests)}.")
         return found[0]
+
+    def answer(self) -> Answer:
+        """Return it as it is kept and reported."""
+        return late("answer_of_comparison")(self)
 
 
 def compare(

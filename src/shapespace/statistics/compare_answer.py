@@ -34,7 +34,7 @@ _PALE = "Vertices that are not found to differ are pale."
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
-def answer_of(comparison: Comparison) -> Answer:
+def answer_of_comparison(comparison: Comparison) -> Answer:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects = comparison.effects
     parts = [

@@ -12,6 +12,8 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
+from shapespace.late import late
+from shapespace.statistics.answer import Answer
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.statistics.smoothers import CHOICES, Choice, Decomposed, IndexArray, errors_of, folds_of, nested
 from shapespace.types import FloatArray, Mesh, read_only
@@ -108,6 +110,14 @@ class Regression:
             return np.linalg.norm(moved, axis=1)
         mean = self.cohort.vertices(self.cohort.coefficients.mean(axis=0))
         return np.einsum("vd,vd->v", moved, vertex_normals(Mesh(mean, self.cohort.faces)))
+
+    def answer(self, new: tuple[Cohort, Predictions] | None = None) -> Answer:
+        """Return it as it is kept and reported.
+
+        Args:
+            new: shapes of other subjects, and what the predictor says of them; None for none.
+        """
+        return late("answer_of_regression")(self, new)
 
 
 def regress(

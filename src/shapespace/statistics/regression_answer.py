@@ -21,7 +21,7 @@ _CALLED = {
 }  # fmt: skip
 
 
-def regression_answer(found: Regression, new: tuple[Cohort, Predictions] | None = None) -> Answer:
+def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | None = None) -> Answer:
     """Return the answer to what number goes with a shape, with what is predicted of new shapes."""
     parts: list[Part] = [_measures(found), _calibration(found)]
     if new is not None:

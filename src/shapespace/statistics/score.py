@@ -20,6 +20,8 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
+from shapespace.late import late
+from shapespace.statistics.answer import Answer
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
 
 FEWEST_PEOPLE, SMALL = 5, 30
@@ -130,6 +132,10 @@ class Scores:
     def beyond_2(self) -> FloatArray:
         """(M,) Share of the vertices beyond 2 standard deviations."""
         return read_only((np.abs(self.z) > 2).mean(axis=1))
+
+    def answer(self) -> Answer:
+        """Return it as it is kept and reported."""
+        return late("answer_of_scores")(self)
 
 
 def score(

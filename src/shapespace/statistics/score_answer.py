@@ -17,7 +17,7 @@ _LIMIT_SD = 4.0
 _FILE = "score.npz"
 
 
-def answer_of(scores: Scores) -> Answer:
+def answer_of_scores(scores: Scores) -> Answer:
     """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
     shown = _shown(scores)
     tables, arrays = _tables(scores), _arrays(scores, shown)

@@ -28,7 +28,6 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.batch.progress import progress
     from shapespace.errors import InputError
     from shapespace.statistics.asymmetry import SUBJECT, measure_asymmetry
-    from shapespace.statistics.asymmetry_answer import asymmetry_answer
     from shapespace.statistics.sides import read_pairs
 
     column, equals, value = (arguments.reference or "").partition("=")
@@ -55,4 +54,4 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             on_step=step,
         )
-    return finish(asymmetry_answer(found), arguments)
+    return finish(found.answer(), arguments)

@@ -30,7 +30,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
     from shapespace.batch.progress import progress
     from shapespace.statistics.compare import CompareOptions, compare
-    from shapespace.statistics.compare_answer import answer_of
 
     options = CompareOptions(
         squares=arguments.squares,
@@ -50,4 +49,4 @@ def run(arguments: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         found = compare(cohort, arguments.formula, options, on_step=step)
-    return finish(answer_of(found), arguments)
+    return finish(found.answer(), arguments)

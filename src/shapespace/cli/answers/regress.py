@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.io.files import make_folder
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import SUBJECT, regress
-    from shapespace.statistics.regression_answer import predicted_answer, regression_answer
+    from shapespace.statistics.regression_answer import predicted_answer
 
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
@@ -73,4 +73,4 @@ def run(arguments: argparse.Namespace) -> int:
         new = (fresh, found.predictor.predict(fresh))
     make_folder(arguments.output)
     found.predictor.save(arguments.output / "predictor.npz")
-    return finish(regression_answer(found, new), arguments)
+    return finish(found.answer(new), arguments)

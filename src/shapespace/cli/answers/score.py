@@ -28,7 +28,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import progress
     from shapespace.statistics.score import ScoreOptions, score
-    from shapespace.statistics.score_answer import answer_of
 
     options = ScoreOptions(
         modes=arguments.modes,
@@ -46,4 +45,4 @@ def run(arguments: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         scores = score(reference, subjects, options, on_step=step)
-    return finish(answer_of(scores), arguments)
+    return finish(scores.answer(), arguments)
