@@ -98,6 +98,13 @@ def test_every_kind_of_part_is_drawn_and_says_who_was_left_out(analysis: Path) -
     assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
 
 
+def test_no_folder_of_this_machine_gets_into_a_report(analysis: Path, undrawn: None) -> None:
+    words = words_under(
+        report(change(analysis, notes=["5 rows of /home/anna/secret/people.csv are left out."])), "Summary"
+    )
+    assert "5 rows of people.csv are left out" in words and "anna" not in words
+
+
 def test_names_that_are_scripts_stay_text(analysis: Path) -> None:
     page = report(analysis)
     assert EVIL not in page and "<script>alert" not in page and Page(page).words.count(EVIL) >= 4

@@ -38,7 +38,7 @@ from shapespace.report.study_parts import (
     StudyParts,
     paragraphs,
 )
-from shapespace.report.wording import DASH, counted, listed, moment, printable
+from shapespace.report.wording import DASH, counted, listed, moment, printable, without_folders
 from shapespace.schemas import Target, check_format, read, read_part
 from shapespace.version import __version__
 
@@ -219,7 +219,7 @@ class _Study:
         """Return what should be known of it, such as who was left out."""
         found = self._read("notes", tuple[str, ...])
         rest = [f"{len(found) - _MOST_NOTES} more, in {self.kept.file}."] if len(found) > _MOST_NOTES else []
-        return Notice("To be known", [*found[:_MOST_NOTES], *rest])
+        return Notice("To be known", [*map(without_folders, found[:_MOST_NOTES]), *rest])
 
     def sentences(self) -> list[Block]:
         """Return its sentences."""
