@@ -99,9 +99,8 @@ def test_every_kind_of_part_is_drawn_and_says_who_was_left_out(analysis: Path) -
 
 
 def test_no_folder_of_this_machine_gets_into_a_report(analysis: Path, undrawn: None) -> None:
-    words = words_under(
-        report(change(analysis, notes=["5 rows of /home/anna/secret/people.csv are left out."])), "Summary"
-    )
+    noted = change(analysis, notes=["5 rows of /home/anna/secret/people.csv are left out."])
+    words = words_under(report(noted), "Summary")
     assert "5 rows of people.csv are left out" in words and "anna" not in words
 
 
