@@ -171,7 +171,8 @@ def check_pictures(document: Path, workplace: Path) -> None:
         kept = document.parent / "images" / f"{document.stem}-{name}"
         if os.environ.get("SHAPESPACE_UPDATE_PICTURES"):
             with Image.open(made) as picture:
-                picture.convert("RGB").quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(kept, optimize=True)
+                full = picture.convert("RGB")
+                full.quantize(palette=full.quantize(256), dither=Image.Dither.FLOYDSTEINBERG).save(kept, optimize=True)
         with Image.open(made) as picture, Image.open(kept) as known:
             assert picture.size == known.size, f"{kept} is not of this run; SHAPESPACE_UPDATE_PICTURES=1 renews it"
 
