@@ -67,6 +67,9 @@ def test_identity_and_expression_come_back_apart(one: ModelFormat, model: ShapeM
     one.write(parted.as_linear(), path)
     again = AdditiveModel.load(path)
     assert again.n_identity == parted.n_identity
+    # What no mode holds is kept where it is for a model that is not parted.
+    one.write(model.as_linear(), whole := tmp_path / f"whole{path.suffix}")
+    assert again.shape.total_variance == pytest.approx(ShapeModel.load(whole).total_variance, rel=1e-4)
     # What a and e do to the vertices is the same, though each mode may come back with the other sign.
     for rows in (slice(0, 3), slice(3, None)):
         did, does = (

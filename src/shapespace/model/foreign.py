@@ -137,7 +137,13 @@ def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> 
 def parted(linear: LinearModel, rotation: FloatArray, n_identity: int) -> LinearModel:
     """Return `linear` with its modes turned into those of identity and of expression: z = rotation.T @ [a; e]."""
     moved = linear.shape.moved @ rotation.T
-    return replace(linear, shape=Modes(moved[:, :n_identity]), expression=Modes(moved[:, n_identity:]))
+    total = linear.shape.total_variance
+    return replace(
+        linear,
+        shape=Modes(moved[:, :n_identity], total_variance=total),
+        # That of both is held by the shape alone.
+        expression=Modes(moved[:, n_identity:], total_variance=None if total is None else 0.0),
+    )
 
 
 def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> LinearModel:
