@@ -191,9 +191,12 @@ LONG = (
 )
 """Documents whose examples take long."""
 MARKS: dict[str, Any] = dict.fromkeys(LONG, pytest.mark.long)
-MARKS["tutorial-recognition.md"] = [pytest.mark.long, pytest.mark.pairs]
-FEWER = {"--subjects 25": "--subjects 8", "--folds 5": "--folds 4"}
-"""With which the tutorial on recognition takes a third of its time, where it is not run as it stands."""
+FEWER: Mapping[str, Mapping[str, str]] = {
+    "tutorial-recognition.md": {"--subjects 25": "--subjects 8", "--folds 5": "--folds 4"},
+    "tutorial-identity.md": {"--subjects 12": "--subjects 6"},
+}
+"""With which a tutorial takes a third or half of its time, where it is not run as it stands."""
+MARKS |= {name: [pytest.mark.long, pytest.mark.pairs] for name in FEWER}
 BEGINNINGS = (
     "shapespace data faces -o people --subjects 12",
     "shapespace build people -o model.h5 --variance 0.95",
@@ -239,19 +242,20 @@ def test_examples_run_as_they_stand(
 
 
 @pytest.mark.long
-def test_the_tutorial_on_recognition_goes_with_fewer_people(workplace: Path) -> None:
-    document = ROOT / "docs" / "tutorial-recognition.md"
+@pytest.mark.parametrize("name", FEWER)
+def test_tutorials_of_many_scans_go_with_fewer_people(name: str, workplace: Path) -> None:
+    document, fewer = ROOT / "docs" / name, FEWER[name]
 
     def with_fewer(command: str, many: str) -> Callable[[], None]:
         def do() -> None:
             with contextlib.redirect_stdout(io.StringIO()):
-                assert cli.main(arguments(command.replace(many, FEWER[many]))) == 0
+                assert cli.main(arguments(command.replace(many, fewer[many]))) == 0
 
         return do
 
     typed = [command for block in blocks(document) for command in commands(block)]
-    instead = {command: with_fewer(command, many) for command in typed for many in FEWER if many in command}
-    assert len(instead) == len(FEWER)
+    instead = {command: with_fewer(command, many) for command in typed for many in fewer if many in command}
+    assert len(instead) == len(fewer)
     assert run(document, with_data=False, instead=instead) > 5
     check_pictures(document, workplace)
 
