@@ -130,7 +130,7 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     return grid(
         rows,
         title=title or f"What {_which(shown, model.n_modes)} to the mean",
-        scale=Scale(f"how far a point moves at {deviations:g} standard deviations (mm)", SEQUENTIAL, 0.0, top),
+        scale=Scale(f"how far a point moves at {deviations:g} standard deviation{'s' * (deviations != 1)} (mm)", SEQUENTIAL, 0.0, top),
     )
 
 
