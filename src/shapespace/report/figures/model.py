@@ -127,10 +127,11 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
                 f"Mode {k + 1}: {percent(share)} of the variance, moves up to {mm(float(length.max()))}",
             )
         )
+    of_each = f"{deviations:g} standard deviation{'s' * (deviations != 1)}"
     return grid(
         rows,
         title=title or f"What {_which(shown, model.n_modes)} to the mean",
-        scale=Scale(f"how far a point moves at {deviations:g} standard deviation{'s' * (deviations != 1)} (mm)", SEQUENTIAL, 0.0, top),
+        scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
     )
 
 
