@@ -35,6 +35,18 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
 
 
 @contextmanager
+def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[Callable[[int, int], None]]:
+    """Yield what is called with (done, total), and moves a bar of `progress` there."""
+    with progress(total, doing, unit, quiet=quiet) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield step
+
+
+@contextmanager
 def waiting(what: str, *, quiet: bool) -> Generator[None]:
     """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
     with (

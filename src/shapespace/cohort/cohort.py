@@ -21,6 +21,9 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
+SUBJECT = "subject"
+"""The column that says whose a shape is, unless another is named."""
+
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
@@ -318,6 +321,23 @@ def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
             along = float(np.sum(moved * middle)) / float(np.sum(middle**2))
             moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
         shapes[k] = moved
+
+
+def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
+    """Return whose each of the N shapes is: by `column`, or by `SUBJECT` where there is one; else each its own.
+
+    Raises:
+        InputError: there is no such column, or a cell of it says nothing.
+    """
+    if column is None and SUBJECT not in cohort.table.columns:
+        return cohort.names
+    cells = cohort.table.texts(column or SUBJECT)
+    if not all(cells):
+        raise InputError(
+            f"{cohort.table.where}: {column or SUBJECT!r} of {cohort.names[cells.index('')]} is missing; fill it in, "
+            "or leave such shapes out with --drop-missing."
+        )
+    return cells
 
 
 def refuse_twice(cohort: Cohort) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shapespace.batch.progress import progress
+from shapespace.batch.progress import progress, steps
 from shapespace.commands.about import write_about
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder
@@ -64,12 +64,7 @@ def write_simulated_faces(
         raise InputError("Effects of sex are put in bundled people only; leave --effect out.")
     make_folder(folder)
     total = subjects * len(expressions)
-    with progress(total, "writing", "face", quiet=quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(total, "writing", "face", quiet=quiet) as step:
         if source == "ict-facekit":
             ict.write_people(
                 folder, subjects=subjects, seed=seed, area=area or "face", expressions=expressions, raw=raw,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.batch.fit_work import naming
-from shapespace.batch.progress import progress, waiting
+from shapespace.batch.progress import progress, steps, waiting
 from shapespace.batch.quality_work import QualityElsewhere
 from shapespace.batch.where import Where
 from shapespace.errors import InputError, MeshError
@@ -225,12 +225,7 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
 def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
     unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", quiet=quiet)[0]
     scans = _scans(target, options.scans, quiet=quiet)
-    with progress(None, f"measuring {target.name}, in", "step", quiet=quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
         return measure_quality(target.what, target.settings, scans=scans, unseen=unseen, on_step=step, run=run)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
@@ -27,8 +27,6 @@ from shapespace.statistics.answer import Answer
 from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import FloatArray, Mesh, read_only
 
-SUBJECT = "subject"
-"""The column that names who a shape is of, where there is one and no other is named."""
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
 LEVEL = 0.95
 _BLOCK = 100
@@ -234,19 +232,10 @@ class _Means:
 
 
 def _subjects(cohort: Cohort, column: str | None) -> tuple[tuple[str, ...], npt.NDArray[np.intp]]:
-    if column is None and SUBJECT not in cohort.table.columns:
-        names, codes = cohort.names, np.arange(len(cohort))
-    else:
-        cells = cohort.table.texts(column or SUBJECT)
-        if not all(cells):
-            lacking = cohort.names[cells.index("")]
-            raise InputError(
-                f"{cohort.table.where}: {column or SUBJECT!r} of {lacking} is missing; fill it in, or leave such "
-                "shapes out with --drop-missing."
-            )
-        names = tuple(dict.fromkeys(cells))
-        number = {name: k for k, name in enumerate(names)}
-        codes = np.array([number[cell] for cell in cells])
+    cells = subjects_of(cohort, column)
+    names = tuple(dict.fromkeys(cells))
+    number = {name: k for k, name in enumerate(names)}
+    codes = np.array([number[cell] for cell in cells])
     if len(names) < _FEWEST:
         raise InputError(
             f"{cohort.table.where}: {len(names)} subjects are too few for asymmetry; {_FEWEST} are the least."

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
@@ -18,7 +18,6 @@ from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, mod
 from shapespace.statistics.smoothers import CHOICES, Choice, Decomposed, IndexArray, errors_of, folds_of, nested
 from shapespace.types import FloatArray, Mesh, read_only
 
-SUBJECT = "subject"
 FEWEST, SMALL = 10, 100
 """Subjects below which nothing is learned, and below which a sample is said to be small."""
 MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
@@ -153,7 +152,7 @@ def regress(
     _check_options(folds, permutations, draws, level, seed)
     y = cohort.table.numbers(target)
     _check_target(cohort, target, y)
-    subjects = _subjects_of(cohort, subject)
+    subjects = subjects_of(cohort, subject)
     names = tuple(dict.fromkeys(subjects))
     number = {name: at for at, name in enumerate(names)}
     codes = np.array([number[name] for name in subjects])
@@ -248,18 +247,6 @@ def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
         )
     if np.ptp(y) == 0:
         raise InputError(f"{cohort.table.where}: {target} is {y[0]:g} for all shapes, so there is nothing to learn.")
-
-
-def _subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
-    if column is None and SUBJECT not in cohort.table.columns:
-        return cohort.names
-    cells = cohort.table.texts(column or SUBJECT)
-    if not all(cells):
-        raise InputError(
-            f"{cohort.table.where}: {column or SUBJECT!r} of {cohort.names[cells.index('')]} is missing; fill it in, "
-            "or leave such shapes out with --drop-missing."
-        )
-    return cells
 
 
 def _intervals(

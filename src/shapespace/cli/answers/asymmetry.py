@@ -25,9 +25,10 @@ def add(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the asymmetry of a cohort, and keep the answer."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
+    from shapespace.cohort.cohort import SUBJECT
     from shapespace.errors import InputError
-    from shapespace.statistics.asymmetry import SUBJECT, measure_asymmetry
+    from shapespace.statistics.asymmetry import measure_asymmetry
     from shapespace.statistics.sides import read_pairs
 
     column, equals, value = (arguments.reference or "").partition("=")
@@ -38,12 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     wanted = [name for name in (subject, column) if name]
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
-    with progress(None, "permuting", "shape", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
         found = measure_asymmetry(
             cohort,
             subject=subject,

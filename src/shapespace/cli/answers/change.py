@@ -34,7 +34,7 @@ def add(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Answer, and write the report."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.io.regions import read_region
     from shapespace.statistics.change import change
     from shapespace.statistics.change_found import ChangeSettings
@@ -58,12 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
         from shapespace.statistics.change_visits import time_column
 
         cohort = cohort.complete([*columns, time_column(cohort.table, arguments.time)], drop_missing=True)
-    with progress(None, "comparing", "subject", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
         answer = change(cohort, settings, on_step=step).answer()
     return finish(answer, arguments)
 

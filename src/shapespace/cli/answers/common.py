@@ -47,18 +47,13 @@ def cohort_of(
         onto: a cohort that it is to be compared with.
         least: how many shapes there must be, where `onto` is None.
     """
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortOptions, read_cohort
 
     options = CohortOptions(
         arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful, least
     )
-    with progress(None, "reading", "shape", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
         return read_cohort(arguments.data, options, onto=onto, on_shape=step)
 
 

@@ -28,7 +28,7 @@ def add(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.statistics.compare import CompareOptions, compare
 
     options = CompareOptions(
@@ -42,11 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
         drop_missing=arguments.drop_missing,
     )
     cohort = cohort_of(arguments)
-    with progress(None, "permuting", "step", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
         found = compare(cohort, arguments.formula, options, on_step=step)
     return finish(found.answer(), arguments)

@@ -30,32 +30,22 @@ def add_identify(sub: argparse.ArgumentParser) -> None:
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Are two scans of one person."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.statistics.identity.verify import verify
 
     cohort, options = _asked(arguments)
-    with progress(None, "comparing", "draw", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "comparing", "draw", quiet=arguments.quiet) as step:
         found = verify(cohort, options, on_step=step)
     return finish(found.answer(), arguments)
 
 
 def run_identify(arguments: argparse.Namespace) -> int:
     """Which of the people enrolled does a scan show."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.statistics.identity.identify import identify
 
     cohort, options = _asked(arguments)
-    with progress(None, "searching", "score", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "searching", "score", quiet=arguments.quiet) as step:
         found = identify(cohort, options, on_step=step)
     return finish(found.answer(), arguments)
 

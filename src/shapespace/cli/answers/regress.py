@@ -29,11 +29,12 @@ def add(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Learn a number from shape and predict it, and keep the answer."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
+    from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.read import CohortOptions, read_cohort
     from shapespace.io.files import make_folder
     from shapespace.statistics.predictor import Predictor, refuse_known
-    from shapespace.statistics.regression import SUBJECT, regress
+    from shapespace.statistics.regression import regress
     from shapespace.statistics.regression_answer import predicted_answer
 
     if arguments.predictor is not None:
@@ -44,12 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
     wanted = [arguments.target, *([subject] if subject else [])]
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
-    with progress(None, "learning", "fold", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         found = regress(
             cohort,
             arguments.target,

@@ -26,7 +26,7 @@ def add(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
-    from shapespace.batch.progress import progress
+    from shapespace.batch.progress import steps
     from shapespace.statistics.score import ScoreOptions, score
 
     options = ScoreOptions(
@@ -39,10 +39,6 @@ def run(arguments: argparse.Namespace) -> int:
     known = {"data": arguments.reference, "shapes": arguments.reference_shapes, "doubtful": False}
     reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
     subjects = cohort_of(arguments, onto=reference)
-    with progress(len(subjects), "scoring", "subject", quiet=arguments.quiet) as bar:
-
-        def step(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
+    with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
         scores = score(reference, subjects, options, on_step=step)
     return finish(scores.answer(), arguments)
