@@ -35,7 +35,7 @@ from shapespace.errors import MeshError, ShapespaceError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.surface import face_areas, without_estimates
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
@@ -275,7 +275,7 @@ def _records(
         record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
         record = structs.replace(record, metadata=dict(job.metadata))
         if one is not None and one.vertices is not None:
-            surface = Mesh(one.vertices, made.template.faces, name=name)
+            surface = without_estimates(Mesh(one.vertices, made.template.faces, name=name, observed=one.observed))
             record = _judged(record, surface, made.template, read.scans[name])
         if name in sizes:
             scale, ratio = map(float, sizes[name])
@@ -339,7 +339,7 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         if record.reason or one is None or one.vertices is None:
             remove_file(surface)
         else:
-            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name))
+            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name, observed=one.observed))
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
