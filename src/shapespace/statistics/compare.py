@@ -23,6 +23,7 @@ from shapespace.statistics.answer import Answer
 from shapespace.statistics.compare_formula import Design, Term, Variable, columns_of, design_of
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less, strata_of
+from shapespace.statistics.observed import information, weights_of
 from shapespace.types import FloatArray, read_only
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -250,7 +251,7 @@ def compare(
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
     tests = tuple(test for stratum in strata for test in _tests(stratum, options, step))
-    effects = tuple(e for family in families for e in _effects(cohort, family, options, step))
+    effects = tuple(e for family in families for e in _effects(cohort, design, family, options, step))
     return Comparison(
         cohort=cohort,
         design=design,
@@ -371,7 +372,9 @@ def _interacting(design: Design, stratum: Stratum) -> Iterator[tuple[Variable, V
             yield one, other
 
 
-def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Callable[[], None]) -> Iterator[Effect]:
+def _effects(
+    cohort: Cohort, design: Design, family: _Family, options: CompareOptions, step: Callable[[], None]
+) -> Iterator[Effect]:
     stratum = family.stratum
     residual = stratum.residual(family.beside)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family.ends])
@@ -385,7 +388,9 @@ def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Cal
     step()
     maps: Iterable[EffectMap | None] = itertools.repeat(None)
     if options.maps:
-        maps = effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
+        known = information(cohort, design.matrix, np.stack([ends.contrast for ends in family.ends]))
+        weights = None if known is None else weights_of(known)
+        maps = effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm, weights)
         step()
     mean = cohort.coefficients.mean(axis=0)
     for at, (ends, made) in enumerate(zip(family.ends, maps, strict=False)):
