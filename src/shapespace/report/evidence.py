@@ -46,6 +46,13 @@ EVIDENCE: Mapping[str, _Told] = MappingProxyType(
         "start_runner_up_score_mm": ("... of the best one elsewhere", mm),
         "layered_share": ("Share of the scan that lies on another layer of it", percent),
         "layers_apart_mm": ("... and how far apart these layers are", mm),
+        "displaced_share": ("Share of the scan that runs along the surface at a distance from it", percent),
+        "displaced_inward_share": ("... inside the surface", percent),
+        "displaced_purity": ("... of the unexplained parts of the scan", percent),
+        "second_instance_mm": ("Distance of a second instance in the scan", mm),
+        "second_instance_gap_mm": ("... gap between the two (negative: they overlap)", mm),
+        "mirrored_log_odds": ("Log odds that the scan is mirrored (nats; above 5: mirrored, below -5: not)", _plain),
+        "training_shapes": ("Number of training shapes of the model", _plain),
         "marks_stddev_mm": ("Standard deviation of the landmarks given", mm),
         "marks_rms_mm": ("RMS distance from the landmarks given", mm),
     }
