@@ -107,21 +107,22 @@ def find_second_instance(
 
 
 def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return how much of the scan runs along the fitted surface at a distance from it, by name.
+    """Return how much of the scan runs along the fitted surface at a distance, and how much scatters, by name.
 
-    Such is a scan whose parts differ in scale or pose: the fit follows one part, and the others run along the surface
-    at a distance. Around a point of them the heights over the fitted surface are alike, which those of outliers and
-    loose hair are not, and little else of the scan is unexplained. All are zero where the fit explains nearly all of
-    the scan.
+    Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
+    a distance. Around a point of them the heights over the fitted surface are alike, and little else of the scan is
+    unexplained. Outliers, noise and loose hair scatter: heights around a point differ. All are zero where the fit
+    explains nearly all of the scan.
 
     Args:
         model: the shape space.
         target: the scan in its mm frame.
         fitted: result of the fit to it.
     """
-    found = {"displaced_share": 0.0, "displaced_inward_share": 0.0, "displaced_purity": 0.0}
     if fitted.evidence["scan_near_share"] > _ALL_EXPLAINED:
-        return found
+        return {
+            "displaced_share": 0.0, "displaced_inward_share": 0.0, "displaced_purity": 0.0, "scattered_share": 0.0,
+        }  # fmt: skip
     scale = fitted.T_scan_fitted.scale
     size, spread = rms_size(model.mean_vertices) * scale, fitted.evidence["spread_mm"] * scale
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
@@ -130,17 +131,16 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
     height = np.einsum("ij,ij->i", points - at.points, vertex_normals(surface)[at.vertex])
     around = height[np.asarray(cKDTree(points).query(points, _NEIGHBOURS)[1], dtype=np.int32)[:, 1:]]
     alike = np.median(np.abs(around - height[:, None]), axis=1) < _ALIKE * np.abs(height)
+    inside = ~boundary_vertices(surface)[at.vertex]
     far = max(_DISPLACED[0] * size, _SPREADS * spread)
-    moved = (np.abs(height) > far) & (at.distance < _DISPLACED[1] * size) & alike
-    moved &= (np.abs(height) > _ALONG_NORMAL * at.distance) & ~boundary_vertices(surface)[at.vertex]
-    unexplained = float((at.distance > far).mean())
-    if moved.any():
-        found = {
-            "displaced_share": float(moved.mean()),
-            "displaced_inward_share": float((moved & (height < 0.0)).mean()),
-            "displaced_purity": float(moved.mean()) / unexplained,
-        }
-    return found
+    moved = (np.abs(height) > far) & (at.distance < _DISPLACED[1] * size) & alike & inside
+    moved &= np.abs(height) > _ALONG_NORMAL * at.distance
+    return {
+        "displaced_share": float(moved.mean()),
+        "displaced_inward_share": float((moved & (height < 0.0)).mean()),
+        "displaced_purity": float(moved.mean() / max(float((at.distance > far).mean()), 1.0 / len(points))),
+        "scattered_share": float(((at.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
+    }
 
 
 def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:

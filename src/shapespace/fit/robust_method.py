@@ -13,6 +13,7 @@ from shapespace.fit.settings import RobustSettings
 from shapespace.fit.start import Start, start_evidence
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.fit.trust import (
+    chirality_of,
     doubts_of_chirality,
     doubts_of_few_shapes,
     doubts_of_inconsistent_parts,
@@ -63,9 +64,10 @@ class Robust(RobustSettings):
             log_odds = mirrored_log_odds(model, scan, fitted, self, with_scale=limits.with_scale)
             evidence |= {} if log_odds is None else {"mirrored_log_odds": log_odds}
         second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
-        if second is None:
-            return replace(fitted, evidence=evidence)
-        return replace(fitted, evidence=evidence | second.as_evidence(), notes=(*fitted.notes, second.note))
+        notes = [*fitted.notes, *([] if second is None else [second.note])]
+        if "mirrored_log_odds" in evidence and chirality_of(evidence) == "undecidable":
+            notes.append("Whether the scan is mirrored is undecidable: its mirror image fits the model about as well.")
+        return replace(fitted, evidence=evidence | ({} if second is None else second.as_evidence()), notes=notes)
 
     def doubts(self, ended: Ended) -> list[str]:
         """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""

@@ -49,6 +49,7 @@ EVIDENCE: Mapping[str, _Told] = MappingProxyType(
         "displaced_share": ("Share of the scan that runs along the surface at a distance from it", percent),
         "displaced_inward_share": ("... inside the surface", percent),
         "displaced_purity": ("... of the unexplained parts of the scan", percent),
+        "scattered_share": ("Share of the scan that scatters widely around the surface", percent),
         "second_instance_mm": ("Distance of a second instance in the scan", mm),
         "second_instance_gap_mm": ("... gap between the two (negative: they overlap)", mm),
         "mirrored_log_odds": ("Log odds that the scan is mirrored (nats; above 5: mirrored, below -5: not)", _plain),
