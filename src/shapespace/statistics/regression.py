@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
@@ -380,7 +381,10 @@ def _measures(
         ends = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
         return Measure(float(values[0]), float(ends[0]), float(ends[1]))
 
-    return {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+    measured = {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+    inside = measured["coverage"]
+    ends = widen_share(np.array(inside.low), np.array(inside.high), n, level)
+    return {**measured, "coverage": Measure(inside.value, *map(float, ends))}
 
 
 def _p_of(
@@ -452,11 +456,15 @@ def _percentiles(
 
     With one value for each subject they are those of `np.percentile`.
     """
-    own, at = np.unique(np.column_stack([y, codes]), axis=0, return_inverse=True)
-    weight = np.bincount(at.ravel(), weights=share)
+    weights: dict[tuple[float, int], float] = {}
+    for value, subject, one in zip(y.tolist(), codes.tolist(), share.tolist(), strict=True):
+        weights[value, subject] = weights.get((value, subject), 0.0) + one
+    own = sorted(weights)
+    weight = np.array([weights[key] for key in own])
     place = np.cumsum(weight) - 0.5 * (weight + 1.0)
-    low, high = np.interp(np.array(percent) / 100.0 * (weight.sum() - 1.0), place, own[:, 0])
-    return float(low), float(high)
+    at = np.array(percent) / 100.0 * (weight.sum() - 1.0)
+    low, high = np.interp(at, place, [value for value, _ in own]).tolist()
+    return low, high
 
 
 def _rms(values: FloatArray, share: FloatArray) -> float:
