@@ -2,9 +2,9 @@
 
 The bootstrap of a share without a single error is the interval [0, 0]. The exact interval of Clopper and Pearson
 ("The use of confidence or fiducial limits", Biometrika 26, 1934) for 0 errors among n independent units ends at
-1 - (alpha / 2)^(1 / n); the rule of three, 3 / n, is its one-sided approximation. The units are subjects, since pairs and
-scans of one subject depend on each other. A share of errors over all pairs is at most the share of subjects with whom
-errors happen, so the bound is valid for it too.
+1 - (alpha / 2)^(1 / n); the rule of three, 3 / n, is its one-sided approximation. The units are subjects, since pairs
+and scans of one subject depend on each other. The share of errors is at most the share of subjects with whom errors
+happen, where each subject counts alike, so the bound is valid for it too.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import softmax
 
+from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.recognise.classifiers import likeliest_temperature
 from shapespace.recognise.learn import confusion_matrix, precision_recall_fscore_support
@@ -98,8 +99,8 @@ def subject_bootstrap(
 ) -> tuple[float, float]:
     """Return the bootstrap percentile interval of the macro accuracy, drawing whole people with replacement.
 
-    Near 0 and 1 it is at least as wide as the exact interval without an error among as many people as show the class that
-    the fewest show.
+    Near 0 and 1 it is at least as wide as the exact interval without an error among as many people as show the rarest
+    class.
     """
     names, truth = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
     people, owner = np.unique(np.asarray(subjects, dtype=str), return_inverse=True)

@@ -8,8 +8,8 @@ from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, 
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.identify import Identification, Identified
 from shapespace.statistics.identity.told import (
-    called,
     INTERVALS,
+    called,
     cells,
     hashes,
     in_percent,

@@ -24,8 +24,8 @@ CALLED = {
 }
 """What scores are called in words."""
 INTERVALS = (
-    "95 % intervals are percentiles over draws of people with replacement; near 0 and 1 they are at least as wide as the "
-    "exact interval of Clopper and Pearson for no error among as many people."
+    "95 % intervals are percentiles over draws of people with replacement; near 0 and 1 they are at least as wide as "
+    "the exact interval of Clopper and Pearson for no error among as many people."
 )
 """What the intervals of error rates are, for reports."""
 
@@ -102,8 +102,8 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean that there are none: up to {100 * zero_bound(people):.1f} % "
-        "of people may be ones with whom errors happen (95 %, Clopper-Pearson, with people as the units)."
+        else f"No error among {people} people does not mean that there are none: up to {100 * zero_bound(people):.1f} "
+        "% of people may be ones with whom errors happen (95 %, Clopper-Pearson, with people as the units)."
     )
 
 

@@ -218,7 +218,9 @@ def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float
     """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {
-        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people) if impostors * far >= 1 else Figure(None)
+        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people)
+        if impostors * far >= 1
+        else Figure(None)
         for k, far in enumerate(FAR)
     }
     return figure(roc.eer, drawn[:, 0], pairs.genuine_people), tar

@@ -9,8 +9,8 @@ import numpy as np
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.told import (
-    called,
     INTERVALS,
+    called,
     cells,
     hashes,
     in_percent,
@@ -132,8 +132,8 @@ def _parts(found: Verification) -> tuple[Part, ...]:
             title="How it was measured",
             text=(
                 who_was_tested(found.trial, found.trained_on),
-                f"{INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by a "
-                "logistic regression on pairs of people of other groups. Whether the shape model "
+                f"{INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by "
+                "a logistic regression on pairs of people of other groups. Whether the shape model "
                 "was built from people tested here cannot be seen from its file; it must not have been.",
             ),
         )
