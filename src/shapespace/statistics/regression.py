@@ -463,7 +463,8 @@ def _percentiles(
     weight = np.array([weights[key] for key in own])
     place = np.cumsum(weight) - 0.5 * (weight + 1.0)
     at = np.array(percent) / 100.0 * (weight.sum() - 1.0)
-    low, high = np.interp(at, place, [value for value, _ in own]).tolist()
+    values = np.array([value for value, _ in own])
+    low, high = (float(np.interp(one, place, values)) for one in at)
     return low, high
 
 

@@ -210,7 +210,7 @@ def identified(name: str, searches: Searches, most: int, people: FloatArray) -> 
     cmc, fnir = searches.cmc(most), searches.fnir(rates)
     searched = len(searches.rank) if searches.enrolled.all() else int((~searches.enrolled).sum())
     band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
-    band = np.stack(widen_share(*band, searches.people))
+    band = np.stack(widen_share(band[0], band[1], searches.people))
     missed = {
         rate: figure(float(fnir[k]), drawn[:, most + k], searches.people) if searched * rate >= 1 else Figure(None)
         for k, rate in enumerate(FPIR)

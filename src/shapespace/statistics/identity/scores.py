@@ -49,7 +49,8 @@ SCORES: Mapping[str, Callable[[Samples], Scorer]] = MappingProxyType(
     }
 )
 """Scores of how alike two scans are: by the two-covariance model (PLDA), by the angle and by the distance of whitened
-coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm. None is a likelihood ratio."""
+coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm. No score is a likelihood
+ratio."""
 
 
 _FORMER = {"likelihood-ratio": "plda"}

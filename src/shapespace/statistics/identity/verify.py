@@ -196,7 +196,7 @@ def verified(
     eer, tar = _told(roc, pairs, drawn[:, 1:])
     usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
     band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
-    band = np.stack(widen_share(*band, pairs.genuine_people))
+    band = np.stack(widen_share(band[0], band[1], pairs.genuine_people))
     by: dict[str, Part] = {}
     for value, own in (chosen or {}).items():
         part = pairs.take(own)
