@@ -230,6 +230,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     b_stddev_calibrated: bool = False
     shrinkage: tuple[float, ...] = ()
     evidence: Mapping[str, Any] = {}
+    chirality: Literal["as scanned", "mirrored", "undecidable"] | None = None
     found_landmarks: Mapping[str, FoundLandmark] = {}
     distances_mm: Mapping[str, BothWays] = {}
     shown: ShownDistances | None = None
