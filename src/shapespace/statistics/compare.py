@@ -268,7 +268,7 @@ def compare(
     families = list(_families(design, made))
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
-    tests = tuple(test for stratum in strata for test in _tests(stratum, options, step))
+    tests = tuple(test for stratum in strata for test in term_tests(stratum, options, step))
     effects = tuple(e for family in families for e in _effects(cohort, family, options, step))
     warnings = (
         *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design)
@@ -312,7 +312,10 @@ def _with_sizes(cohort: Cohort) -> Cohort:
     return with_columns(cohort, {name: v for name, v in sizes.items() if name not in cohort.table.columns})
 
 
-def _tests(stratum: Stratum, options: CompareOptions, step: Callable[[], None]) -> Iterator[TermTest]:
+def term_tests(
+    stratum: Stratum, options: CompareOptions, step: Callable[[], None] = lambda: None
+) -> Iterator[TermTest]:
+    """Yield the tests of the terms of a stratum; `step` is called after each."""
     total = float((stratum.shapes**2).sum())
     for term in stratum.terms:
         reduced = stratum.reduced(term, options.squares)
