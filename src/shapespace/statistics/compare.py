@@ -31,6 +31,7 @@ from shapespace.statistics.compare_formula import (
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less
 from shapespace.statistics.compare_within import Strata, Within, strata_of
+from shapespace.statistics.observed import information, weights_of
 from shapespace.types import FloatArray, read_only
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -265,7 +266,7 @@ def compare(
         cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.squares, random
     )
     strata = made.every
-    families = list(_families(design, made))
+    families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
     tests = tuple(test for stratum in strata for test in term_tests(stratum, options, step))
@@ -346,13 +347,14 @@ def _remainder(stratum: Stratum) -> Remainder:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """A contrast of a stratum, in whose reduced model some terms are."""
+    """A contrast of a stratum, in whose reduced model some terms are, with the weight (V,) of each vertex."""
 
     low: str
     high: str
     stratum: Stratum
     beside: tuple[Term, ...]
     contrast: FloatArray
+    weight: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,6 +395,27 @@ def _families(design: Design, strata: Strata) -> Iterator[_Family]:
         for stratum in strata.every:
             if any(both <= term.variables for term in stratum.terms):
                 yield _Family(name, (_Ends(*words, stratum, tuple(stratum.without(both)), change[1] - change[0]),))
+
+
+def _weighted(cohort: Cohort, design: Design, family: _Family) -> _Family:
+    """Return a family with the share of the information on each contrast that the observations of a vertex carry.
+
+    The scans of a subject count one by one, also where a test combines them.
+    """
+    contrasts: list[FloatArray] = []
+    for one in design.variables:
+        if one.name == family.name:
+            contrasts = [design.contrast(one.column, low, high) for low, high in _pairs(one)]
+    for one, other in _interacting(design):
+        if f"{one.name}:{other.name}" == family.name:
+            (low, high), values = _pairs(one)[0], _pairs(other)[0]
+            first, second = (design.contrast(one.column, low, high, {other.column: value}) for value in values)
+            contrasts = [second - first]
+    known = information(cohort, design.matrix, np.stack(contrasts))
+    if known is None:
+        return family
+    weights = weights_of(known)
+    return replace(family, ends=tuple(replace(e, weight=w) for e, w in zip(family.ends, weights, strict=True)))
 
 
 def _within_ends(within: Within, one: Variable, low: str | float, high: str | float) -> _Ends:
@@ -483,7 +506,12 @@ def _tested_together(
     changes = directions @ stratum.shapes
     if not options.maps:
         return f, changes, [None] * len(family)
-    return f, changes, effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
+    weights = [ends.weight for ends in family if ends.weight is not None]
+    maps = effect_maps(
+        cohort, stratum, residual, products, along, changes, options.bump_width_mm,
+        np.stack(weights) if weights else None,
+    )  # fmt: skip
+    return f, changes, maps
 
 
 def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterator[Angle]:
