@@ -128,8 +128,8 @@ def rows() -> Iterator[Row]:
     times = ("time", "sex:time")
     table = partial(factorial, subjects=20, scans=1, conditions={"time": 5}, numbers=("time",))
     yield Row("5 visits, own growth", "~ sex * time", ("sex", *times), table, 1.0, ("time",))
-    yield Row("the same, --random '1 + time | subject'", "~ sex * time", times, table, 1.0, ("time",), 0.0, "1 + time | subject")  # noqa: E501  # fmt: skip
-    yield Row("the same, growth alike, --random '1 | subject'", "~ sex * time", times, table, 0.0, ("time",), 0.0, "1 | subject")  # noqa: E501  # fmt: skip
+    yield Row("the same, `time` random", "~ sex * time", times, table, 1.0, ("time",), 0.0, "1 + time | subject")  # fmt: skip
+    yield Row("the same, growth alike, no random `time`", "~ sex * time", times, table, 0.0, ("time",), 0.0, "1 | subject")  # noqa: E501  # fmt: skip
     yield Row("2 to 8 visits at any time, own growth", "~ sex * time", ("sex", *times), partial(irregular, subjects=24), 1.0, ("time",))  # noqa: E501  # fmt: skip
     yield Row("2 to 8 visits at any time, growth alike", "~ sex * time", times, partial(irregular, subjects=24), 0.0, ("time",))  # noqa: E501  # fmt: skip
     table = partial(with_missing_cells, subjects=30, share=0.15)
