@@ -113,8 +113,7 @@ def confounded(_: np.random.Generator, subjects: int, both: int) -> dict[str, tu
 def rows() -> Iterator[Row]:
     """Yield the designs of the table."""
     visit = ("visit",)
-    yield Row("pre/post, 1 scan, own change 1", "~ visit", visit, partial(factorial, subjects=20, scans=1, conditions={"visit": 2}), 1.0, visit)  # noqa: E501  # fmt: skip
-    for scans, own in ((2, 0.5), (2, 1.0), (3, 1.0)):
+    for scans, own in ((1, 1.0), (2, 0.5), (2, 1.0), (3, 1.0)):
         table = partial(factorial, subjects=20, scans=scans, conditions={"visit": 2})
         yield Row(f"pre/post, {scans} scans each, own change {own:g}", "~ visit", visit, table, own, visit)
     table = partial(factorial, subjects=20, scans=3, conditions={"visit": 2})
@@ -128,8 +127,11 @@ def rows() -> Iterator[Row]:
     times = ("time", "sex:time")
     table = partial(factorial, subjects=20, scans=1, conditions={"time": 5}, numbers=("time",))
     yield Row("5 visits, own growth", "~ sex * time", ("sex", *times), table, 1.0, ("time",))
-    yield Row("the same, `time` random", "~ sex * time", times, table, 1.0, ("time",), 0.0, "1 + time | subject")  # fmt: skip
-    yield Row("the same, growth alike, no random `time`", "~ sex * time", times, table, 0.0, ("time",), 0.0, "1 | subject")  # noqa: E501  # fmt: skip
+    for name, own, random in (
+        ("the same, `time` random", 1.0, "1 + time | subject"),
+        ("the same, growth alike, no random `time`", 0.0, "1 | subject"),
+    ):
+        yield Row(name, "~ sex * time", times, table, own, ("time",), random=random)
     yield Row("2 to 8 visits at any time, own growth", "~ sex * time", ("sex", *times), partial(irregular, subjects=24), 1.0, ("time",))  # noqa: E501  # fmt: skip
     yield Row("2 to 8 visits at any time, growth alike", "~ sex * time", times, partial(irregular, subjects=24), 0.0, ("time",))  # noqa: E501  # fmt: skip
     table = partial(with_missing_cells, subjects=30, share=0.15)
