@@ -88,8 +88,8 @@ def _add_demo(commands: Any) -> None:
 
 
 def _add_data(commands: Any) -> None:
-    sub = commands.add_parser("data", help="open data sets, simulated faces and organs").add_subparsers(
-        required=True, metavar="list|get|faces|organs"
+    sub = commands.add_parser("data", help="open data sets, simulated faces, organs and bones").add_subparsers(
+        required=True, metavar="list|get|faces|organs|bones"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
     listing.set_defaults(run=run.data_list)
@@ -124,6 +124,14 @@ def _add_data(commands: Any) -> None:
     organs.add_argument("--seed", type=_natural, default=0, metavar="S")
     organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
     organs.set_defaults(run=run.data_organs)
+    bones = _add(sub, "bones", "write raw scans (PLY) of simulated bones of two groups, with bones.csv",
+                 "shapespace data bones -o bones --count 16")  # fmt: skip
+    bones.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    bones.add_argument("--count", type=_positive, default=16, metavar="N", help="of both groups in turn (default 16)")
+    bones.add_argument("--seed", type=_natural, default=0, metavar="S")
+    bones.add_argument("--effect", type=float, default=4.0, metavar="MM",
+                       help="how much longer the snouts of the second group are (default 4)")  # fmt: skip
+    bones.set_defaults(run=run.data_bones)
 
 
 def _add_surface(commands: Any) -> None:
