@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any, cast
 
@@ -139,6 +140,9 @@ def _add_surface(commands: Any) -> None:
                      help="standard deviation of the smoothing in voxels (default 1.3; 0: none)")  # fmt: skip
     sub.add_argument("--keep-pieces", action="store_true",
                      help="all pieces and cavities (default: the largest piece, cavities filled)")  # fmt: skip
+    sub.add_argument("--max-memory", type=_memory_bytes, metavar="SIZE",
+                     help="memory that a volume and its surface may take, such as 8G or 500M; one that takes more is "
+                          "refused before it is read (default 4G, at most four fifths of the free memory)")  # fmt: skip
     sub.set_defaults(run=run.surface)
 
 
@@ -523,6 +527,14 @@ def _stddev(text: str) -> float:
     if not value > 0:
         raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
     return value
+
+
+def _memory_bytes(text: str) -> int:
+    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)
+    value = float(found[1]) * 1024 ** (1 + "KMGT".index(found[2].upper())) if found else 0.0
+    if not value:
+        raise argparse.ArgumentTypeError(f"must be a size such as 8G or 500M, not {text!r}")
+    return int(value)
 
 
 def _smoothing(text: str) -> float:

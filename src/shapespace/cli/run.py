@@ -131,6 +131,7 @@ def surface(arguments: argparse.Namespace) -> int:
         smooth=arguments.smooth,
         keep_pieces=arguments.keep_pieces,
         recursive=arguments.recursive,
+        max_memory_bytes=arguments.max_memory,
         quiet=arguments.quiet,
         say=warn,
     )
