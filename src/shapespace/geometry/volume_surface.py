@@ -115,7 +115,7 @@ def surface_of_volume(
     memory = _Memory(volume.labels.nbytes, max_memory_bytes, volume.name)
     mask, corner = _cut_out(volume.labels, chosen, np.ceil(3 * sigma).astype(int) + 3, memory)
     part = _Part.of(mask, keep_pieces=keep_pieces)
-    memory.check(mask.shape, _crossings(part.mask))
+    memory.check(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
         raise InputError(
             f"{volume.name}: {_named(chosen)} has only {part.voxels} "
@@ -161,7 +161,7 @@ class _Memory:
         Raises:
             InputError: they do.
         """
-        needed = self.volume_bytes + _BASE_BYTES + _VOXEL_BYTES * math.prod(map(int, box)) + _VERTEX_BYTES * vertices
+        needed = self.volume_bytes + estimated_bytes(box, vertices)
         if needed > self.limit_bytes:
             size = " x ".join(map(str, box))
             raise InputError(
@@ -169,6 +169,16 @@ class _Memory:
                 f"{needed / 2**30:.2g} GiB of memory, over the limit of {self.limit_bytes / 2**30:.2g} GiB; crop or "
                 "resample it, as by 3D Slicer, or allow more (--max-memory)."
             )
+
+
+def estimated_bytes(box: Sequence[int], vertices: int) -> int:
+    """Return an upper bound of the memory of smoothing and marching cubes, without the volume.
+
+    Args:
+        box: (3,) voxels along each axis of the box around the labels, with its margin.
+        vertices: of the surface, by the pairs of neighbouring voxels on both sides of its border.
+    """
+    return _BASE_BYTES + _VOXEL_BYTES * math.prod(map(int, box)) + _VERTEX_BYTES * vertices
 
 
 def _blocks(shape: tuple[int, ...]) -> Generator[tuple[slice, slice, slice]]:
@@ -267,7 +277,7 @@ def _is_one_of(values: _Labels, wanted: _Labels) -> BoolArray:
     return values == wanted[0] if len(wanted) == 1 else np.isin(values, wanted)
 
 
-def _crossings(mask: BoolArray) -> int:
+def count_crossings(mask: BoolArray) -> int:
     """Return how many pairs of neighbours lie on both sides of the border: the vertices of marching cubes."""
     count = 0
     for axis in range(3):
