@@ -151,7 +151,14 @@ def _add_check(commands: Any) -> None:
                "shapespace check scan.obj")  # fmt: skip
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _add_recursive(sub)
+    _add_strict(sub)
     sub.set_defaults(run=run.check)
+
+
+def _add_strict(sub: Any, more: str = "") -> None:
+    sub.add_argument("--strict", action="store_true",
+                     help="refuse scans with coordinates that are NaN or infinite, instead of removing the triangles "
+                          f"that use them{more}")  # fmt: skip
 
 
 def _add_correspond(commands: Any) -> None:
@@ -174,6 +181,7 @@ def _add_correspond(commands: Any) -> None:
     sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
                      help="of the template where a scan is chosen (default 10000)")  # fmt: skip
     sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")
+    _add_strict(sub)
     _add_where(sub, "scans")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.correspond, goes_on="; the same command goes on from there")
@@ -303,7 +311,7 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--store", action="store_true",
                      help="keep results in few files, as is done by itself from 10,000 scans on")  # fmt: skip
-    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
+    _add_strict(sub, "; exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.fit, goes_on="; the same command goes on from there")
 

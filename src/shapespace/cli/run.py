@@ -167,7 +167,7 @@ def check(arguments: argparse.Namespace) -> int:
     """What is in each mesh, and what fitting will do about it."""
     from shapespace.commands.look import check
 
-    reports = check(arguments.files, recursive=arguments.recursive, say=warn)
+    reports = check(arguments.files, recursive=arguments.recursive, strict=arguments.strict, say=warn)
     if arguments.json:
         show_json(reports)
     else:
@@ -223,6 +223,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         arguments.landmarks,
         _where(arguments),
         arguments.recursive,
+        arguments.strict,
     )
     summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
     if arguments.json:
@@ -367,6 +368,7 @@ def fit(arguments: argparse.Namespace) -> int:
         landmark_stddev_mm=arguments.landmark_sd,
         crop=arguments.crop,
         region=_region(arguments.region),
+        strict=arguments.strict,
     )
     settings = BatchSettings(
         config,
