@@ -6,7 +6,6 @@ D, text files of `x y z` rows, and `groomed_D`, the surface on which the local p
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -20,26 +19,25 @@ from scipy.interpolate import RBFInterpolator
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from shapespace.errors import FileError, InputError, ModelFileError, ShapespaceError
+from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
 from shapespace.formats.folder import write_folder
 from shapespace.formats.parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.archives import zip_members
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.json_files import check_file, json_of
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES, Allowance
 from shapespace.io.meshes import MESH_ENDINGS, read_mesh
-from shapespace.io.parsing import floats_of, number_lines, xml_root
+from shapespace.io.parsing import floats_of, number_lines
 from shapespace.io.vtk import write_vtk
+from shapespace.io.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
 _LARGEST_PROJECT_BYTES = 2**26
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
-_CELL = re.compile(r"([A-Z]{1,3})\d+")
 _ON_PARTICLES = 1e-6
 MOST_DENSE = 2_000
 """Particles through which one spline passes; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
@@ -52,7 +50,6 @@ _MOST_CARRIED_BYTES = 2**31
 _MOST_APART = 0.02
 """Of the size of a shape: further from its mesh, the particles are those of another."""
 _IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
-_RELATIONS = "xl/_rels/workbook.xml.rels"
 
 Row = Mapping[str, str]
 
@@ -374,40 +371,8 @@ def _rows(data: object) -> list[Row]:
 def _sheet(content: bytes, path: Path) -> list[Row]:
     """Return the rows of the sheet `data` of a workbook, by their headings."""
     try:
-        members = zip_members(io.BytesIO(content), len(content))
-    except (ValueError, OSError) as error:
-        raise ModelFileError(f"{path} is no workbook, or it is cut short ({error}); {_AGAIN}.") from error
-    strings = [
-        "".join(part.text or "" for part in one.iter() if part.tag.endswith("}t"))
-        for one in _elements(members, "xl/sharedStrings.xml", "si", path)
-    ]
-    sheets = {sheet.get("name"): sheet for sheet in _elements(members, "xl/workbook.xml", "sheet", path)}
-    if "data" not in sheets:
-        raise ModelFileError(f"{path} has no sheet called data, so it is no project of ShapeWorks; {_AGAIN}.")
-    key = next((value for name, value in sheets["data"].items() if name.endswith("}id")), "")
-    targets = {one.get("Id"): one.get("Target", "") for one in _elements(members, _RELATIONS, "Relationship", path)}
-    target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
-    table: list[dict[str, str]] = []
-    for row in _elements(members, f"xl/{target}", "row", path):
-        cells: dict[str, str] = {}
-        for cell in row:
-            at = _CELL.fullmatch(cell.get("r", ""))
-            text = "".join(part.text or "" for part in cell.iter() if part.tag.endswith(("}v", "}t")))
-            if at is None:
-                continue
-            if cell.get("t") == "s":
-                text = strings[int(text)] if text.isdecimal() and int(text) < len(strings) else ""
-            cells[at[1]] = text
-        table.append(cells)
-    if not table:
-        return []
-    heads = table[0]
+        table = sheet_rows(content, "data")
+    except ValueError as error:
+        raise ModelFileError(f"{path} {error}, so it is no project of ShapeWorks; {_AGAIN}.") from error
+    heads = table[0] if table else {}
     return [{heads[at]: text for at, text in cells.items() if at in heads} for cells in table[1:]]
-
-
-def _elements(members: Mapping[str, bytes], name: str, tag: str, path: Path) -> list[Any]:
-    try:
-        root = xml_root(members.get(name, b"<none/>"), path)
-    except FileError as error:
-        raise ModelFileError(f"{path} is a damaged workbook; {_AGAIN}.") from error
-    return [one for one in root.iter() if one.tag.rpartition("}")[2] == tag]
