@@ -9,7 +9,7 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -54,7 +54,9 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def rows_text(rows: Iterable[Sequence[object]]) -> str:
     """Return rows as CSV text, each ended by a line feed; text that a spreadsheet would run gets an apostrophe."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_written(cell) for cell in row] for row in rows)
+    write_row = _row_writer(text)
+    for row in rows:
+        write_row([_written(cell) for cell in row])
     return text.getvalue()
 
 
@@ -69,11 +71,24 @@ def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence
     """Write the same to `stream`, a row at a time."""
     at = header.index(CHECKSUM)
     header = [str(_written(name)) for name in header]
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
+    write_row = _row_writer(stream)
+    write_row(header)
     for row in rows:
         cells = ["" if cell is None else str(_written(cell)) for cell in row]
-        writer.writerow([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+        write_row([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+
+
+def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
+    """Return what writes a row of CSV to `stream`."""
+    plain = csv.writer(stream, lineterminator="\n")
+    # The csv module leaves a lone carriage return without quotes, and reads it as the end of a line.
+    quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+
+    def write_row(row: Sequence[object]) -> None:
+        returns = any(isinstance(cell, str) and "\r" in cell for cell in row)
+        (quoted if returns else plain).writerow(row)
+
+    return write_row
 
 
 def _written(cell: object) -> object:
