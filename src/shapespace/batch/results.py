@@ -146,6 +146,7 @@ def fit_record(
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
+        "chirality": result.chirality,
         **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [

@@ -16,6 +16,8 @@ from typing import Any, cast
 import numpy as np
 from scipy.fft import dct
 from scipy.interpolate import RBFInterpolator
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
@@ -37,6 +39,14 @@ _LARGEST_PROJECT_BYTES = 2**26
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
 _ON_PARTICLES = 1e-6
+MOST_DENSE = 2_000
+"""Particles through which one spline passes; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
+NEIGHBOURS = 32
+"""Particles of a local spline: within 0.1 % (RMS) of the dense one, by tests/formats/test_shapeworks_projects.py."""
+_BATCH = 512
+"""Points whose splines are solved together: 40 MB of matrices."""
+_MOST_CARRIED_BYTES = 2**31
+"""Memory of the modes of a carried mesh (2 GiB)."""
 _MOST_APART = 0.02
 """Of the size of a shape: further from its mesh, the particles are those of another."""
 _IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
@@ -181,8 +191,10 @@ def _model(project: _Project) -> LinearModel:
         notes.append(f"It is a point model of {len(points)} particles: {surface}.")
     elif surface.carry is None:
         faces = surface.faces
+    elif isinstance(carried := surface.carried(points, moved), str):
+        notes.append(f"It is a point model of {len(points)} particles: {carried}.")
     else:
-        points, moved = surface.carried(points, moved)
+        points, moved = carried
         faces = surface.faces
         notes.append(
             f"Its surface is the mesh of {surface.subject}, the most average subject, carried by the particles with "
@@ -226,8 +238,10 @@ class _Surface:
     faces: IntArray
     carry: Sequence[tuple[FloatArray, FloatArray]] | None
 
-    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry."""
+    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry, or why not."""
+        if 24 * sum(len(mesh) for _, mesh in self.carry or ()) * (1 + moved.shape[1]) > _MOST_CARRIED_BYTES:
+            return f"its modes on the mesh of {self.subject} would take more than {_MOST_CARRIED_BYTES >> 30} GiB"
         steps = moved.reshape(len(mean), -1)
         at, vertices, modes = 0, list[FloatArray](), list[FloatArray]()
         for particles, mesh in self.carry or ():
@@ -235,11 +249,64 @@ class _Surface:
             at += len(particles)
             # Splines are linear in what the particles do, so that the model stays a linear one.
             what = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
-            spline = RBFInterpolator(particles, what, kernel="linear", degree=1)
-            found = np.asarray(spline(mesh), dtype=np.float64)
+            try:
+                found = interpolate_displacements(particles, what, mesh)
+            except np.linalg.LinAlgError:
+                return "its particles lie in a plane or nearly coincide, so that they carry no mesh"
             vertices.append(mesh + found[:, :3])
             modes.append(found[:, 3:].reshape(3 * len(mesh), -1))
         return np.concatenate(vertices), np.concatenate(modes)
+
+
+def interpolate_displacements(
+    particles: FloatArray, values: FloatArray, points: FloatArray, *, most_dense: int = MOST_DENSE
+) -> FloatArray:
+    """Interpolate values at particles to other points by biharmonic splines.
+
+    Up to `most_dense` particles, one spline passes through all of them: time grows with their cube. More particles
+    are fitted by an affine map, and a spline through the `NEIGHBOURS` nearest particles interpolates the residuals at
+    each point, as `scipy.interpolate.RBFInterpolator(neighbors=...)` does: time grows with the number of points.
+
+    Args:
+        particles: (P, 3) mm, P at least 5, all different.
+        values: (P, D) such as displacements and modes, mm.
+        points: (V, 3) mm.
+        most_dense: the largest P for which one spline passes through all particles.
+
+    Returns:
+        (V, D) values at the points.
+
+    Raises:
+        np.linalg.LinAlgError: the particles lie in a plane, or nearly coincide.
+    """
+    if len(particles) <= most_dense:
+        spline = RBFInterpolator(particles, values, kernel="linear", degree=1)
+        return np.asarray(spline(points), dtype=np.float64)
+    centre = particles.mean(axis=0)
+    design = np.column_stack([np.ones(len(particles)), particles - centre])
+    affine = np.linalg.lstsq(design, values, rcond=None)[0]
+    nearest = np.asarray(KDTree(particles).query(points, NEIGHBOURS)[1], dtype=np.int64)
+    weights = np.concatenate(
+        [
+            _spline_weights(points[at : at + _BATCH], particles[nearest[at : at + _BATCH]])
+            for at in range(0, len(points), _BATCH)
+        ]
+    )
+    starts = np.arange(0, nearest.size + 1, NEIGHBOURS)
+    matrix = csr_array((weights.ravel(), nearest.ravel(), starts), shape=(len(points), len(particles)))
+    residuals = np.asarray(matrix @ (values - design @ affine), dtype=np.float64)
+    return residuals + np.column_stack([np.ones(len(points)), points - centre]) @ affine
+
+
+def _spline_weights(points: FloatArray, neighbours: FloatArray) -> FloatArray:
+    """Return the weights (B, k) of a biharmonic spline with a constant, through `neighbours` (B, k, 3), at `points`."""
+    count = neighbours.shape[1]
+    system = np.ones((len(points), count + 1, count + 1))
+    system[:, :count, :count] = -np.linalg.norm(neighbours[:, :, None] - neighbours[:, None], axis=3)
+    system[:, count, count] = 0.0
+    right = np.ones((len(points), count + 1, 1))
+    right[:, :count, 0] = -np.linalg.norm(neighbours - points[:, None], axis=2)
+    return np.asarray(np.linalg.solve(system, right)[:, :count, 0], dtype=np.float64)
 
 
 def _surface(

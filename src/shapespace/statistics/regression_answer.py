@@ -9,6 +9,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.observed import blank_where, weights_of, with_shape_data
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
     SMALL,
@@ -43,7 +44,7 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         for name, at in (("low", found.low_at), ("high", found.high_at))
     }
     fitted = found.cohort.fitted
-    return Answer(
+    answer = Answer(
         question="regress",
         title=f"{found.target} from shape",
         summary=_summary(found, new),
@@ -59,11 +60,12 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
     )  # fmt: skip
+    return with_shape_data(answer, found.cohort)
 
 
 def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> Answer:
     """Return the answer of a predictor that was learned earlier."""
-    return Answer(
+    answer = Answer(
         question="regress",
         title=f"{learned.target} from shape",
         summary=(
@@ -76,6 +78,7 @@ def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> A
         settings={"target": learned.target, "gauge": learned.gauge, "level": learned.level},
         model_hashes=(learned.model_hash,) if learned.model_hash else (),
     )
+    return with_shape_data(answer, cohort)
 
 
 def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
@@ -170,7 +173,9 @@ def _calibration(found: Regression) -> CurvePart:
 
 def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
     low, high = found.shape_at(found.low_at), found.shape_at(found.high_at)
-    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0, "per_unit_mm": found.map}
+    blank = weights_of(found.cohort.observed_share) == 0
+    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
+    arrays["per_unit_mm"] = blank_where(found.map, blank)
     if found.cohort.faces is None:
         return arrays, []
     arrays["faces"] = found.cohort.faces

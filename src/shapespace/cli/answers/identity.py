@@ -51,7 +51,7 @@ def run_identify(arguments: argparse.Namespace) -> int:
 
 
 def _add_who(sub: argparse.ArgumentParser) -> None:
-    add_cohort(sub)
+    add_cohort(sub, "coefficients")
     sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
     sub.add_argument("--gallery", metavar="EXPR",
                      help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all; of "

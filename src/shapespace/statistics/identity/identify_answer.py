@@ -20,6 +20,7 @@ from shapespace.statistics.identity.told import (
     settings,
     who_was_tested,
 )
+from shapespace.statistics.observed import with_shape_data
 
 
 def answer_of_identification(found: Identification) -> Answer:
@@ -58,7 +59,7 @@ def answer_of_identification(found: Identification) -> Answer:
         ]
     )
     told = ("score", "figure", "value", "low", "high")
-    return Answer(
+    answer = Answer(
         question="recognise identify",
         title="Who is it? Identification",
         summary=summary,
@@ -78,6 +79,7 @@ def answer_of_identification(found: Identification) -> Answer:
         settings=settings(found.options),
         model_hashes=hashes(trial),
     )
+    return with_shape_data(answer, trial.cohort)
 
 
 def _rows(one: Identified) -> list[Sequence[object]]:

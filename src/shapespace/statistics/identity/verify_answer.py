@@ -23,6 +23,7 @@ from shapespace.statistics.identity.told import (
     who_was_tested,
 )
 from shapespace.statistics.identity.verify import FAR, GRID, Verification, Verified
+from shapespace.statistics.observed import with_shape_data
 
 _LEAST_RATE = 1e-4
 _BINS = 40
@@ -72,7 +73,7 @@ def answer_of_verification(found: Verification) -> Answer:
         **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
     }
     told = ("score", "figure", "value", "low", "high")
-    return Answer(
+    answer = Answer(
         question="recognise verify",
         title="Who is it? Verification",
         summary=summary,
@@ -86,6 +87,7 @@ def answer_of_verification(found: Verification) -> Answer:
         settings=settings(found.options),
         model_hashes=hashes(trial),
     )
+    return with_shape_data(answer, trial.cohort)
 
 
 def _cost(one: Verified) -> str:
