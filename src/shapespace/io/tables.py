@@ -32,6 +32,8 @@ _DELIMITERS = (",", ";", "\t")
 _INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
+_MOST_LACKING = 2**18
+"""Cells that all rows of a table together may be shorter than its header; they take memory that the file has not."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _OLD_EXCEL = b"\xd0\xcf\x11\xe0"
 _SEPARATOR = re.compile(r'"?sep=(.)"?')
@@ -141,7 +143,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
         if len(set(known)) != len(known):
             raise ValueError("has two columns of one name")
         yield header
-        at = header.index(CHECKSUM) if CHECKSUM in header else None
+        at, lacking = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):
             if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
                 del row[len(raw) :]
@@ -149,6 +151,9 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
                 raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
             if at is not None and row_checksum(raw, row) != row[at]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
+            lacking += len(raw) - len(row)
+            if lacking > _MOST_LACKING:
+                raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
             yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
         raise ValueError(f"is not a CSV table ({error})") from error
