@@ -345,7 +345,7 @@ def _add_report(commands: Any) -> None:
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
     sub.add_argument("--labels", type=Path, metavar="FILE",
-                     help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
+                     help="table of scans and labels (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.report)
 
@@ -401,7 +401,7 @@ def _add_recognise_train(commands: Any) -> None:
                "--classifier mean-direction")  # fmt: skip
     sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
     sub.add_argument("--labels", type=Path, required=True, metavar="FILE",
-                     help="CSV of file and label, and of subject if known")  # fmt: skip
+                     help="table of scans and their labels, and subjects if known")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.skops")
     sub.add_argument("--classifier", default="lda", metavar="NAME",
                      help="mean-direction, knn, lda (default), qda, logistic or svm")  # fmt: skip
