@@ -19,7 +19,7 @@ from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size,
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Mesh, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
@@ -82,7 +82,7 @@ class Cohort:
         table: what is known of each, N rows in this order.
         gauge: `shape` or `form`.
         faces: (F, 3) triangles; None for points.
-        landmarks: name -> vertex.
+        landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
     """
@@ -95,7 +95,7 @@ class Cohort:
     table: Table
     gauge: Gauge = "shape"
     faces: IntArray | None = None
-    landmarks: Mapping[str, int] | None = None
+    landmarks: SurfaceLandmarks | None = None
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
 
@@ -109,6 +109,8 @@ class Cohort:
         )
         if not agree:
             raise InputError("A cohort needs a row of coefficients, a size and a row of the table for each shape.")
+        if self.landmarks is not None:
+            object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -193,7 +195,7 @@ class Cohort:
             faces: (F, 3) triangles.
             gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
             align: False takes them as they stand.
-            landmarks: name -> vertex.
+            landmarks: named points on the surfaces (`place_landmarks`), or name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
             least: how many shapes there must be, where `onto` is None.
 
@@ -219,8 +221,9 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks
-        )
+            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces,
+            None if landmarks is None else SurfaceLandmarks.of(landmarks),
+        )  # fmt: skip
         refuse_twice(cohort)
         return cohort
 
@@ -301,7 +304,7 @@ class Cohort:
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
-            dict(model.landmarks), fitted,
+            model.landmarks, fitted,
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort

@@ -32,17 +32,17 @@ from shapespace.correspondence.rounds import (
 )
 from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.errors import MeshError, ShapespaceError
-from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.landmarks import far_landmarks, place_landmarks
+from shapespace.geometry.surface import face_areas, rms_size
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
-from shapespace.io.landmarks import write_landmark_indices
+from shapespace.io.landmarks import write_surface_landmarks
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.types import Mesh
+from shapespace.types import Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
 _KEPT = ".rounds"
@@ -133,6 +133,7 @@ def _corresponding(
         _note_other_objects(made, notes)
     records = _records(made, read, jobs, folder)
     _tell(records, made, given, say)
+    _report_landmarks(records, read, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
@@ -176,6 +177,7 @@ class _Read:
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     hashes: dict[str, str] = field(default_factory=dict[str, str])
     unread: dict[str, str] = field(default_factory=dict[str, str])
+    landmark_distances: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
 def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Read:
@@ -190,7 +192,11 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Rea
                 read.unread[job.name] = f"broken: {error}"
             else:
                 own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
-                read.scans[job.name], read.notes[job.name] = _looked_at(own)
+                read.scans[job.name], read.notes[job.name] = scan, notes = _looked_at(own)
+                if scan.landmarks:
+                    placed = place_landmarks(scan, scan.landmarks)
+                    read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
+                    notes += _far_notes(scan, placed)
                 read.hashes[job.name] = content_hash
             bar.update()
     return read
@@ -203,6 +209,38 @@ def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
         return scan, []  # it is set aside with that reason
     notes = [f"{one.what} {one.action}" for one in findings if one.level == "note"]
     return without_astray(mesh), [*notes, *_told_astray(mesh)]
+
+
+def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
+    """Return a sentence on landmarks of `scan` that are off its surface by more than their placing can explain."""
+    far = far_landmarks(scan, placed)
+    if not far:
+        return []
+    listed = sorted(far, key=lambda name: -far[name])[:_LISTED]
+    named = ", ".join(f"{name} ({far[name]:.2g})" for name in listed) + (", ..." if len(far) > _LISTED else "")
+    return [f"Landmarks farther from its surface than 1 % of its size and than its mean edge: {named} of its units."]
+
+
+def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:
+    """Say how far the given landmarks are from the scans, and from their places on the corresponding surfaces."""
+    shares = {
+        (name, scan): distance / rms_size(read.scans[scan].vertices)
+        for scan, distances in read.landmark_distances.items()
+        for name, distance in distances.items()
+    }
+    if not shares:
+        return
+    name, scan = max(shares, key=lambda key: shares[key])
+    sentence = (
+        f"The given landmarks of {len(read.landmark_distances)} scans are {100 * np.mean(list(shares.values())):.2g} % "
+        f"of the size from the surface of their scan on average, at most {100 * shares[name, scan]:.2g} % ({name} of "
+        f"{scan})"
+    )
+    off = [
+        one.landmark_rms / rms_size(read.scans[one.name].vertices) for one in records if one.landmark_rms is not None
+    ]
+    after = f"; from their places on the corresponding surfaces {100 * np.mean(off):.2g} % (RMS)" if off else ""
+    say(f"{sentence}{after}.")
 
 
 def _told_astray(scan: Mesh) -> list[str]:
@@ -277,6 +315,7 @@ def _records(
         if one is not None and one.vertices is not None:
             surface = Mesh(one.vertices, made.template.faces, name=name)
             record = _judged(record, surface, made.template, read.scans[name])
+        record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
@@ -343,10 +382,8 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
-    if made.template.landmarks:
-        points = np.stack(list(made.template.landmarks.values()))
-        nearest = build_engine(made.template).query(points).vertex
-        write_landmark_indices(folder / LANDMARKS, dict(zip(made.template.landmarks, nearest.tolist(), strict=True)))
+    if made.landmarks:
+        write_surface_landmarks(folder / LANDMARKS, made.landmarks)
     else:
         remove_file(folder / LANDMARKS)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.correspondence.guide import Others, aligned, told_by_others
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places, agreed, unlike_most, without_astray
+from shapespace.correspondence.landmarks import Marks, agreed, unlike_most, without_astray
 from shapespace.correspondence.mirror import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
@@ -24,11 +24,12 @@ from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.correspondence.template import Glance, choose, clean, given, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, Mesh, Similarity
+from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
@@ -121,20 +122,27 @@ class Correspondence:
         scans: in the order given.
         why: where the first template came from, in a sentence.
         moved: RMS movement in each round, share of the size.
+        landmarks: the landmarks that scans have, on each of the surfaces.
     """
 
     template: Mesh
     scans: tuple[Corresponding, ...]
     why: str
     moved: tuple[float, ...]
+    landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
 
     __repr__ = short_repr
 
     def meshes(self) -> list[Mesh]:
-        """Return the surfaces of those that are not set aside, in their scans' own frames."""
-        return [
-            Mesh(scan.vertices, self.template.faces, name=scan.name) for scan in self.scans if scan.vertices is not None
-        ]
+        """Return the surfaces of those that are not excluded, in their scans' own frames, with their landmarks.
+
+        A landmark in a triangle of which a vertex is missing is left out.
+        """
+        return [self._mesh(scan.name, scan.vertices) for scan in self.scans if scan.vertices is not None]
+
+    def _mesh(self, name: str, vertices: FloatArray) -> Mesh:
+        there = self.landmarks.within(np.isfinite(vertices).all(axis=1))
+        return Mesh(vertices, self.template.faces, there.positions(vertices), name)
 
 
 class Runner(Protocol):
@@ -194,7 +202,7 @@ def first_template(
     if model is not None:
         if model.faces is None:
             raise MeshError("The model has no triangles, and a template needs them; leave it out, or give another.")
-        points = {name: model.mean_vertices[vertex] for name, vertex in model.landmarks.items()}
+        points = model.landmarks.positions(model.mean_vertices)
         mesh, why = (
             Mesh(model.mean_vertices, model.faces, points, "mean"),
             "The template is the mean of the model given.",
@@ -295,7 +303,7 @@ class _State:
         self.broken, self.reasons = first.broken, dict(first.broken)
         self.template, self.guide = first.mesh, first.guide
         self.harmonics = Harmonics.of(first.mesh, settings.first.harmonics)
-        self.places = Places.on(first.mesh, first.mesh.landmarks)
+        self.places = place_landmarks(first.mesh, first.mesh.landmarks)
         self.mirror = (
             Mirror.of(first.mesh, self.harmonics, settings.first, settings.seed) if settings.symmetric else None
         )
@@ -461,9 +469,10 @@ class _State:
     def result(self, why: str) -> Correspondence:
         """Return the scans with what is known of each."""
         scans = [self._ended(i) for i in range(len(self.names))]
-        points = dict(zip(self.places.names, self.places.at(self.template.vertices), strict=True))
+        points = self.places.positions(self.template.vertices)
         template = self.template.with_vertices(self.template.vertices, points)
-        return Correspondence(template, tuple(scans), why, tuple(self.moved))
+        landmarks = replace(self.places, distance_mm=np.empty(0))  # places on a mean have no given point
+        return Correspondence(template, tuple(scans), why, tuple(self.moved), landmarks)
 
     def _ended(self, i: int) -> Corresponding:
         moves, seconds = tuple(self.moves.get(i, ())), tuple(self.seconds.get(i, ()))
