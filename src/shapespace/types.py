@@ -202,8 +202,9 @@ class SurfaceLandmarks(Mapping[str, int]):
                 f"{count} landmarks need corners ({count}, 3), barycentric coordinates ({count}, 3) and distances "
                 f"({count},), not {corners.shape}, {weights.shape} and {distance.shape}."
             )
-        total = weights.sum(axis=1, keepdims=True)
-        if not ((weights >= 0).all() and (np.abs(total - 1.0) <= _FEW_DIGITS).all()):
+        within = bool(((weights >= 0) & (weights <= 1.0 + _FEW_DIGITS)).all())
+        total = weights.sum(axis=1, keepdims=True) if within else np.zeros((count, 1))
+        if not (within and (np.abs(total - 1.0) <= _FEW_DIGITS).all()):
             raise InputError("Barycentric coordinates of landmarks must not be negative, with the sum 1.")
         # What differs by rounding alone stays as it is, so that it is the same again once it was written and read.
         weights = np.where(np.abs(total - 1.0) > _ROUNDING, weights / total, weights)

@@ -12,8 +12,8 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.surface import rms_size
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
-_AT_VERTEX = 1e-12
-"""A landmark within this share of the object's size of a vertex is at that vertex: rounding of float64."""
+_ROUNDING = 1e-12
+"""Share of the object's size (RMS) that is rounding of float64: so near to a vertex or to the surface is at it."""
 _FAR_SHARE = 0.01
 """Share of the object's size (RMS): a landmark farther than this and than a mean edge is likely not of the surface."""
 
@@ -54,12 +54,12 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray]) -> SurfaceLand
     assert near.triangle is not None and near.barycentric is not None
     corners, weights = faces[near.triangle], np.clip(near.barycentric, 0.0, None)
     weights = weights / weights.sum(axis=1, keepdims=True)
-    off = np.linalg.norm(near.points - whole[near.vertex], axis=1)
-    weights[off <= _AT_VERTEX * rms_size(whole[there])] = 0.0
-    at_vertex = ~weights.any(axis=1)
-    weights[at_vertex, 0] = 1.0
+    rounding_mm = _ROUNDING * rms_size(whole[there])
+    at_vertex = np.linalg.norm(near.points - whole[near.vertex], axis=1) <= rounding_mm
+    weights[at_vertex] = 1.0, 0.0, 0.0
     corners = np.where(at_vertex[:, None], near.vertex[:, None], corners)
-    return SurfaceLandmarks(tuple(points), corners, weights, near.distance)
+    distance = np.where(near.distance <= rounding_mm, 0.0, near.distance)
+    return SurfaceLandmarks(tuple(points), corners, weights, distance)
 
 
 def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
@@ -70,7 +70,8 @@ def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> dict[str, float]:
     there = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
     limit = _FAR_SHARE * rms_size(mesh.vertices[there])
     if mesh.faces is not None:
-        edges: FloatArray = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
-        limit = max(limit, float(np.nanmean(np.linalg.norm(edges, axis=2))))
+        edges = mesh.vertices[mesh.faces] - mesh.vertices[np.roll(mesh.faces, 1, axis=1)]
+        lengths = np.asarray(np.linalg.norm(edges, axis=2), dtype=np.float64)
+        limit = max(limit, float(np.nanmean(lengths)))
     distances = zip(landmarks.names, landmarks.distance_mm, strict=True)
     return {name: float(distance) for name, distance in distances if distance > limit}

@@ -20,7 +20,7 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
 _SHOWN = 2
@@ -299,7 +299,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
 
 
 def _points(found: Asymmetry) -> TablePart:
-    of = {v: name for name, v in (found.cohort.landmarks or {}).items()}
+    of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
         TableColumn(name="point"), TableColumn(name="directional", kind="mm"), TableColumn(name="p", kind="p"),
         TableColumn(name="fluctuating", kind="mm"),
