@@ -152,7 +152,7 @@ def test_landmarks_between_vertices_are_recovered_between_vertices() -> None:
     off_mm, snapped_mm, share = [], [], []
     for k, z in enumerate(np.random.default_rng(8).uniform(-1.0, 1.0, (3, 5))):
         pose = similarity(k, 20.0, 1.0)
-        raw = raw_scan(z, pose, vertices=4000, model_vertices=700, noise_mm=0.1)
+        raw = raw_scan(z, pose, vertices=4000, model_vertices=700, noise_mm=1.5)
         truth = model.landmarks.positions(raw.truth)
         result = fit_scan(model, raw.scan, MM, landmarks=truth)
         assert result.start == "landmarks" and result.landmark_stddev_mm is not None
@@ -162,8 +162,8 @@ def test_landmarks_between_vertices_are_recovered_between_vertices() -> None:
         nearest = result.surface().vertices[list(model.landmarks.values())]
         snapped_mm += np.linalg.norm(nearest - true, axis=1).tolist()
         share.append((at - true) / np.stack([result.landmark_stddev_mm[name] for name in model.landmarks]))
-    assert np.mean(off_mm) < 0.6 and np.mean(snapped_mm) > 4.0
-    assert 0.2 < np.sqrt(np.mean(np.square(share))) < 1.8
+    assert np.mean(off_mm) < 0.8 and np.mean(snapped_mm) > 4.0
+    assert 0.5 < np.sqrt(np.mean(np.square(share))) < 1.6
 
 
 def test_landmarks_at_vertices_fit_to_the_bit_as_vertices_did() -> None:

@@ -18,6 +18,7 @@ from shapespace.commands.about import ABOUT, read_about
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.landmarks import far_landmarks, place_landmarks
 from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.surface import without_estimates
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import is_of_vertices, read_landmarks, read_surface_landmarks
@@ -393,7 +394,7 @@ def _odd_size(model: ShapeModel, unit: str) -> list[str]:
 
 def _training_mesh(path: Path) -> Mesh:
     try:
-        mesh = mesh_at(path)
+        mesh = without_estimates(mesh_at(path))
     except MeshError as error:
         raise MeshError(naming(path, str(error))) from error
     if not len(mesh.vertices):
