@@ -8,7 +8,7 @@ three such models in one: shape, colour, expression.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -30,8 +30,8 @@ _AGAIN = "export it again from where it was made"
 _LARGEST_BYTES = 2**31
 _POINTS_AT = 1e-3
 """Share of the extent of the model; landmarks farther from its surface are not on it."""
-_SINGLE = 1e-6
-"""Share of the extent of the model by which single precision may move a point."""
+_SINGLE = 2e-6
+"""Share of the size of the model by which single precision may move a point."""
 _UNIT_LENGTH = 1e-2
 _BFM_MODES = 199
 _BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
@@ -295,19 +295,15 @@ def _landmarks(
     if not found:
         return SurfaceLandmarks()
     own = faces if faces is not None and are_triangles(faces, len(surfaces[0])) else None
-    placed = [place_landmarks(Mesh(surface, own), found) for surface in surfaces]
+    placed = [place_landmarks(Mesh(surface, own), found, precision=_SINGLE) for surface in surfaces]
     best = min(placed, key=lambda one: float(one.distance_mm.sum()))
-    extent = float(np.ptp(surfaces[0], axis=0).max())
-    there = best.distance_mm <= _POINTS_AT * extent
+    there = best.distance_mm <= _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
     if not there.all():
         notes.append(
             f"{int((~there).sum())} of {len(found)} landmarks lie more than {100 * _POINTS_AT:g} % of the extent of "
             "the model off its surface and are left out."
         )
-    # What single precision does to points on the surface is no distance.
-    distance = np.where(best.distance_mm > _SINGLE * extent, best.distance_mm, 0.0)
-    rounded = replace(best, distance_mm=distance)
-    return rounded.select([name for name, is_there in zip(best.names, there, strict=True) if is_there])
+    return best.select([name for name, is_there in zip(best.names, there, strict=True) if is_there])
 
 
 def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:

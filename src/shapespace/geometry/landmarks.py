@@ -12,13 +12,11 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.surface import rms_size
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
-_ROUNDING = 1e-12
-"""Share of the object's size (RMS) that is rounding of float64: so near to a vertex or to the surface is at it."""
 _FAR_SHARE = 0.01
 """Share of the object's size (RMS): a landmark farther than this and than a mean edge is likely not of the surface."""
 
 
-def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray]) -> SurfaceLandmarks:
+def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: float = 1e-12) -> SurfaceLandmarks:
     """Place named points on a surface: each at the closest point of its triangles.
 
     Without triangles each is placed at the nearest vertex. Missing vertices (not-a-number) and their triangles are left
@@ -27,6 +25,8 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray]) -> SurfaceLand
     Args:
         mesh: the surface, in mm.
         points: name -> (3,) in the frame of `mesh`, mm.
+        precision: of the coordinates, as a share of the object's size (RMS); a point that is nearer than this to a
+            vertex or to the surface is at it. The default is the rounding of float64.
 
     Returns:
         The landmarks; their `distance_mm` is how far each point lies from the surface.
@@ -54,7 +54,7 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray]) -> SurfaceLand
     assert near.triangle is not None and near.barycentric is not None
     corners, weights = faces[near.triangle], np.clip(near.barycentric, 0.0, None)
     weights = weights / weights.sum(axis=1, keepdims=True)
-    rounding_mm = _ROUNDING * rms_size(whole[there])
+    rounding_mm = precision * rms_size(whole[there])
     at_vertex = np.linalg.norm(near.points - whole[near.vertex], axis=1) <= rounding_mm
     weights[at_vertex] = 1.0, 0.0, 0.0
     corners = np.where(at_vertex[:, None], near.vertex[:, None], corners)
