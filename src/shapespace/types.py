@@ -239,7 +239,8 @@ class SurfaceLandmarks(Mapping[str, int]):
     __repr__ = short_repr
 
     def __getstate__(self) -> dict[str, Any]:
-        return {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        # Plain values, as of `Mesh`.
+        return {one.name: getattr(self, one.name) for one in dataclasses.fields(self)} | {"names": list(self.names)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]

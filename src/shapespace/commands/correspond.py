@@ -292,7 +292,10 @@ def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
         return []
     listed = sorted(far, key=lambda name: -far[name])[:_LISTED]
     named = ", ".join(f"{name} ({far[name]:.2g})" for name in listed) + (", ..." if len(far) > _LISTED else "")
-    return [f"Landmarks farther from its surface than 1 % of its size and than its mean edge: {named} of its units."]
+    return [
+        "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
+        f"{named}."
+    ]
 
 
 def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:

@@ -51,6 +51,8 @@ _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
 _TOLD = 300
 _FILES: weakref.WeakKeyDictionary[ShapeModel, Path] = weakref.WeakKeyDictionary()
+_PLACES = "landmark_places"
+"""In the state of a model: landmarks between vertices, as plain arrays."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
 """Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
@@ -146,11 +148,15 @@ class ShapeModel:
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        plain = {name: dict(getattr(self, name)) for name in ("coding", "regions")}
-        return {**self.fields(), **plain}
+        plain = {name: dict(getattr(self, name)) for name in ("coding", "regions", "landmarks")}
+        places = None if self.landmarks.are_vertices else self.landmarks.__getstate__()
+        return {**self.fields(), **plain, _PLACES: places}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+        fields = dict(state)  # without places in states of earlier versions
+        if places := fields.pop(_PLACES, None):
+            fields["landmarks"] = SurfaceLandmarks(**places)
+        self.__init__(**fields)  # type: ignore[misc]
 
     @classmethod
     def fit(
