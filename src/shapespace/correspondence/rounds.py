@@ -26,6 +26,8 @@ from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
+from shapespace.io.beside import as_meshes
+from shapespace.late import late
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, Mesh, Similarity
@@ -129,6 +131,9 @@ class Correspondence:
     moved: tuple[float, ...]
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        return late("html_of_correspondence")(self)
 
     def meshes(self) -> list[Mesh]:
         """Return the surfaces of those that are not set aside, in their scans' own frames."""
@@ -262,6 +267,7 @@ def correspond(
         InputError: fewer than two scans, scans that are all equal, or too few that can be reached.
         MeshError: no scan can be a template, or the template is none.
     """
+    scans = list(as_meshes(scans, "correspond"))
     settings = settings or CorrespondSettings()
     first = first or first_template(scans, template, settings, model)
     state = _State([scan.name for scan in scans], first, settings)

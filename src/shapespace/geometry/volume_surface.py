@@ -19,8 +19,9 @@ from scipy import ndimage
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
+from shapespace.late import late
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
 
 SMOOTH = 1.3
 """Standard deviation of the smoothing by default, in voxels."""
@@ -75,6 +76,9 @@ class VolumeSurface:
 
     __repr__ = short_repr
 
+    def _repr_html_(self) -> str:
+        return late("html_of_volume_surface")(self)
+
 
 def surface_of_volume(
     volume: LabelVolume,
@@ -95,6 +99,7 @@ def surface_of_volume(
         InputError: no such label, several where none was chosen, too few voxels or too many, or a bad `smooth`.
         ShapespaceError: the extra `volumes` is not installed.
     """
+    require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.read_volume")
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen = _chosen(volume, labels)

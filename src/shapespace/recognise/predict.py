@@ -18,7 +18,8 @@ from shapespace.recognise.predictions import left_out, subject_folds
 from shapespace.recognise.saved import SavedClassifier, software_versions
 from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
 from shapespace.recognise.scores import fit_temperature, macro_accuracy
-from shapespace.types import FloatArray
+from shapespace.reprs import short_repr
+from shapespace.types import FloatArray, require
 
 UNSURE = "unsure"
 """The answer where the likeliest class is less likely than the stated confidence, or the fit is doubtful."""
@@ -49,6 +50,8 @@ class Answer:
     probabilities: FloatArray | None
     reason: str
     neutral: bool = False
+
+    __repr__ = short_repr
 
 
 def train_classifier(
@@ -86,6 +89,10 @@ def train_classifier(
         raise InputError(f"There is no classifier {classifier!r}; choose among {', '.join(CLASSIFIERS)}.")
     if not 0 <= confidence <= 1:
         raise InputError(f"The confidence must lie from 0 to 1, not {confidence!r}.")
+    for scan in scans:
+        require(
+            scan, ScanCoefficients, "train_classifier", "read them with shapespace.recognise.scans.read_coefficients"
+        )
     model_hash = one_model(scans)
     used, left_out_counts, notes = _with_labels(scans)
     z, labels, subjects = _samples(used, neutral if relative else None, projection)

@@ -19,6 +19,7 @@ from shapespace.errors import InputError
 from shapespace.recognise.classifiers import CLASSIFIERS, GRIDS
 from shapespace.recognise.learn import StratifiedGroupKFold
 from shapespace.recognise.scores import IndexArray, calibrated, fit_temperature, macro_accuracy
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 
 MODES: tuple[int | None, ...] = (10, 20, 40, None)
@@ -110,6 +111,8 @@ class Predictions:
     subjects: tuple[str, ...]
     index: IndexArray
     chosen: tuple[Choice, ...]
+
+    __repr__ = short_repr
 
 
 def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[tuple[IndexArray, IndexArray]]:

@@ -15,6 +15,7 @@ from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import write_rows
+from shapespace.reprs import short_repr
 from shapespace.schemas import Analysis, Part, Target, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
@@ -54,6 +55,8 @@ class Answer:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     model_hashes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def analysis(self) -> Analysis:
         """Return what analysis.json says."""

@@ -18,6 +18,7 @@ import numpy as np
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.late import other_package
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 INSTALL = "'shapespace[statistics]'"
@@ -101,6 +102,8 @@ class Design:
     variables: tuple[Variable, ...]
     values: Mapping[str, Sequence[str | float]]
     _spec: Any = field(repr=False)
+
+    __repr__ = short_repr
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
         """Return the (n, p) columns where each variable, by its name inside, has these n values."""

@@ -18,6 +18,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import other_package
+from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
 from shapespace.types import FloatArray, Mesh, read_only
@@ -51,6 +52,8 @@ class Tested:
     p_family: FloatArray
     q: FloatArray
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class EffectMap:
@@ -73,6 +76,8 @@ class EffectMap:
     any_way: Tested
     bump_mm: FloatArray | None = None
     bump: Tested | None = None
+
+    __repr__ = short_repr
 
     @property
     def shown_mm(self) -> FloatArray:

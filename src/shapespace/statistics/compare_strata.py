@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import Design, Term
 from shapespace.types import FloatArray
 
@@ -51,6 +52,8 @@ class Stratum:
     groups: Rows
     removed: int
     number: int
+
+    __repr__ = short_repr
 
     @property
     def df_error(self) -> int:

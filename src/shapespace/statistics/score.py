@@ -21,8 +21,9 @@ from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
+from shapespace.reprs import listed_briefly
 from shapespace.statistics.answer import Answer
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
 FEWEST_PEOPLE, SMALL = 5, 30
 """The least reference, and one below which the answer says that it is small."""
@@ -137,6 +138,18 @@ class Scores:
         """Return it as it is kept and reported."""
         return late("answer_of_scores")(self)
 
+    def __repr__(self) -> str:
+        told = listed_briefly(
+            [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
+        )
+        return (
+            f"<Scores of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
+            f"{self.modes} modes; {told}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def score(
     reference: Cohort,
@@ -162,6 +175,8 @@ def score(
             subject who is in the reference, or something missing in the column that says who is scanned.
         CorrespondenceError: shapes of different vertices.
     """
+    require(reference, Cohort, "score", "read one with shapespace.read_cohort")
+    require(subjects, Cohort, "score", "read one with shapespace.read_cohort")
     options = options or ScoreOptions()
     if options.subject is not None:
         reference = reference.complete([options.subject], drop_missing=options.drop_missing)

@@ -5,6 +5,7 @@ A figure is 960 pixels wide, and its smallest type stays legible when a phone sh
 
 from __future__ import annotations
 
+import io
 import re
 import textwrap
 import warnings
@@ -60,6 +61,16 @@ _GAP, _EDGE = 8, 4
 _MOST_LINES = 4
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
+
+
+class ShownFigure(Figure):
+    """A figure that shows itself once as the value of a notebook's cell, also where pyplot was never imported."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        with without_glyph_warnings():
+            FigureCanvasAgg(self).print_png(stream)
+        return stream.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +207,7 @@ def _drawn(
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
-    figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    figure = ShownFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image in pictures:
         high, wide = image.shape[:2]
         axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
@@ -269,7 +280,7 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
     top = (height_of(wrapped, TITLE) + 14) / DPI
     bottom = (height_of(below, SMALL) + 12) / DPI if below else 0.03
     total = sum(heights) + top + bottom
-    figure = Figure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    figure = ShownFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
     start = total * DPI - height_of(below, SMALL) - 2

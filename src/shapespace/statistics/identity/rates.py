@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 _LEVEL = 0.95
@@ -28,6 +29,8 @@ class Pairs:
     one: IntArray
     other: IntArray
     rows: IntArray
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.one)
@@ -59,6 +62,8 @@ class Roc:
     threshold: FloatArray
     far: FloatArray
     tar: FloatArray
+
+    __repr__ = short_repr
 
     @property
     def eer(self) -> float:
@@ -114,6 +119,13 @@ class Figure:
     value: float | None
     low: float | None = None
     high: float | None = None
+
+    def briefly(self) -> str:
+        """Return the figure as percent with its interval, for a line at a prompt."""
+        if self.value is None:
+            return "unknown"
+        interval = "" if self.low is None or self.high is None else f" ({100 * self.low:.3g} to {100 * self.high:.3g})"
+        return f"{100 * self.value:.3g} %{interval}"
 
 
 def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:

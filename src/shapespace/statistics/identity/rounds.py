@@ -12,6 +12,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table, named
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.statistics.identity.samples import Samples, samples_of
 from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
@@ -90,6 +91,8 @@ class Trial:
     group: IntArray
     all_pairs: bool
     notes: tuple[str, ...]
+
+    __repr__ = short_repr
 
     @cached_property
     def subjects(self) -> tuple[str, ...]:

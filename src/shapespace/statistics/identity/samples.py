@@ -9,6 +9,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 _NO_VARIANCE = 1e-9
@@ -34,6 +35,8 @@ class Samples:
     mm: FloatArray
     subjects: tuple[str, ...]
     n_vertices: int = 1
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         n = len(self.subjects)
