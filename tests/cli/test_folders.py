@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -208,3 +209,23 @@ def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     for command, line in commands:
         assert run(*command).err.splitlines().count(line) == 1
         assert "..." not in run(*command, "--quiet").err
+
+
+def test_a_log_says_how_far_a_long_step_is_ever_more_rarely(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "TOLD_AFTER_S", 0.05)
+    monkeypatch.setattr(progress, "TOLD_EVERY_S", 0.1)
+    with progress.steps(None, "permuting", "step", quiet=False) as step:
+        for done in range(1, 9):
+            step(done, 8)
+            time.sleep(0.05)
+    lines = capsys.readouterr().err.splitlines()
+    assert 3 <= len(lines) <= 6
+    assert lines[0].startswith("shapespace: permuting steps: ") and " of 8 done ..." in lines[0]
+    counted = [int(line.split(": ")[2].split(" of ")[0]) for line in lines]
+    assert counted == sorted(counted) and counted[-1] > counted[0]
+    with progress.steps(None, "permuting", "step", quiet=True) as step:
+        step(1, 2)
+        time.sleep(0.2)
+    assert not capsys.readouterr().err

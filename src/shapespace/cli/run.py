@@ -551,7 +551,12 @@ def convert(arguments: argparse.Namespace) -> int:
 
     mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
     source, target, notes = convert(
-        arguments.source, arguments.output, to=arguments.to, mm=mm, expressions=arguments.expressions
+        arguments.source,
+        arguments.output,
+        to=arguments.to,
+        mm=mm,
+        expressions=arguments.expressions,
+        quiet=arguments.quiet,
     )
     if arguments.json:
         show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})
