@@ -192,6 +192,22 @@ def test_build_of_dense_surfaces_keeps_the_landmarks_of_the_model_that_fitted_th
     assert "fitted by different models" in run("build", *surfaces, "-o", tmp_path / "m.h5").err
 
 
+@pytest.mark.parametrize("command", ["fit", "correspond"])
+def test_a_folder_of_scans_that_is_not_there_leaves_nothing(
+    run: Run, world: World, tmp_path: Path, command: str
+) -> None:
+    model = [world.model] if command == "fit" else []
+    ended = run(command, *model, tmp_path / "absent", "-o", tmp_path / "out")
+    assert ended.code == 2 and "there is no such file or folder" in ended.sentence()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_not_there_stops_a_batch_before_it_starts(run: Run, world: World, tmp_path: Path) -> None:
+    ended = run("fit", world.model, world.scan, tmp_path / "absent", "-o", tmp_path / "out")
+    assert ended.code == 2 and f"{tmp_path / 'absent'}: there is no such file or folder" in ended.sentence()
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
