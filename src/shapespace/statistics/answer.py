@@ -24,6 +24,10 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
 
 
+LESS_SO_THAT_NONE_FLIPS = "Drawn smaller than it is, so that no triangle turns over."
+"""The note of a morph whose full size would turn triangles over."""
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """What an analysis found, ready to be kept.

@@ -143,18 +143,25 @@ def surroundings(fit: StagedFit) -> FloatArray:
 def grid(
     rows: Sequence[Row],
     *,
-    title: str,
+    title: str | None,
     note: str = "",
     scale: Scale | None = None,
     keys: Sequence[tuple[str, Colour]] = (),
 ) -> Figure:
-    """Lay out pictures pixel for pixel in rows below `title`, with a key or a scale and a `note` below them.
+    """Lay out pictures pixel for pixel in rows, with a key or a scale and a `note` below them.
+
+    Args:
+        rows: of pictures.
+        title: above them; None where the page has it already.
+        note: below all.
+        scale: a colour bar, or None.
+        keys: names of colours.
 
     Raises:
         InputError: there are no pictures.
     """
     if not rows or not rows[0].panels:
-        raise InputError(f"{plain(title)}: there is nothing to draw.")
+        raise InputError(f"{plain(title or 'The figure')}: there is nothing to draw.")
     columns = max(len(row.panels) for row in rows)
     widest = max(row.panels[0].shape[1] for row in rows)
     total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
@@ -169,7 +176,8 @@ def grid(
             texts.append((x, y + baseline(k, size), line, {"fontsize": size, "va": "baseline", **style}))
         return height_of(wrapped, size)
 
-    y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
+    if title is not None:
+        y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
     for r, row in enumerate(rows):
         y += 10 if r and any(row.captions) and not row.heading else 0
         panels = without_empty_rows(row.panels)
