@@ -124,7 +124,7 @@ def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[
     people = np.asarray(subjects, dtype=str)
     count = len(np.unique(people))
     if not 2 <= n_folds <= count:
-        raise InputError(f"{count} people cannot be split into {n_folds} folds; ask for 2 to {count}.")
+        raise InputError(f"{count} subjects cannot be split into {n_folds} folds; ask for 2 to {count}.")
     # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
     parted: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
     return list(parted.split(people, np.zeros(len(people)), people))

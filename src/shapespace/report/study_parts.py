@@ -206,10 +206,10 @@ class StudyParts:
             part.subjects, part.mean, low=low, high=high, band=part.band or "interval", ceiling=part.ceiling
         )
         told = [
-            f"{100 * mean:.1f} % from {count:g} people" for count, mean in zip(part.subjects, part.mean, strict=True)
+            f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
         ]
         said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
-        about = "Share of right answers on people who were not learned from, against how many were."
+        about = "Share of right answers on subjects who were not learned from, against how many were."
         return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
 
     def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:

@@ -265,7 +265,7 @@ def _people(reference: Cohort, column: str | None) -> IntArray:
     count = int(codes.max()) + 1
     if count < FEWEST_PEOPLE:
         raise InputError(
-            f"A reference of {count} {'shapes' if column is None else 'people'} is too small to tell what is usual; "
+            f"A reference of {count} {'shapes' if column is None else 'subjects'} is too small to tell what is usual; "
             f"give {FEWEST_PEOPLE} or more, better {SMALL} and more."
         )
     return codes.astype(np.int32)
@@ -280,7 +280,7 @@ def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
     most = min(there, count - 3)
     if wanted is not None:
         if not 1 <= wanted <= most:
-            raise InputError(f"A reference of {count} people has 1 to {most} modes to measure by, not {wanted}.")
+            raise InputError(f"A reference of {count} subjects has 1 to {most} modes to measure by, not {wanted}.")
         return wanted
     enough = int(np.searchsorted(np.cumsum(variance) / variance.sum(), _SHARE)) + 1
     return max(1, min(enough, count // _PEOPLE_PER_MODE, most))
@@ -511,7 +511,7 @@ def _on_size(people: int) -> list[str]:
         return []
     step = 100 / (people + 1)
     return [
-        f"The reference is small: with {people} people shares are told in steps of {step:.0f} %, and what is usual is "
+        f"The reference is small: with {people} subjects shares come in steps of {step:.0f} %, and what is usual is "
         "known roughly."
     ]
 

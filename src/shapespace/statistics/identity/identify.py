@@ -142,7 +142,7 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
     """
     people, whose = np.unique(gallery, return_inverse=True)
     if len(people) < 2:
-        raise InputError(f"{len(people)} people are enrolled, and two are the least to tell apart; use fewer folds.")
+        raise InputError(f"{len(people)} subjects are enrolled, and two are the least to tell apart; use fewer folds.")
     best = np.full((len(people), len(probes)), -np.inf)
     np.maximum.at(best, whose, scores)
     own = people[:, None] == probes

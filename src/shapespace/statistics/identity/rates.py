@@ -95,7 +95,7 @@ class Sweep:
             raise InputError("Rates need a finite score for each pair.")
         if same.all() or not same.any():
             raise InputError(
-                f"There are {int(same.sum())} pairs of one person and {int((~same).sum())} of two; rates need both."
+                f"There are {int(same.sum())} pairs of one subject and {int((~same).sum())} of two; rates need both."
             )
         self._order = np.argsort(-score, kind="stable")
         ranked = score[self._order]

@@ -96,8 +96,8 @@ def samples_of(
         return Samples(x, variance if uncertainty else np.zeros_like(x), mm, tuple(subjects), vertices)
     if len(training) < 3:
         raise InputError(
-            "Surfaces without fits are whitened by those of people who are not tested, of whom there are "
-            f"{len(training)} and three are the least; ask for folds, or name people to train on."
+            "Surfaces without fits are whitened by those of subjects who are not tested, of whom there are "
+            f"{len(training)} and three are the least; ask for folds, or name subjects to train on."
         )
     known = mm[np.asarray(training, dtype=np.intp)]
     mean = known.mean(axis=0)

@@ -60,12 +60,12 @@ def thinned(x: FloatArray, y: FloatArray, label: str) -> Series:
 def who_was_tested(trial: Trial, trained_on: int) -> str:
     """Return in words who was compared, and who was learned from."""
     tested = int(trial.tested.sum())
-    learned = f"{trained_on} other people" if trained_on else "nobody"
+    learned = f"{trained_on} other subjects" if trained_on else "nobody"
     if len(trial.rounds) == 1:
-        return f"{tested} people were tested; what is learned was learned from {learned}."
+        return f"{tested} subjects were tested; what is learned was learned from {learned}."
     return (
-        f"{tested} people were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
-        f"learned from the other parts, of {trained_on} people at least."
+        f"{tested} subjects were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
+        f"learned from the other parts, of {trained_on} subjects at least."
     )
 
 
@@ -96,7 +96,7 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may "
+        else f"No error among {people} subjects does not mean none: up to {min(300 / people, 100):.1f} % of them may "
         "be ones with whom errors happen (95 %, rule of three)."
     )
 
