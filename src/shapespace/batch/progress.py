@@ -125,3 +125,15 @@ def _telling_a_log(what: str, far: Callable[[], str], *, quiet: bool) -> Generat
         yield
     finally:
         ended.set()
+
+
+@contextmanager
+def tell_after(seconds: float, sentence: str) -> Generator[None]:
+    """Print `sentence` on standard error, above any progress bar, if the block takes longer than `seconds`."""
+    later = threading.Timer(seconds, tqdm.write, (sentence, sys.stderr))
+    later.daemon = True
+    later.start()
+    try:
+        yield
+    finally:
+        later.cancel()

@@ -22,7 +22,7 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_vertices, part_of
+from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
 from shapespace.io.beside import MeshLike, as_meshes
 from shapespace.late import late
 from shapespace.model.missing import MIN_SEEN, Kept
@@ -462,9 +462,9 @@ def measure_quality(
     settings = settings or QualitySettings()
     meshes: Sequence[Mesh] = []
     if not isinstance(target, ShapeModel):
-        meshes = _checked(as_meshes(target, "measure_quality"))
+        meshes = _checked([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
     scans = None if scans is None else as_meshes(scans, "measure_quality")
-    new: list[Mesh] = list(as_meshes(unseen, "measure_quality"))
+    new: list[Mesh] = [without_estimates(mesh) for mesh in as_meshes(unseen, "measure_quality")]
     vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
     if scans is not None and len(scans) != len(meshes):
         raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
@@ -530,7 +530,7 @@ def _of_meshes(
     )
 
 
-def _checked(meshes: Sequence[Mesh]) -> Sequence[Mesh]:
+def _checked(meshes: list[Mesh]) -> list[Mesh]:
     if len(meshes) < _FEWEST:
         raise InputError(
             f"Quality is measured on shapes left out, which takes at least three meshes, not {len(meshes)}."

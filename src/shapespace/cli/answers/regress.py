@@ -39,6 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
+        if learned.model_hash and arguments.surfaces == "auto":
+            arguments.surfaces = "coefficients"
         cohort = cohort_of(arguments, learned.gauge, least=1)
         return finish(predicted_answer(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
@@ -62,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.new_shapes, arguments.model, arguments.surfaces, arguments.gauge, arguments.doubtful, least=1
         )
         with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-            fresh = read_cohort(arguments.predict, options, on_shape=step)
+            fresh = read_cohort(arguments.predict, options, onto=cohort, on_shape=step)
         there = subject is not None and subject in fresh.table.columns
         refuse_known(
             found.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where
