@@ -23,6 +23,12 @@ def short_repr(self: Any) -> str:
     return f"{type(self).__name__}({', '.join(told)})"
 
 
+def listed_briefly(parts: Sequence[str]) -> str:
+    """Return the first of `parts` in one line, and the number of the others."""
+    more = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
+    return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + more
+
+
 def told_briefly(value: Any) -> str:
     """Return a few words on `value`, of which nothing is measured or read for that."""
     if isinstance(value, np.ndarray):

@@ -713,7 +713,7 @@ class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
         faces: (F, 3).
         low_label: what `low` is.
         high_label: what `high` is.
-        times: by how much the difference is exaggerated in both; 1 is as it is.
+        times: by how much the difference is multiplied in both; 1 is as it is, below 1 it is drawn smaller.
     """
 
     arrays: str

@@ -37,6 +37,22 @@ _FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
 """By which the sum of barycentric coordinates may differ from 1: as written with few digits, and by rounding."""
 
 
+def require(value: object, wanted: type, function: str, how: str) -> None:
+    """Refuse an argument of another type in a sentence, where Python would name a missing attribute.
+
+    Args:
+        value: the argument.
+        wanted: its type.
+        function: that takes it.
+        how: the caller gets one, as the end of the sentence.
+
+    Raises:
+        InputError: it is of another type.
+    """
+    if not isinstance(value, wanted):
+        raise InputError(f"{function} takes a {wanted.__name__}, not {type(value).__name__}; {how}.")
+
+
 def read_only(array: npt.ArrayLike) -> FloatArray:
     """Return `array` as a C-ordered float64 array that refuses writing; a view where no copy is needed.
 

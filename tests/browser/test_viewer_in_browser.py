@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -192,6 +193,8 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     tab.page.get_by_test_id("tab-fits").click()
     rows = tab.page.get_by_test_id("fit")
     rows.first.wait_for()
+    chosen = tab.page.locator('[data-testid="fit"][aria-selected="true"]')
+    assert "converged" in (chosen.get_attribute("class") or "")  # it opens on the first good fit
     assert tab.page.get_by_test_id("fit-filter").is_hidden()  # there are few
     assert rows.first.get_attribute("data-name") == "broken"
     seen = []
@@ -212,6 +215,29 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     )
     assert change(shown, view(tab)) > 0.01
     assert tab.complaints == []
+
+
+def test_fits_without_stages_are_drawn_and_one_without_its_scan_says_so(open_tab, world: World, tmp_path: Path) -> None:
+    for name in ("fits", "scans"):
+        ignored = shutil.ignore_patterns("*.stages.npz")
+        shutil.copytree(world.home / name, tmp_path / name, ignore=ignored)
+    shutil.copy(world.model, tmp_path)
+    (tmp_path / "scans" / "holes.ply").unlink()
+    process, address = serve(str(tmp_path / "fits"))
+    try:
+        tab = ready(open_tab(address))
+        tab.page.get_by_test_id("tab-fits").click()
+        for name, alone in (("plain", False), ("holes", True)):
+            tab.page.locator(f'[data-testid="fit"][data-name="{name}"]').click()
+            tab.until(f"document.getElementById('caption-a').textContent === '{name}. The fitted model'")
+            assert drawn_share(view(tab)) > 0.1
+            assert (tab.page.get_by_test_id("fit-without-scan").count() == 1) is alone
+            assert (tab.page.locator("[data-testid=fit-colour] [data-value=model]").count() == 0) is alone
+            assert tab.page.locator("[data-testid=fit-colour] [data-value=regions]").count() == 0
+        tab.shot("alone")
+        assert tab.complaints == []
+    finally:
+        end(process, signal.SIGINT)
 
 
 def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,22 @@ def test_build_of_dense_surfaces_keeps_the_landmarks_of_the_model_that_fitted_th
     assert "fitted by different models" in run("build", *surfaces, "-o", tmp_path / "m.h5").err
 
 
+@pytest.mark.parametrize("command", ["fit", "correspond"])
+def test_a_folder_of_scans_that_is_not_there_leaves_nothing(
+    run: Run, world: World, tmp_path: Path, command: str
+) -> None:
+    model = [world.model] if command == "fit" else []
+    ended = run(command, *model, tmp_path / "absent", "-o", tmp_path / "out")
+    assert ended.code == 2 and "there is no such file or folder" in ended.sentence()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_not_there_stops_a_batch_before_it_starts(run: Run, world: World, tmp_path: Path) -> None:
+    ended = run("fit", world.model, world.scan, tmp_path / "absent", "-o", tmp_path / "out")
+    assert ended.code == 2 and f"{tmp_path / 'absent'}: there is no such file or folder" in ended.sentence()
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     run: Run, world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,3 +225,23 @@ def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     for command, line in commands:
         assert run(*command).err.splitlines().count(line) == 1
         assert "..." not in run(*command, "--quiet").err
+
+
+def test_a_log_says_how_far_a_long_step_is_ever_more_rarely(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "TOLD_AFTER_S", 0.05)
+    monkeypatch.setattr(progress, "TOLD_EVERY_S", 0.1)
+    with progress.steps(None, "permuting", "step", quiet=False) as step:
+        for done in range(1, 9):
+            step(done, 8)
+            time.sleep(0.05)
+    lines = capsys.readouterr().err.splitlines()
+    assert 3 <= len(lines) <= 6
+    assert lines[0].startswith("shapespace: permuting steps: ") and " of 8 done ..." in lines[0]
+    counted = [int(line.split(": ")[2].split(" of ")[0]) for line in lines]
+    assert counted == sorted(counted) and counted[-1] > counted[0]
+    with progress.steps(None, "permuting", "step", quiet=True) as step:
+        step(1, 2)
+        time.sleep(0.2)
+    assert not capsys.readouterr().err

@@ -88,8 +88,8 @@ def test_training_says_what_it_used_and_how_well_it_does(run: Run, train: Path, 
     assert (facts["model_hash"], facts["classes"]) == (HASH, ["anger", "fear", "smile"])
     assert facts["cross_validation"]["macro_accuracy"] > 0.9
     again = run("recognise", "train", train, "--labels", train / "labels.csv", "-o", tmp_path / "c.skops")
-    assert "lda of 4 classes from 32 scans of 8 people, 4 modes\n" in again.out
-    assert "macro accuracy on people left out: " in again.out
+    assert "lda of 4 classes from 32 scans of 8 subjects, 4 modes\n" in again.out
+    assert "macro accuracy on subjects left out: " in again.out
 
 
 def test_answers_are_the_same_from_the_folder_and_from_the_table(run: Run, classifier: Path, new: Path, tmp_path: Path):

@@ -37,6 +37,8 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NEEDS_DATA = "<!-- needs data -->"
+OUTPUT = "<!-- output of the commands above -->"
+"""Before a block whose lines the commands since the last Python block print, in this order."""
 # The demo takes minutes and the viewer runs until it is stopped; both have tests of their own. Here they are parsed.
 PARSED_ONLY = ("demo", "view")
 BESIDE = ("dask",)
@@ -51,6 +53,7 @@ class Block:
     text: str
     line: int
     needs_data: bool
+    is_output: bool = False
 
 
 def named(path: Path) -> str:
@@ -67,7 +70,8 @@ def blocks(document: Path) -> list[Block]:
                 start = number
             else:
                 language = lines[start][3:].strip()
-                found.append(Block(language, "\n".join(lines[start + 1 : number]), start + 1, before == NEEDS_DATA))
+                text = "\n".join(lines[start + 1 : number])
+                found.append(Block(language, text, start + 1, before == NEEDS_DATA, before == OUTPUT))
                 start, before = None, ""
         elif start is None and line.strip():
             before = line.strip()
@@ -119,12 +123,15 @@ def _run(
     document: Path, beside: contextlib.ExitStack, *, with_data: bool, instead: Mapping[str, Callable[[], None]]
 ) -> int:
     namespace: dict[str, Any] = {"__name__": "__main__"}
-    count = 0
+    count, printed = 0, ""
     for block in blocks(document):
         if block.needs_data and not with_data:
             continue
         where = f"{named(document)}, line {block.line}"
+        if block.is_output:
+            check_output(block, printed, where)
         if block.language == "python":
+            printed = ""
             # Padding makes the line numbers of a traceback those of the document.
             exec(compile("\n" * block.line + block.text, str(document), "exec"), namespace)
             count += 1
@@ -143,10 +150,19 @@ def _run(
                 cli.parser().parse_args(argv)
                 count += 1
                 continue
-            with contextlib.redirect_stdout(io.StringIO()):
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said):
                 assert cli.main(argv) == 0, f"{where}: {command}"
+            printed += said.getvalue()
             count += 1
     return count
+
+
+def check_output(block: Block, printed: str, where: str) -> None:
+    """Check that the lines of a block are printed in its order, whatever is printed between them."""
+    lines = iter(line.rstrip() for line in printed.splitlines())
+    for quoted in block.text.splitlines():
+        assert quoted.rstrip() in lines, f"{where}: {quoted!r} is not printed; this is:\n{printed}"
 
 
 @pytest.fixture

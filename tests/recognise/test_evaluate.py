@@ -58,7 +58,7 @@ def test_folds_never_split_a_person_and_are_balanced():
 
 @pytest.mark.parametrize("n_folds", [1, 4])
 def test_folds_that_cannot_be_made_are_refused(n_folds):
-    with pytest.raises(InputError, match="3 people"):
+    with pytest.raises(InputError, match="3 subjects"):
         subject_folds(["a", "a", "b", "c"], n_folds)
 
 

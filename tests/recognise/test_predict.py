@@ -136,7 +136,7 @@ def test_one_person_alone_gives_no_accuracy():
     scans = people(1) + [changed(s, name=f"{s.name}_2") for s in people(1, seed=0, spread=0.4)]
     saved, notes = train_classifier(scans)
     assert saved.cross_validation["macro_accuracy"] is None and saved.temperature == 1.0
-    assert "too few people" in notes[0]
+    assert "too few subjects" in notes[0]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from report_page import Page
 from test_recognition_report import EVIL, words_under
 
@@ -109,13 +110,31 @@ def test_names_that_are_scripts_stay_text(analysis: Path) -> None:
     assert EVIL not in page and "<script>alert" not in page and Page(page).words.count(EVIL) >= 4
 
 
-def test_maps_that_follow_each_other_stand_side_by_side(
+def test_charts_that_follow_each_other_stand_side_by_side_and_maps_have_the_whole_width(
     tmp_path: Path, head: Callable[..., Mesh], undrawn: None
 ) -> None:
-    both = {"a": PARTS["surface_map"], "b": SurfaceMapPart(title="The other", arrays="a.npz", signed=False)}
-    page = report(save(tmp_path / "compared", head(8), both))
+    maps = {"a": PARTS["surface_map"], "b": SurfaceMapPart(title="The other", arrays="a.npz", signed=False)}
+    page = report(save(tmp_path / "maps", head(8), maps))
+    assert 'class="beside"' not in page and page.index("Where") < page.index("The other")
+    charts = {"a": PARTS["histogram"], "b": PARTS["curve"]}
+    page = report(save(tmp_path / "charts", head(8), charts))
     beside = page[page.index('class="beside"') :]
-    assert beside.index("Where") < beside.index("The other") < beside.index("Settings")
+    assert beside.index("Permutations") < beside.index("DET") < beside.index("Settings")
+
+
+def test_a_title_stands_once_above_a_map_and_not_in_its_picture(
+    tmp_path: Path, head: Callable[..., Mesh], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[list[str]] = []
+
+    def encode(figure: Figure, **_: object) -> tuple[bytes, tuple[int, int]]:
+        drawn.append([text.get_text() for text in figure.texts])
+        return b"", (960, 300)
+
+    monkeypatch.setattr("shapespace.report.figures.encode_webp", encode)
+    page = report(save(tmp_path / "maps", head(8), {key: PARTS[key] for key in ("surface_map", "morph")}))
+    assert len(drawn) == 2 and not [text for texts in drawn for text in texts if text in ("Where", "From low to high")]
+    assert Page(page).words.count("Where") == 1
 
 
 @pytest.mark.parametrize(

@@ -172,13 +172,26 @@ def test_a_damaged_table_of_labels_is_refused_when_given_and_told_when_found(
     assert "There are no labels:" in Page(report(fits)).words
 
 
-def test_without_stages_a_sentence_names_the_command_and_stills_are_shown(fits: Path, sketched: None) -> None:
+def test_without_stages_scans_and_fitted_surfaces_are_drawn_with_their_distances(fits: Path, sketched: None) -> None:
     for path in fits.glob("*.stages.npz"):
         path.unlink()
     page = report(fits)
     words = Page(page).words
-    assert 'class="broken"' not in page
+    assert 'class="broken"' not in page and "No picture: the scan is" not in words
     assert "shapespace fit ../model.h5 ../scans -o . --stages --resume" in words
+    alts = [str(image["alt"]) for image in Page(page).images()]
+    assert [alt for alt in alts if alt.startswith("able: the scan, scan and model over each other, and a map")]
+    assert [alt for alt in alts if alt.startswith("Signed distance maps of charlie")]
+    assert not [alt for alt in alts if alt.startswith(("Regions of", "RMS of", "Scan and model of charlie by stage"))]
+    assert "charlie in detail" in words
+
+
+def test_without_stages_and_scans_the_fitted_surfaces_are_drawn_alone(fits: Path, sketched: None) -> None:
+    for path in (*fits.glob("*.stages.npz"), *(fits.parent / "scans").glob("*.ply")):
+        path.unlink()
+    page = report(fits)
+    words = Page(page).words
+    assert "charlie: the scan is no longer where it was, or has changed; the fitted surface is shown alone." in words
     alts = [str(image["alt"]) for image in Page(page).images()]
     assert "The fitted surface of able" in alts and not [alt for alt in alts if "over each other" in alt]
 

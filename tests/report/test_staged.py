@@ -13,7 +13,14 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.saved import Folder, find_fits, model_of, staged_fit
+from shapespace.report.saved import (
+    Folder,
+    ScanNotFoundError,
+    find_fits,
+    model_of,
+    saved_surfaces,
+    staged_fit,
+)
 from shapespace.report.staged import StagedFit
 from synthetic_shapes import blob_model, raw_scan
 
@@ -51,6 +58,34 @@ def test_a_saved_fit_is_the_fit_itself(home: Path) -> None:
         assert np.allclose(read.scan_to_model_mm[stage], fresh.scan_to_model_mm[stage], atol=1e-5, equal_nan=True)
     assert np.array_equal(read.b, fresh.b)
     assert len(read.history) == len(fresh.history)
+
+
+def test_saved_surfaces_and_the_scan_give_the_pictures_of_saved_stages(home: Path) -> None:
+    folder = Folder(home / "out")
+    before = {fit.name: staged_fit(folder, fit) for fit in find_fits(folder) if fit.fitted}
+    for path in (home / "out").glob("*.stages.npz"):
+        path.unlink()
+    for fit in find_fits(folder):
+        if not fit.fitted:
+            continue
+        drawn, staged = staged_fit(folder, fit), before[fit.name]
+        assert list(drawn.surfaces) == ["final"] and drawn.regions is None and drawn.history == ()
+        assert np.allclose(drawn.scan.vertices, staged.scan.vertices, atol=1e-4)
+        assert np.allclose(drawn.surfaces["final"].vertices, staged.surfaces["final"].vertices, atol=1e-4)
+        forward = drawn.model_to_scan_mm["final"], staged.model_to_scan_mm["final"]
+        backward = drawn.scan_to_model_mm["final"], staged.scan_to_model_mm["final"]
+        for one, other in (forward, backward):
+            assert np.allclose(np.abs(one), np.abs(other), atol=1e-3, equal_nan=True)
+
+
+def test_a_scan_that_has_changed_is_not_drawn_with_an_older_fit(home: Path) -> None:
+    folder = Folder(home / "out")
+    (home / "out" / "scan0.stages.npz").unlink()
+    write_mesh(home / "scan0.ply", raw_scan(np.full(5, 0.9), seed=7).scan)
+    (fit,) = [fit for fit in find_fits(folder) if fit.name == "scan0"]
+    with pytest.raises(ScanNotFoundError, match="has changed"):
+        staged_fit(folder, fit)
+    assert list(saved_surfaces(folder, fit)) == ["final"]
 
 
 def test_the_last_moment_is_the_final_surface(home: Path) -> None:

@@ -15,7 +15,7 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.mirror import find_mirror, mirror_pairs
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.surface import face_vectors, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry
@@ -269,6 +269,12 @@ def test_the_answer_can_be_read_and_says_what_is_not_known(thing: Symmetric, tmp
                     [part.get(k, k) for k in ("low", "high", "faces")] if part["kind"] == "morph" else [part["values"]]
                 )
                 assert all(name in arrays for name in names)
+            if part["kind"] == "morph":
+                faces = arrays["faces"]
+                middle = (arrays[names[0]] + arrays[names[1]]) / 2
+                area = face_vectors(middle, faces)
+                for end in names[:2]:
+                    assert (np.einsum("fd,fd->f", face_vectors(arrays[end], faces), area) > 0).all(), part["title"]
 
 
 def organ_cohort() -> Cohort:

@@ -15,8 +15,8 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import vertex_areas, vertex_normals
-from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, read, read_part
+from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
+from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
 from shapespace.statistics.change import Change, change
 from shapespace.statistics.change_align import align_by, align_robustly
 from shapespace.statistics.change_found import ChangeSettings
@@ -421,6 +421,31 @@ def test_the_answer_is_the_same_by_its_seed_and_its_parts_are_bounded(tmp_path: 
     assert len((tmp_path / "one" / "subjects.csv").read_text().splitlines()) == 11
     with np.load(tmp_path / "one" / "subjects.npz") as maps:
         assert maps["change_mm"].shape == (10, V)
+
+
+def test_a_noisy_change_is_drawn_as_a_part_so_that_no_triangle_turns_over() -> None:
+    noise = np.random.default_rng(5).normal(0, 12.0, (V, 3))
+    x = person(1).vertices
+    found = asked(cohort_of([x, x + noise], {"subject": ["a", "a"], "time": ["before", "after"]}), stable="all")
+    answer = found.answer()
+    [morph] = [part for part in answer.parts if isinstance(part, MorphPart)]
+    arrays = answer.arrays["change.npz"]
+    low, high, faces = (arrays[name] for name in (morph.low, morph.high, morph.faces))
+    whole = arrays[morph.high.removesuffix("_drawn")]
+    area = face_vectors(low, faces)
+    assert (np.einsum("fd,fd->f", face_vectors(whole, faces), area) <= 0).any()
+    assert (np.einsum("fd,fd->f", face_vectors(high, faces), area) > 0).all()
+    assert 0 < morph.times < 1 and np.allclose(high - low, morph.times * (whole - low))
+    assert "Drawn smaller" in morph.note
+
+
+@pytest.mark.parametrize(("mm", "unit"), [(2.0, "ml"), (0.002, "mm³")])
+def test_volumes_below_a_tenth_of_a_millilitre_are_stated_in_cubic_millimetres(mm: float, unit: str) -> None:
+    answer = asked(pairs([mm * bump() for _ in range(4)], rescans=True, noise_mm=0.002)).answer()
+    assert any(f" {unit} on average" in sentence for sentence in answer.summary)
+    tables = [part for part in answer.parts if isinstance(part, TablePart) and part.title == "Subjects"]
+    columns = [column.name for table in tables for column in table.columns]
+    assert f"volume, {unit}" in columns and f"stddev, {unit}" in columns
 
 
 def test_one_subject_alone_has_maps_and_no_test() -> None:

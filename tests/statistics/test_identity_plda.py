@@ -110,7 +110,7 @@ def test_errors_that_fits_state_help_where_they_differ():
 
 @pytest.mark.parametrize(("count", "scans"), [(2, 5), (6, 1)])
 def test_too_few_people_to_learn_from_are_refused(count, scans):
-    with pytest.raises(InputError, match="three people or more and several scans"):
+    with pytest.raises(InputError, match="three subjects or more and several scans"):
         TwoCovariance.learn(people(count, scans))
 
 

@@ -209,7 +209,7 @@ def test_surfaces_without_fits_are_whitened_by_people_who_are_not_tested():
 def test_identification_enrols_the_first_scan_of_each_person_and_says_so():
     found = identify(cohort(), FEW)
     assert found.enrolled == 3 and found.probes == 24 and found.trained_on == 9
-    assert any("first scan of each person" in note for note in found.answer().notes)
+    assert any("first scan of each subject" in note for note in found.answer().notes)
     by_hand = identify(cohort(), replace(FEW, gallery="expression=neutral"))
     np.testing.assert_array_equal(found.scores[0].cmc, by_hand.scores[0].cmc)
     assert found.scores[0].cmc[-1] == 1.0 and (np.diff(found.scores[0].cmc) >= 0).all()

@@ -194,7 +194,7 @@ def test_the_same_seed_gives_the_same_scores_and_one_subject_those_among_many() 
 def test_a_small_reference_is_said_to_be_small() -> None:
     rng = np.random.default_rng(10)
     found = score(population(8, rng), population(2, rng, name="s"))
-    assert "small" in found.notes[-1] and "8 people" in found.notes[-1] and np.isnan(found.z_limit)
+    assert "small" in found.notes[-1] and "8 subjects" in found.notes[-1] and np.isnan(found.z_limit)
     assert "a small reference" in found.answer().summary[0]
     large = score(population(30, rng), population(2, rng, name="s"))
     assert not any("small" in note for note in large.notes)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import httpx
 import numpy as np
 import pytest
-from viewer_world import Start, drop, model, scan_file, sentence, start, told
+from viewer_world import Start, drop, model, scan_file, sentence, start, told, unpacked
 
 from shapespace.batch.fit_work import Job, fit_file
 from shapespace.errors import InputError, ShapespaceError
@@ -401,11 +401,12 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("d", "unreadable", False),
         ("c", "failed", False),
         ("a", "converged", True),
-        ("b", "converged", False),
+        ("b", "converged", True),
     ]
-    assert len(listed[2]["z"]) == model.n_modes and "--stages" in listed[3]["why_not"]
+    assert len(listed[2]["z"]) == model.n_modes
     assert len(visitor.get("/api/fits/a").content) > 10_000
-    for name in ("b", "c", "d"):
+    assert len(visitor.get("/api/fits/b").content) > 10_000
+    for name in ("c", "d"):
         answer = visitor.get(f"/api/fits/{name}")
         assert answer.status_code == 422 and sentence(answer)
     saved = visitor.post("/api/export?format=ply", json={"fit": "a"})
@@ -418,6 +419,23 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("d", "unreadable"),
         ("e", "unreadable"),
     ]
+
+
+def test_a_fit_without_stages_is_shown_from_its_surfaces_and_its_scan(start: Start, fits: Path) -> None:
+    visitor = start(Shown.open(fits)).visitor()
+    (_, staged), (facts, plain) = (unpacked(visitor.get(f"/api/fits/{name}").content) for name in ("a", "b"))
+    assert facts["stages"] == ["final"] and "regions" not in plain
+    assert np.allclose(plain["scan"], staged["scan"], atol=1e-3)
+    assert np.allclose(plain["surface_final"], staged["surface_final"], atol=1e-3)
+    both = np.isfinite(plain["model_to_scan_final"]) & np.isfinite(staged["model_to_scan_final"])
+    assert both.mean() > 0.9
+    assert np.allclose(plain["model_to_scan_final"][both], staged["model_to_scan_final"][both], atol=1e-2)
+    record = json.loads((fits / "b.fit.json").read_text())
+    (fits / "b.fit.json").write_text(json.dumps(record | {"scan": {**record["scan"], "path": "gone.ply"}}))
+    visitor = start(Shown.open(fits)).visitor()
+    facts, alone = unpacked(visitor.get("/api/fits/b").content)
+    assert np.allclose(alone["surface_final"], plain["surface_final"]) and "scan" not in alone
+    assert facts["without_scan"].startswith("The fitted surface is shown alone, since the scan is no longer")
 
 
 def test_the_list_of_fits_tells_what_scan_and_model_both_show(fits: Path) -> None:

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import shutil
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from viewer_world import enter, served
+from viewer_world import enter, served, unpacked
 
 from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
 from shapespace.errors import FileFormatError, InputError
@@ -22,28 +21,6 @@ from shapespace.viewer.limits import Limits
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
-
-
-def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """As scene.js reads it."""
-    (length,) = struct.unpack("<I", content[:4])
-    header = json.loads(content[4 : 4 + length])
-    start, arrays = 8 * -(-(4 + length) // 8), {}
-    for name, spec in header["arrays"].items():
-        count = int(np.prod(spec["shape"]))
-        at = start + spec["offset"]
-        if "coded" in spec:
-            columns = spec["shape"][-1]
-            planes = np.frombuffer(content, np.uint8, 2 * count, at).reshape(columns, 2, -1).astype(np.uint16)
-            zigzag = (planes[:, 0] | planes[:, 1] << 8).astype(np.int32)
-            steps = np.where(zigzag & 1, -(zigzag >> 1) - 1, zigzag >> 1)
-            values = np.cumsum(steps, axis=1).astype(np.int16).T
-        else:
-            values = np.frombuffer(content, spec["dtype"], count, at).reshape(spec["shape"])
-        if "scale" in spec:
-            values = np.where(values == -32768, np.nan, values * spec["scale"])
-        arrays[name] = values
-    return header["facts"], arrays
 
 
 @contextmanager

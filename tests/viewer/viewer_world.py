@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 import uvicorn
 
@@ -27,6 +29,28 @@ from shapespace.viewer.shown import Shown
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 VERTICES = 400
+
+
+def unpacked(content: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """As scene.js reads it."""
+    (length,) = struct.unpack("<I", content[:4])
+    header = json.loads(content[4 : 4 + length])
+    start, arrays = 8 * -(-(4 + length) // 8), {}
+    for name, spec in header["arrays"].items():
+        count = int(np.prod(spec["shape"]))
+        at = start + spec["offset"]
+        if "coded" in spec:
+            columns = spec["shape"][-1]
+            planes = np.frombuffer(content, np.uint8, 2 * count, at).reshape(columns, 2, -1).astype(np.uint16)
+            zigzag = (planes[:, 0] | planes[:, 1] << 8).astype(np.int32)
+            steps = np.where(zigzag & 1, -(zigzag >> 1) - 1, zigzag >> 1)
+            values = np.cumsum(steps, axis=1).astype(np.int16).T
+        else:
+            values = np.frombuffer(content, spec["dtype"], count, at).reshape(spec["shape"])
+        if "scale" in spec:
+            values = np.where(values == -32768, np.nan, values * spec["scale"])
+        arrays[name] = values
+    return header["facts"], arrays
 
 
 @dataclass(frozen=True)

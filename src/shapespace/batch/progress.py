@@ -1,22 +1,51 @@
-"""What the user waits for: a bar or a line in a terminal, and in a log one line where it takes more than a moment."""
+"""Progress of long steps: a bar in a terminal, and without one lines in a log, ever more rarely."""
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 TOLD_AFTER_S = 5.0
-"""What takes longer than this is told where there is no terminal."""
+"""Seconds after which a log is told of a step that still runs, where there is no terminal."""
+TOLD_EVERY_S = 60.0
+"""The longest pause between two lines of one step in a log, s; pauses double until then, so that logs stay short."""
+
+
+if TYPE_CHECKING:
+    _Tqdm = tqdm[Any]
+else:
+    _Tqdm = tqdm
+
+
+class Bar(_Tqdm):
+    """A bar that counts also where it is not drawn."""
+
+    counted: float = 0
+    """How many are done."""
+
+    said = ""
+    """The description that was set last."""
+
+    def update(self, n: float | None = 1) -> bool | None:
+        """Count `n` more."""
+        self.counted += n or 0
+        return super().update(n)
+
+    def set_description_str(self, desc: str | None = None, refresh: bool | None = True) -> None:
+        """Set the description."""
+        self.said = desc or ""
+        super().set_description_str(desc, bool(refresh))
 
 
 @contextmanager
-def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[tqdm[Any]]:
-    """Yield a bar on standard error; without a terminal one line says what is being done, with `quiet` nothing.
+def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[Bar]:
+    """Yield a bar on standard error; without a terminal lines in a log say how far it is, with `quiet` nothing.
 
     Args:
         total: how many there are, where that is known.
@@ -27,11 +56,14 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
     several = unit + ("es" if unit.endswith("sh") else "s")
     what = f"{doing} {several}" if total is None else f"{doing} {total} {unit if total == 1 else several}"
     # disable=None is tqdm's way to ask whether there is a terminal.
-    with (
-        _telling_a_log(what, quiet=quiet),
-        tqdm(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar,
-    ):
-        yield bar
+    with Bar(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar:
+
+        def far() -> str:
+            said = f", {bar.said}" if bar.said else ""
+            return f"{said}: {bar.counted:g} of {bar.total:g} done" if bar.counted and bar.total else said
+
+        with _telling_a_log(what, far, quiet=quiet):
+            yield bar
 
 
 @contextmanager
@@ -41,7 +73,7 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 
         def step(done: int, total: int) -> None:
             bar.total = total
-            bar.update(done - bar.n)
+            bar.update(done - bar.counted)
 
         yield step
 
@@ -50,7 +82,7 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 def waiting(what: str, *, quiet: bool) -> Generator[None]:
     """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
     with (
-        _telling_a_log(what, quiet=quiet),
+        _telling_a_log(what, lambda: "", quiet=quiet),
         tqdm(total=0, desc=f"{what} ...", bar_format="{desc}", leave=False, disable=True if quiet else None),
     ):
         yield
@@ -67,12 +99,32 @@ def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _telling_a_log(what: str, *, quiet: bool) -> Generator[None]:
+def _telling_a_log(what: str, far: Callable[[], str], *, quiet: bool) -> Generator[None]:
+    """Print lines on standard error while the block runs: the first after `TOLD_AFTER_S`, then ever more rarely.
+
+    Args:
+        what: is being done.
+        far: returns how far it is, to stand after `what`; empty where that is not known.
+        quiet: whether to be silent.
+    """
     if quiet or sys.stderr.isatty():
         yield
         return
-    with tell_after(TOLD_AFTER_S, f"shapespace: {what} ..."):
+    ended, began = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        pause, after = TOLD_AFTER_S, ""
+        while not ended.wait(pause):
+            print(f"shapespace: {what}{far()} ...{after}", file=sys.stderr, flush=True)
+            pause = min(max(2 * pause, 1.0), TOLD_EVERY_S)
+            after = f" ({time.monotonic() - began + pause:.0f} s)"
+
+    teller = threading.Thread(target=tell, name="shapespace progress", daemon=True)
+    teller.start()
+    try:
         yield
+    finally:
+        ended.set()
 
 
 @contextmanager

@@ -385,11 +385,11 @@ def _add_recognise(commands: Any) -> None:
     _add_recognise_transfer(sub)
     _add_recognise_study(sub)
     identity.add_verify(
-        _add(sub, "verify", "are two scans of one person: error rates and calibrated likelihood ratios",
+        _add(sub, "verify", "are two scans of one subject: error rates and calibrated likelihood ratios",
              "shapespace recognise verify scans.csv -o verified --gallery expression=neutral")
     )  # fmt: skip
     identity.add_identify(
-        _add(sub, "identify", "which of the people enrolled does a scan show: ranks, and what is missed",
+        _add(sub, "identify", "which of the enrolled subjects does a scan show: ranks, and what is missed",
              "shapespace recognise identify scans.csv -o identified --gallery expression=neutral")
     )  # fmt: skip
 
@@ -439,7 +439,7 @@ def _add_recognise_transfer(commands: Any) -> None:
 
 
 def _add_recognise_study(commands: Any) -> None:
-    sub = _add(commands, "study", "recognition measured on unseen people, ending in a report",
+    sub = _add(commands, "study", "recognition measured on unseen subjects, ending in a report",
                "shapespace recognise study --data BU-3DFE --model model.h5 -o study")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, default=Path("shapespace-study"), metavar="DIR",
                      help="where to write; a study that was interrupted goes on")  # fmt: skip

@@ -285,7 +285,7 @@ def build(arguments: argparse.Namespace) -> int:
         show(
             f"{arguments.output}: {facts['modes']} modes of {facts['vertices']} vertices from "
             f"{facts['training_shapes']} meshes, {100 * facts['variance_held']:.2f} % of "
-            f"{'the variance of people left out' if model.held_out else 'their variance'}, "
+            f"{'the variance of subjects left out' if model.held_out else 'their variance'}, "
             f"gauge {facts['gauge']}"
         )
     return 0
@@ -444,12 +444,12 @@ def recognise_train(arguments: argparse.Namespace) -> int:
     training, checked = facts["training"], facts["cross_validation"]
     show(
         f"{arguments.output}: {facts['classifier']} of {len(facts['classes'])} classes from {training['scans']} scans"
-        + (f" of {training['subjects']} people" if training["subjects"] else "")
+        + (f" of {training['subjects']} subjects" if training["subjects"] else "")
         + f", {facts['modes']} modes"
         + (", relative to neutral" if facts["relative_to_neutral"] else "")
     )
     if checked["macro_accuracy"] is not None:
-        left_out = "people" if checked["by"] == "subject" else "scans"
+        left_out = "subjects" if checked["by"] == "subject" else "scans"
         show(f"macro accuracy on {left_out} left out: {100 * checked['macro_accuracy']:.1f} %")
     return 0
 
@@ -567,7 +567,12 @@ def convert(arguments: argparse.Namespace) -> int:
 
     mm = None if arguments.unit is None else MM_PER_UNIT[arguments.unit]
     source, target, notes = convert(
-        arguments.source, arguments.output, to=arguments.to, mm=mm, expressions=arguments.expressions
+        arguments.source,
+        arguments.output,
+        to=arguments.to,
+        mm=mm,
+        expressions=arguments.expressions,
+        quiet=arguments.quiet,
     )
     if arguments.json:
         show_json({"source": source, "target": target, "output": str(arguments.output), "notes": notes})

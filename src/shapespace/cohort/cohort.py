@@ -20,8 +20,10 @@ from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.late import late
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
@@ -77,6 +79,8 @@ class Fitted:
     folder: str
     beyond_mm: FloatArray | None = None
     additive: AdditiveModel | None = None
+
+    __repr__ = short_repr
 
     @cached_property
     def z(self) -> FloatArray:
@@ -166,6 +170,17 @@ class Cohort:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __repr__(self) -> str:
+        what = "surfaces" if self.fitted is None else "fits"
+        columns = listed_briefly(list(self.table.columns)) or "no columns"
+        return (
+            f"<Cohort of {len(self)} {what} with {self.n_vertices:,} vertices, gauge {self.gauge}; "
+            f"{len(self.basis)} coefficients each; columns: {columns}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return late("html_of_cohort")(self)
 
     @property
     def n_vertices(self) -> int:

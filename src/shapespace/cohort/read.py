@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -44,12 +45,20 @@ class CohortOptions:
         least: shapes that there must be; one will do where it is compared with what is known already.
     """
 
-    shapes: Path | None = None
-    model: Path | None = None
+    shapes: Path | str | None = None
+    model: Path | str | None = None
     surfaces: Surfaces = "auto"
     gauge: Gauge = "shape"
     doubtful: bool = False
     least: int = 2
+
+    def __post_init__(self) -> None:
+        for name, path in (("shapes", self.shapes), ("model", self.model)):
+            if path is not None and not isinstance(path, str | PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise InputError(f"CohortOptions: {name} is a path, not {type(path).__name__}; give a str or a Path.")
+        for name, value, choices in (("surfaces", self.surfaces, SURFACES), ("gauge", self.gauge, get_args(Gauge))):
+            if value not in choices:
+                raise InputError(f"CohortOptions: there is no {name} {value!r}; choose one of {', '.join(choices)}.")
 
 
 def read_cohort(
@@ -79,7 +88,7 @@ def read_cohort(
     """
     data, options = Path(data), options or CohortOptions()
     table, keys = (None, ()) if data.is_dir() else read_table(data)
-    folder = options.shapes or (data if table is None else data.parent)
+    folder = Path(options.shapes) if options.shapes else (data if table is None else data.parent)
     if not folder.is_dir():
         raise InputError(
             f"{folder} is no folder; give the results of fits, or meshes in correspondence, with --shapes."
@@ -172,7 +181,7 @@ def _of_results(
         )
     fits = [row for row, _ in kept]
     _refuse_mixed(fits, results.folder)
-    model, additive = _model_of(results, fits[0], options.model)
+    model, additive = _model_of(results, fits[0], None if options.model is None else Path(options.model))
     stated = table.take([at for _, at in kept])
     names = tuple(row.name for row in fits)
     sizes = read_only([row.size_mm for row in fits])

@@ -16,6 +16,7 @@ from shapespace.io.files import read_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.meshes import stem_of
 from shapespace.io.tables import CHECKSUM, KEYS, MISSING, key_column, table_rows
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 _META = "meta_"
@@ -39,6 +40,8 @@ class Table:
     columns: Mapping[str, tuple[str, ...]]
     rows: tuple[str, ...]
     where: str = "The table"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name, cells in self.columns.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from shapespace.batch.progress import waiting
 from shapespace.commands.report import write_report
 from shapespace.errors import ShapespaceError
 from shapespace.statistics.answer import Answer
@@ -25,7 +26,8 @@ def keep_answer(answer: Answer, output: Path, *, quiet: bool) -> tuple[Path | No
     """
     from shapespace.report.html import require_report_extra
 
-    answer.save(output)
+    with waiting("writing the results", quiet=quiet):
+        answer.save(output)
     notes = list(answer.notes)
     try:
         require_report_extra()

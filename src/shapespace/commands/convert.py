@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from shapespace.batch.progress import waiting
 from shapespace.errors import InputError
 from shapespace.formats.parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
@@ -15,7 +16,13 @@ OWN = ("shapespace", OWN_ENDINGS)
 
 
 def convert(
-    source: Path, output: Path, *, to: str | None, mm: float | None, expressions: Path | None = None
+    source: Path,
+    output: Path,
+    *,
+    to: str | None,
+    mm: float | None,
+    expressions: Path | None = None,
+    quiet: bool = False,
 ) -> tuple[str, str, list[str]]:
     """Write the model in `source` to `output`; return the formats of both, and sentences on what became of it.
 
@@ -25,6 +32,7 @@ def convert(
         to: a format by its name, or None.
         mm: how many mm one unit of `source` is, where its format does not say; None for what the format says, or 1.
         expressions: a file of blendshapes of eos that belong to `source`, or None.
+        quiet: no progress.
 
     Raises:
         FileError: `source` cannot be read, or `output` not written.
@@ -33,12 +41,15 @@ def convert(
     target = _target(output, to)
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the model itself; give another name to write to.")
-    model, of, notes = _load(source, mm, expressions)
-    linear = model.as_linear()
+    with waiting(f"reading {source.name}", quiet=quiet):
+        model, of, notes = _load(source, mm, expressions)
+        linear = model.as_linear()
     if target is None:
-        model.save(output)
+        with waiting(f"writing {output.name}", quiet=quiet):
+            model.save(output)
     else:
-        notes += target.write(linear, output)
+        with waiting(f"writing {output.name}", quiet=quiet):
+            notes += target.write(linear, output)
         if regions := sorted((model if isinstance(model, ShapeModel) else model.shape).regions):
             notes.append(
                 f"Left out: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} "

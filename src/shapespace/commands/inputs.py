@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from shapespace.batch.fit_work import Job
-from shapespace.errors import InputError
+from shapespace.errors import FileError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
 from shapespace.io.json_files import check_file
@@ -116,6 +117,8 @@ def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[
         files = [one for one in matched if one.is_dir() or one.name.lower().endswith(MESH_FILE_ENDINGS)]
         paths = files or matched
     else:
+        if not path.name.lower().endswith(MESH_FILE_ENDINGS) and not os.path.lexists(path):
+            raise FileError(f"Cannot read {path}: there is no such file or folder; check the name.")
         paths = [path]
     listed = mesh_files(paths, recursive=recursive, apart_from=folder)
     for sentence in listed.left_out:

@@ -27,6 +27,8 @@ from shapespace.geometry.doctor import repair
 from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
+from shapespace.io.beside import as_meshes
+from shapespace.late import late
 from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
@@ -136,6 +138,9 @@ class Correspondence:
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        return late("html_of_correspondence")(self)
 
     def meshes(self) -> list[Mesh]:
         """Return the complete surfaces of scans that are not set aside, in their own frames, with `Mesh.observed`.
@@ -275,6 +280,7 @@ def correspond(
         InputError: fewer than two scans, scans that are all equal, or too few that can be reached.
         MeshError: no scan can be a template, or the template is none.
     """
+    scans = list(as_meshes(scans, "correspond"))
     settings = settings or CorrespondSettings()
     first = first or first_template(scans, template, settings, model)
     state = _State([scan.name for scan in scans], first, settings)

@@ -19,7 +19,7 @@ from shapespace.errors import InputError
 from shapespace.geometry import remesh
 from shapespace.geometry.surface import faces_of, vertex_normals
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, read_only, require
 
 PLAIN_TRIANGLES = 20_000
 """Of a plain scan."""
@@ -139,6 +139,7 @@ def simulate_scan(
         InputError: an option out of range, or holes and cuts that leave nothing.
         MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
     """
+    require(mesh, Mesh, "simulate_scan", "convert it with shapespace.as_mesh")
     if triangles < 4 or noise_mm < 0 or not 0 <= outlier_fraction < 1:
         raise InputError(
             f"A simulated scan needs at least 4 triangles, noise of at least 0 mm and a share of outliers in [0, 1), "

@@ -13,7 +13,7 @@ import numpy as np
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, build_engine, on_boundary
 from shapespace.geometry.surface import boundary_vertices, part_of, vertex_normals
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray, Mesh, require
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,8 @@ def surface_distances(
         mm_per_length: what one length in this frame is worth in mm of the model's frame.
         region: (V,) the model's vertices that count; the scan is then measured to what lies between them. None for all.
     """
+    require(model, Mesh, "surface_distances", "convert it with shapespace.as_mesh")
+    require(scan, Mesh, "surface_distances", "convert it with shapespace.as_mesh")
     engine = scan_engine or build_engine(scan)
     forward = engine.query(model.vertices)
     part = model if region is None else part_of(model, region)

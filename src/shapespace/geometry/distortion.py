@@ -61,3 +61,43 @@ def _turned_back(vectors: FloatArray, faces: IntArray, vertices: int) -> BoolArr
     sums = np.stack([np.bincount(flat, np.repeat(there[:, k], 3), vertices) for k in range(3)], axis=1)
     around = sums[faces].sum(axis=1) - 3.0 * there
     return (there * around).sum(axis=1) < 0
+
+
+def flip_factor(vertices: FloatArray, change: FloatArray, faces: IntArray) -> float:
+    """Return the factor of `change` at which the first triangle turns over; infinity where none ever does.
+
+    A triangle is turned over where its normal is at 90 degrees or more to that of the same triangle of `vertices`. With
+    the factor s its area vector is quadratic in s, so the first root is found without search.
+
+    Args:
+        vertices: (V, 3) of the surface that is changed.
+        change: (V, 3) displacement of each vertex at the factor 1.
+        faces: (F, 3).
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    u, v, w = (change[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    linear = np.cross(v - u, c - a) + np.cross(b - a, w - u)
+    square = np.cross(v - u, w - u)
+    q0, q1, q2 = (np.einsum("fd,fd->f", normal, vector) for vector in (normal, linear, square))
+    known = (q0 > 0) & np.isfinite(q1) & np.isfinite(q2)
+    q0, q1, q2 = q0[known], q1[known], q2[known]
+    inside = q1**2 - 4.0 * q2 * q0
+    real = inside >= 0
+    # The larger of the two sums in size, so that nothing cancels; its inverse gives the other root.
+    half = -0.5 * (q1[real] + np.copysign(np.sqrt(inside[real]), q1[real]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        roots = np.concatenate([half / q2[real], q0[real] / half])
+    ahead = roots[np.isfinite(roots) & (roots > 0)]
+    return float(ahead.min()) if len(ahead) else float("inf")
+
+
+def factor_to_draw(wanted: float, flips_at: float) -> float:
+    """Return the largest of 1, 2, 3, 5, 10, 20, ... and 0.5, 0.3, 0.2, 0.1, ... up to `wanted` and below `flips_at`.
+
+    Args:
+        wanted: the factor by which a change would be drawn, positive.
+        flips_at: the factor at which the first triangle turns over, as `flip_factor` returns it.
+    """
+    steps = sorted(step * 10.0**power for power in range(-6, 4) for step in (1, 2, 3, 5))
+    return max((step for step in steps if step <= wanted * (1 + 1e-9) and step < flips_at), default=steps[0])

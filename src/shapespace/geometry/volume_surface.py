@@ -21,8 +21,9 @@ from scipy import ndimage
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
+from shapespace.late import late
 from shapespace.reprs import short_repr
-from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh
+from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
 
 SMOOTH = 1.3
 """Standard deviation of the smoothing by default, in voxels."""
@@ -84,6 +85,9 @@ class VolumeSurface:
 
     __repr__ = short_repr
 
+    def _repr_html_(self) -> str:
+        return late("html_of_volume_surface")(self)
+
 
 def surface_of_volume(
     volume: LabelVolume,
@@ -108,6 +112,7 @@ def surface_of_volume(
             `smooth`.
         ShapespaceError: the extra `volumes` is not installed.
     """
+    require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.read_volume")
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen = _chosen(volume, labels)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast, overload
 
 import numpy as np
 
@@ -47,6 +47,43 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
         if isinstance(error, MeshError):
             raise
         raise InputError(f"{called}: its vertices are no numbers of the shape (V, 3).") from error
+
+
+class _AsMeshes(Sequence[Mesh]):
+    """A sequence whose items become meshes when they are asked for."""
+
+    def __init__(self, items: Any) -> None:
+        self._items = items
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @overload
+    def __getitem__(self, index: int) -> Mesh: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Mesh]: ...
+    def __getitem__(self, index: int | slice) -> Mesh | Sequence[Mesh]:
+        if isinstance(index, slice):
+            return _AsMeshes(self._items[index])
+        return as_mesh(self._items[index], name=f"mesh {index + 1}")
+
+
+def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
+    """Return a sequence of whatever `as_mesh` takes as one of meshes, each converted when it is asked for.
+
+    Args:
+        items: a list, or anything with a length and items; an array (N, V, 3) too.
+        function: that was given it, for the message.
+
+    Raises:
+        InputError: it is no such sequence. An item that is no mesh is refused when it is asked for.
+    """
+    if isinstance(items, str | os.PathLike | Mesh) or not (hasattr(items, "__len__") and hasattr(items, "__getitem__")):
+        raise InputError(
+            f"{function} takes a list of meshes, not {type(cast(object, items)).__name__}; give meshes, their paths, "
+            "or arrays (V, 3)."
+        )
+    return _AsMeshes(items)
 
 
 def _held(x: Any) -> Any:

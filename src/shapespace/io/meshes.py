@@ -28,7 +28,7 @@ from shapespace.io.stl import probe_stl, read_stl, write_stl
 from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
 from shapespace.io.xyz import read_xyz
-from shapespace.types import Mesh
+from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
 _PROBED_BYTES = 2**16
@@ -126,6 +126,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
         FileError: the folder cannot be written, or the disk is full.
         InputError: the format cannot hold this mesh (STL without triangles, float32 overflow).
     """
+    require(mesh, Mesh, "write_mesh", "convert it with shapespace.as_mesh")
     path = Path(path)
     write_bytes(path, _format(path, "write").write(mesh))
 

@@ -21,7 +21,9 @@ from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import without_estimates
+from shapespace.io.beside import as_meshes
 from shapespace.io.hdf5 import read_hdf5
+from shapespace.late import late
 from shapespace.model import model_file
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
 from shapespace.model.held_out import held_out_shapes
@@ -72,6 +74,9 @@ class AdditiveModel:
     n_identity: int
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        return late("html_of_additive_model")(self)
 
     def __post_init__(self) -> None:
         rotation, k = read_only(self.rotation), self.shape.n_modes
@@ -131,7 +136,7 @@ class AdditiveModel:
             CorrespondenceError: the meshes differ in vertices or triangles.
             InputError: too few of them, or an expression without its person's neutral.
         """
-        meshes = [without_estimates(mesh) for mesh in meshes]
+        meshes = [without_estimates(mesh) for mesh in as_meshes(meshes, "AdditiveModel.fit")]
         faces = common_faces(meshes)
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
         row = np.array([people.index(subjects[i]) for i in expressive])

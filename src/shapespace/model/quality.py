@@ -23,6 +23,7 @@ from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_bou
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
+from shapespace.io.beside import MeshLike, as_meshes
 from shapespace.late import late
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
@@ -435,19 +436,19 @@ class _Steps:
 
 
 def measure_quality(
-    target: Sequence[Mesh] | ShapeModel,
+    target: Sequence[MeshLike] | ShapeModel,
     settings: QualitySettings | None = None,
     *,
-    scans: Sequence[Mesh] | None = None,
-    unseen: Sequence[Mesh] = (),
+    scans: Sequence[MeshLike] | None = None,
+    unseen: Sequence[MeshLike] = (),
     on_step: OnStep | None = None,
     run: Runner = run_here,
 ) -> ModelQuality:
     """Measure the shape space of meshes in correspondence, or as much of a model as it tells by itself.
 
     Args:
-        target: at least three meshes, mm; or a model, of which only compactness and what is measured on `unseen` can
-            be told, as it does not keep its training shapes.
+        target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and
+            what is measured on `unseen` can be told, as it does not keep its training shapes.
         settings: folds, modes, samples, seed, and what model to make; None for the usual ones.
         scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
         unseen: meshes in correspondence that no model saw.
@@ -459,21 +460,24 @@ def measure_quality(
         InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
     """
     settings = settings or QualitySettings()
-    meshes = [] if isinstance(target, ShapeModel) else _checked([without_estimates(mesh) for mesh in target])
-    unseen = [without_estimates(mesh) for mesh in unseen]
+    meshes: Sequence[Mesh] = []
+    if not isinstance(target, ShapeModel):
+        meshes = _checked([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
+    scans = None if scans is None else as_meshes(scans, "measure_quality")
+    new: list[Mesh] = [without_estimates(mesh) for mesh in as_meshes(unseen, "measure_quality")]
     vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
     if scans is not None and len(scans) != len(meshes):
         raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
-    for mesh in unseen:
+    for mesh in new:
         _refuse_other(mesh, vertices)
     if isinstance(target, ShapeModel):
-        return _of_model(target, unseen, settings, on_step)
+        return _of_model(target, new, settings, on_step)
     whole = representation_named(settings.representation, settings.control_points).takes_holes
     kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
     if not kept.all():
-        meshes, unseen = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in unseen]
+        meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
     shapes = Shapes(meshes, scans, settings)
-    return _of_meshes(shapes, unseen, on_step, run, left_out=int((~kept).sum()))
+    return _of_meshes(shapes, new, on_step, run, left_out=int((~kept).sum()))
 
 
 def _of_model(

@@ -20,6 +20,7 @@ from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import without_estimates
+from shapespace.io.beside import MeshLike, as_meshes
 from shapespace.late import OpenViewer, late
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
@@ -161,7 +162,7 @@ class ShapeModel:
     @classmethod
     def fit(
         cls,
-        meshes: Meshes,
+        meshes: Meshes | Sequence[MeshLike],
         *,
         modes: int | float | Literal["auto"] | None = None,
         gauge: Gauge = "shape",
@@ -183,7 +184,8 @@ class ShapeModel:
 
         Args:
             meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
-                and items that loads a mesh when it is asked for it. Vertices that are not-a-number or not
+                and items that loads a mesh when it is asked for it. Items are whatever `as_mesh` takes: meshes, paths,
+                arrays (V, 3) of points, or objects of other tools. Vertices that are not-a-number or not
                 observed are missing: a model of vertices learns from the others, one of B-splines from filled ones.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
                 vertices; None for every mode that varies.
@@ -214,6 +216,7 @@ class ShapeModel:
                 representation, control points that cannot be; streamed meshes with missing vertices, or for B-splines.
             FileError: the disk has no room for the file.
         """
+        meshes = as_meshes(meshes, "ShapeModel.fit")
         kind = representation_named(representation, control_points)
         if kind is not Vertices and (out_of_core or keep_shapes is not None):
             raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")

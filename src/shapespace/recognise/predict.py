@@ -18,7 +18,8 @@ from shapespace.recognise.predictions import left_out, subject_folds
 from shapespace.recognise.saved import SavedClassifier, software_versions
 from shapespace.recognise.scans import NEUTRAL, ScanCoefficients, one_model, relative_to_neutral
 from shapespace.recognise.scores import fit_temperature, macro_accuracy
-from shapespace.types import FloatArray
+from shapespace.reprs import short_repr
+from shapespace.types import FloatArray, require
 
 UNSURE = "unsure"
 """The answer where the likeliest class is less likely than the stated confidence, or the fit is doubtful."""
@@ -48,6 +49,8 @@ class Answer:
     probabilities: FloatArray | None
     reason: str
     neutral: bool = False
+
+    __repr__ = short_repr
 
 
 def train_classifier(
@@ -85,6 +88,10 @@ def train_classifier(
         raise InputError(f"There is no classifier {classifier!r}; choose among {', '.join(CLASSIFIERS)}.")
     if not 0 <= confidence <= 1:
         raise InputError(f"The confidence must lie from 0 to 1, not {confidence!r}.")
+    for scan in scans:
+        require(
+            scan, ScanCoefficients, "train_classifier", "read them with shapespace.recognise.scans.read_coefficients"
+        )
     model_hash = one_model(scans)
     used, left_out_counts, notes = _with_labels(scans)
     z, labels, subjects = _samples(used, neutral if relative else None, projection)
@@ -172,14 +179,16 @@ def _calibrate(
     splits = subject_folds(groups, folds, seed) if folds >= 2 else []
     # A fold that would leave one class alone to train on teaches nothing.
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
-        note = "There are too few people to leave some out, so accuracy is not known and probabilities not calibrated."
+        note = (
+            "There are too few subjects to leave some out, so accuracy is not known and probabilities not calibrated."
+        )
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
     probabilities = left_out(z, labels, splits, classes, classifier, {}, seed)
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     answers = np.asarray(classes)[probabilities.argmax(axis=1)]
     accuracy = macro_accuracy(labels, answers, classes)
     note = (
-        "" if by_subject else "The labels name no subjects, so a person may be on both sides of the cross-validation."
+        "" if by_subject else "The labels name no subjects, so a subject may be on both sides of the cross-validation."
     )
     return temperature, {"macro_accuracy": accuracy, "by": "subject" if by_subject else "scan", "folds": folds}, note
 

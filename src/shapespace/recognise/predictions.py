@@ -19,6 +19,7 @@ from shapespace.errors import InputError
 from shapespace.recognise.classifiers import CLASSIFIERS, GRIDS
 from shapespace.recognise.learn import StratifiedGroupKFold
 from shapespace.recognise.scores import IndexArray, calibrated, fit_temperature, macro_accuracy
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 
 MODES: tuple[int | None, ...] = (10, 20, 40, None)
@@ -111,6 +112,8 @@ class Predictions:
     index: IndexArray
     chosen: tuple[Choice, ...]
 
+    __repr__ = short_repr
+
 
 def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[tuple[IndexArray, IndexArray]]:
     """Return (train, test) indices of folds that never split a person and have about as many samples each.
@@ -121,7 +124,7 @@ def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[
     people = np.asarray(subjects, dtype=str)
     count = len(np.unique(people))
     if not 2 <= n_folds <= count:
-        raise InputError(f"{count} people cannot be split into {n_folds} folds; ask for 2 to {count}.")
+        raise InputError(f"{count} subjects cannot be split into {n_folds} folds; ask for 2 to {count}.")
     # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
     parted: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
     return list(parted.split(people, np.zeros(len(people)), people))

@@ -201,7 +201,7 @@ def learning_curve(
     fewest = min(len(set(fold.train_subjects)) for fold in folds)
     counts = [n for n in subject_counts if 1 <= n <= fewest]
     if not counts or repeats < 1:
-        raise InputError(f"The folds have {fewest} people to train on, so the learning curve has no point to show.")
+        raise InputError(f"The folds have {fewest} subjects to train on, so the learning curve has no point to show.")
     rng = np.random.default_rng(seed)
     curve = np.zeros((len(counts), repeats))
     truth = [label for fold in folds for label in fold.test_labels]

@@ -26,6 +26,7 @@ from shapespace.io.json_files import check_file, plain_json
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.learn import SVC, Pipeline, skops_io
 from shapespace.recognise.scores import calibrated
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
@@ -120,6 +121,8 @@ class SavedClassifier:
     versions: Mapping[str, str]
     projection: FloatArray | None = None
 
+    __repr__ = short_repr
+
     @property
     def width(self) -> int:
         """Number of the model's coefficients that it asks for."""
@@ -175,13 +178,14 @@ class SavedClassifier:
             "versions": dict(self.versions),
         }
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write it to one file, whole or not at all.
 
         Raises:
             InputError: the name does not end in .skops.
             FileError: the folder cannot be written, or the disk is full.
         """
+        path = Path(path)
         if path.suffix.lower() != ".skops":
             raise InputError(f"{path}: give the classifier's file a name that ends in .skops.")
         buffer = io.BytesIO(skops_io.dumps(self.pipeline))
@@ -201,7 +205,7 @@ def software_versions() -> dict[str, str]:
     return {"shapespace": __version__, **{name: version(name) for name in ("scikit-learn", "skops", "numpy")}}
 
 
-def load_classifier(path: Path) -> SavedClassifier:
+def load_classifier(path: Path | str) -> SavedClassifier:
     """Read a classifier that `SavedClassifier.save` wrote, without running anything that the file holds.
 
     Raises:

@@ -15,6 +15,7 @@ from shapespace.io.json_files import check_file
 from shapespace.io.labels import Label
 from shapespace.io.meshes import stem_of
 from shapespace.io.tables import table_rows
+from shapespace.reprs import short_repr
 from shapespace.store.results import Results, modes_of
 from shapespace.types import FloatArray, read_only
 
@@ -49,6 +50,8 @@ class ScanCoefficients:
     label: str = ""
     subject: str = ""
     file: str = ""
+
+    __repr__ = short_repr
 
     @property
     def trusted(self) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
@@ -38,7 +40,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         gauge: `form` or `shape`.
         align: False takes meshes as they stand, also in `transform`.
         alignment_vertices: indices that carry the alignment of the training meshes.
-        model: a model to use instead of building one; the settings above, but `align`, then mean nothing.
+        model: a model, or its file, to use instead of building one; the settings above, but `align`, then mean nothing.
         meshes: what meshes given to `transform` are: "corresponding" or "scans".
         config: settings of the fits of scans; None for the usual ones.
         seed: of the choice of modes.
@@ -56,7 +58,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         gauge: Gauge = "shape",
         align: bool = True,
         alignment_vertices: IntArray | None = None,
-        model: ShapeModel | None = None,
+        model: ShapeModel | str | PathLike[str] | None = None,
         meshes: Literal["corresponding", "scans"] = "corresponding",
         config: FitConfig | None = None,
         seed: int = 0,
@@ -83,7 +85,10 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         """
         if self.meshes not in ("corresponding", "scans"):
             raise InputError(f"There is no kind of meshes {self.meshes!r}; choose corresponding or scans.")
-        self.model_ = self.model if self.model is not None else self._build(X)
+        if isinstance(self.model, str | PathLike):
+            self.model_ = ShapeModel.load(Path(self.model))
+        else:
+            self.model_ = self.model if self.model is not None else self._build(X)
         self.model_hash_ = self.model_.content_hash
         self.n_features_out_ = self.model_.n_modes
         return self

@@ -32,7 +32,15 @@ from shapespace.report.blocks import (
 )
 from shapespace.report.labels import find_labels, labelled
 from shapespace.report.page import Chapter, Page, Step
-from shapespace.report.saved import Folder, SavedFit, model_of, posed, raw_scan, staged_fit
+from shapespace.report.saved import (
+    Folder,
+    SavedFit,
+    ScanNotFoundError,
+    model_of,
+    raw_scan,
+    saved_surfaces,
+    staged_fit,
+)
 from shapespace.report.settings import settings_told
 from shapespace.report.wording import DASH, STATUS_WORDS, counted, isfinite, listed, mm, printable
 from shapespace.schemas import Quality, read
@@ -241,11 +249,12 @@ class FolderPage:
         """Return which share of the surface lies within each distance."""
         from shapespace.report import figures
 
-        pictured = [fit for fit in self.fits if fit.pictured]
+        # Without stages each curve takes the time to read a scan and to measure to it.
+        pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
         shown, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
         if not shown:
-            raise InputError(problems[0] if problems else "The stages of these fits were not saved.")
-        some = f" The first {MOST_CURVES} fits of the table." if len(pictured) > MOST_CURVES else ""
+            raise InputError(f"There are no distances to draw: {problems[0]}" if problems else "No surface was saved.")
+        some = f" The first {len(shown)} fits of the table." if sum(f.pictured for f in self.fits) > len(shown) else ""
         return self.page.figure(
             figures.error_curves(shown),
             "Share of the model's vertices that lie within each distance of the scan, one curve a fit. Vertices at "
@@ -255,22 +264,42 @@ class FolderPage:
         )
 
     def without_stages(self) -> list[Block]:
-        """Return why there are no pictures of the fit itself, and what adds them."""
+        """Return which fits have no pictures and why, and the command that adds the stages where none were saved."""
         fitted = [fit for fit in self.fits if fit.fitted]
         if not fitted:
             return [Text("There is no fit to show.", "broken")]
-        if any(fit.pictured for fit in fitted):
-            return [Notice("Not in the pictures", sections.usable(self.main, self.staged)[1])]
+        absent = Notice("Not in the pictures", self.not_drawn())
+        if any(fit.entry.stages for fit in fitted):
+            return [absent]
         record = fitted[0].record
         scan = record.scan.path or "SCAN"
         scans = str(Path(scan).parent) if len(fitted) > 1 else scan
         return [
+            absent,
             Text(
-                "The stages of these fits were not saved, so there are no distance maps, overlays and surfaces to "
-                "turn; this adds them, run in the folder of the results:"
+                "These fits were saved without their stages: the pictures show the fitted surfaces and the scans, with "
+                "distances that this report measured. This command, run in the folder of the results, adds the surface "
+                "before the fit and after phase 1, the regions and the iterations:",
+                "soft",
             ),
             Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages --resume"),
         ]
+
+    def not_drawn(self) -> list[str]:
+        """Return one sentence for each of the main fits that cannot be drawn, or not with its scan."""
+        return [
+            f"{fit.name}: {_of_scan(error)}" if isinstance(error, ScanNotFoundError) else str(error)
+            for fit in self.main
+            if (error := self.problem(fit)) is not None
+        ]
+
+    def problem(self, fit: SavedFit) -> ShapespaceError | None:
+        """Return why `fit` cannot be drawn with its scan, or None."""
+        try:
+            self.staged(fit)
+        except ShapespaceError as error:
+            return error
+        return None
 
     # Fits
 
@@ -307,7 +336,7 @@ class FolderPage:
         sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
         good = [fit for fit in sample if fit.status == "converged"]
         limit = sections.common_limit_mm(good or sample)
-        out: list[Block] = [Text("Failed and doubtful ones first, then by the error expected of them.")]
+        out: list[Block] = [Text("Sorted by status (failed, doubtful, converged), then by expected error.")]
         if len(self.fits) > len(self.carded):
             others = counted(len(self.fits) - len(self.carded), "other fit")
             more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
@@ -348,10 +377,13 @@ class FolderPage:
         from shapespace.report import stills
 
         if fit.pictured:
-            staged = self.staged(fit)
-            still, alt = stills.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
-        elif fit.entry.fitted and fit.fitted:
-            still, alt = stills.mesh_still(posed(self.folder, fit)), f"The fitted surface of {fit.name}"
+            try:
+                staged = self.staged(fit)
+            except ScanNotFoundError:
+                surfaces = saved_surfaces(self.folder, fit)
+                still, alt = stills.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
+            else:
+                still, alt = stills.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
         else:
             still, alt = stills.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
         return self.page.image(still, alt)
@@ -403,8 +435,13 @@ class FolderPage:
         return [*out, *self.page.tried(lambda: sections.lines_through_neutral(self.page, points, neutral))]
 
     def detail(self, fit: SavedFit) -> list[Block]:
-        """Return one fit with every picture, as far as the file's size allows."""
-        staged = self.staged(fit)
+        """Return one fit with every picture, as far as the file's size allows; without its scan, its surface alone."""
+        try:
+            staged = self.staged(fit)
+        except ScanNotFoundError as error:
+            why, surfaces = str(error), saved_surfaces(self.folder, fit)
+            turning = self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why))
+            return [*sections.fit_facts(fit), *turning]
         population = self.others(fit)
         reserve = _RESERVE_BYTES + recognition.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
         alone = len(self.fits) == 1
@@ -455,6 +492,10 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
     empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
     first = empty[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(rest))]
     return [*first, *rest[: MOST_CARDS - len(first)]]
+
+
+def _of_scan(error: ScanNotFoundError) -> str:
+    return f"{str(error).removesuffix('.')}; the fitted surface is shown alone."
 
 
 def _without_verdict(reason: str) -> str:

@@ -11,6 +11,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.result import FitResult
 from shapespace.model.quality import Curve, ModelQuality
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report.blocks import Block
 from shapespace.report.html import require_report_extra
 from shapespace.report.staged import StagedFit
 from shapespace.report.wording import counted, listed, mm, percent
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from shapespace.report.stills import Still
 
-_Drawn: TypeAlias = "tuple[Still, str]"
+Drawn: TypeAlias = "tuple[Still, str]"
 """A picture, and what stands below it."""
 _SHARES = (0.9, 0.95, 0.98)
 _MODES_SHOWN = 2
@@ -100,10 +101,10 @@ def html_of_model(model: ShapeModel) -> str:
         ("Licence", model.licence or "not stated"),
     ]
 
-    def draw() -> _Drawn:
+    def draw() -> Drawn:
         return _still(plot_model(model, "modes", modes=_MODES_SHOWN)), "The first modes; model.plot() draws more."
 
-    return _html(model, "Shape model", [], rows, draw)
+    return notebook_html(model, "Shape model", [], rows, draw)
 
 
 def html_of_fit(result: FitResult) -> str:
@@ -122,7 +123,7 @@ def html_of_fit(result: FitResult) -> str:
         rows.insert(2, ("Expected error", f"{mm(expected)} of its vertices"))
     rows += [("Note", note) for note in result.notes]
 
-    def draw() -> _Drawn:
+    def draw() -> Drawn:
         from shapespace.report.stills import fit_strip
 
         fit = StagedFit.of(result.model, result)
@@ -130,7 +131,7 @@ def html_of_fit(result: FitResult) -> str:
         caption = f"The scan; scan and fitted model; distances up to {mm(fit.scale_mm)}: {colours}, grey not shown."
         return fit_strip(fit, fit.scale_mm, _PANEL), caption
 
-    return _html(result, result.scan_name, [f"{result.status}: {result.reason}"], rows, draw)
+    return notebook_html(result, result.scan_name, [f"{result.status}: {result.reason}"], rows, draw)
 
 
 def html_of_quality(quality: ModelQuality) -> str:
@@ -143,15 +144,31 @@ def html_of_quality(quality: ModelQuality) -> str:
             told = percent(value) if name == "compactness" else f"{mm(value)} ({low:.3g} to {high:.3g})"
             rows.append((name.replace("_vertices", " (vertices)").capitalize(), f"{told} with {curve.at[-1]} modes"))
 
-    def draw() -> _Drawn:
+    def draw() -> Drawn:
         return _still(plot_quality(quality)), "Bands are 95 % intervals."
 
-    return _html(quality, "Quality of a shape space", quality.sentences(), rows, draw)
+    return notebook_html(quality, "Quality of a shape space", quality.sentences(), rows, draw)
 
 
-def _html(
-    of: object, title: str, sentences: Sequence[str], rows: Sequence[tuple[str, str]], draw: Callable[[], _Drawn]
+def notebook_html(
+    of: object,
+    title: str,
+    sentences: Sequence[str],
+    rows: Sequence[tuple[str, str]],
+    draw: Callable[[], Drawn] | None = None,
+    *,
+    blocks: Sequence[Block] = (),
 ) -> str:
+    """Return what a notebook shows of an object; its repr where the extra `report` is not installed.
+
+    Args:
+        of: the object.
+        title: above the rest.
+        sentences: what matters first.
+        rows: names and values.
+        draw: makes a picture with its caption; None for none.
+        blocks: of a report, below the rest.
+    """
     try:
         require_report_extra()
     except ShapespaceError as error:
@@ -160,13 +177,15 @@ def _html(
 
     picture, size, caption = "", (0, 0), ""
     try:
-        (content, size), caption = draw()
-        picture = base64.b64encode(content).decode()
+        if draw is not None:
+            (content, size), caption = draw()
+            picture = base64.b64encode(content).decode()
     except ShapespaceError as error:
         sentences = [*sentences, f"No picture: {error}"]
     return template("notebook.html").render(
-        title=title, sentences=sentences, rows=rows, picture=picture, size=size, caption=caption
-    )
+        title=title, sentences=sentences, rows=rows, picture=picture, size=size, caption=caption,
+        body=blocks,
+    )  # fmt: skip
 
 
 def _still(figure: Figure) -> Still:

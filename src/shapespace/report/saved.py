@@ -15,6 +15,7 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.geometry.doctor import repair
 from shapespace.io.files import sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -29,6 +30,10 @@ _FEWEST_POINTS = 20
 
 Direction: TypeAlias = Literal["model_to_scan", "scan_to_model"]
 Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]
+
+
+class ScanNotFoundError(FileFormatError):
+    """The scan of a fit is no longer where it was, or has changed; the message begins with a small letter."""
 
 
 @dataclass(frozen=True)
@@ -143,8 +148,8 @@ class SavedFit:
 
     @property
     def pictured(self) -> bool:
-        """Whether surfaces were kept."""
-        return bool(self.entry.stages) and self.fitted
+        """Whether there are surfaces to show."""
+        return bool(self.entry.stages or self.entry.fitted) and self.fitted
 
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
         """Return a distance over the whole model, or all of the scan, in mm; not-a-number where there is none."""
@@ -245,49 +250,65 @@ def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
 
 
 def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
-    """Return what pictures of `fit` need.
+    """Return what pictures of `fit` need: its saved stages, or else its saved surfaces and its scan.
 
     Raises:
-        FileError: its stages cannot be read.
-        FileFormatError: they were not saved, or are damaged.
+        FileError: a file cannot be read.
+        FileFormatError: the stages are damaged; without stages, a surface is.
+        ScanNotFoundError: there are no stages, and the scan has changed or is missing.
     """
-    if not fit.entry.stages:
-        raise FileFormatError(f"{fit.name}: its stages were not saved; fit the scan again with --stages.")
-    return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
+    if fit.entry.stages:
+        return StagedFit.from_arrays(folder.arrays(fit.entry.stages), fit.record, name=fit.name, label=fit.label)
+    surfaces = saved_surfaces(folder, fit)
+    scan = _in_model_frame(repair(raw_scan(folder, fit))[0], fit)
+    return StagedFit.from_surfaces(surfaces, scan, fit.record, name=fit.name, label=fit.label)
 
 
-def posed(folder: Folder, fit: SavedFit) -> Mesh:
-    """Return NAME.fitted.ply in the model's frame, so that it looks at the camera.
+def saved_surfaces(folder: Folder, fit: SavedFit) -> dict[str, Mesh]:
+    """Return the fitted surface of `fit` as `final`, and its dense one as `dense`, in the model's frame.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is damaged, or the record holds no pose.
+        FileError: a file cannot be read.
+        FileFormatError: one is damaged, or the record has no pose.
     """
+    files = {"final": fit.entry.fitted, "dense": fit.entry.dense}
+    found = {stage: folder.mesh(file) for stage, file in files.items() if file or stage == "final"}
+    if len({len(mesh.vertices) for mesh in found.values()}) > 1:
+        raise FileFormatError(f"{fit.name}: its fitted and its dense surface differ in their vertices; {_AGAIN}.")
+    return {stage: _in_model_frame(mesh, fit) for stage, mesh in found.items()}
+
+
+def _in_model_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
+    """Return `mesh`, which is in the frame and unit of the scan of `fit`, in the model's frame."""
     T = fit.record.T_scan_model
     if T is None or not T.scale > 0:
-        raise FileFormatError(f"The record of {fit.name} holds no pose T_scan_model; {_AGAIN}.")
-    mesh = folder.mesh(fit.entry.fitted)
-    return mesh.with_vertices((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale)
+        raise FileFormatError(f"The record of {fit.name} has no pose T_scan_model; {_AGAIN}.")
+    with np.errstate(all="ignore"):  # what overflows is refused
+        vertices = (mesh.vertices - np.array(T.translation)) @ np.array(T.rotation) / T.scale
+    if not (len(vertices) and np.isfinite(vertices).all()):
+        raise FileFormatError(f"{fit.name}: its surface, its scan or its pose has no finite coordinates; {_AGAIN}.")
+    return mesh.with_vertices(vertices)
 
 
 def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
-    """Return the scan that could not be fitted, if it is still where it was, with the content it had.
+    """Return the scan of `fit` as its file has it, if it is still where it was, with the content it had.
 
     Raises:
-        FileFormatError: it is not, or cannot be read.
+        FileError: it cannot be read.
+        ScanNotFoundError: it is not, or is no scan.
     """
     source = fit.record.scan
     if not source.path or "\0" in source.path:
-        raise FileFormatError("the record does not say where the scan is.")
+        raise ScanNotFoundError("the record does not say where the scan is.")
     file = folder.root / source.path
     if not file.is_file() or sha256_of_file(file) != source.hash:
-        raise FileFormatError("the scan is no longer where it was, or has changed.")
+        raise ScanNotFoundError("the scan is no longer where it was, or has changed.")
     try:
         mesh = read_mesh(file)
     except ShapespaceError as error:
-        raise FileFormatError("the scan cannot be read.") from error
+        raise ScanNotFoundError("the scan cannot be read.") from error
     if len(mesh.vertices) < _FEWEST_POINTS:
-        raise FileFormatError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
+        raise ScanNotFoundError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
     return mesh
 
 

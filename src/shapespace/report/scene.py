@@ -23,7 +23,7 @@ import numpy.typing as npt
 from shapespace.errors import InputError
 from shapespace.report.staged import StagedFit, measured_mm
 from shapespace.report.thin import thinned
-from shapespace.schemas import to_json
+from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 if TYPE_CHECKING:
@@ -208,7 +208,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
     the scan is a point cloud, not-a-number where unknown; `beyond_model_STAGE` and
-    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes;
+    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes, where
+    the stages were saved;
     of a scan with colours `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3) uint8;
     `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
     and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
@@ -241,12 +242,13 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
     arrays |= _stage_arrays(staged, of_model, of_scan, small=small)
     arrays |= {
-        "regions": staged.regions[of_model].astype(np.uint8),
         "b": staged.b,
         "z": staged.z,
         "b_stddev": staged.b_stddev,
     }
-    if not small:
+    if staged.regions is not None:
+        arrays["regions"] = staged.regions[of_model].astype(np.uint8)
+    if staged.history and not small:
         arrays |= _history(staged)
     arrays |= _colours(staged, of_model, of_scan)
     facts = {
@@ -263,10 +265,45 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
             stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
             for stage in staged.surfaces
         },
-        "region_shares": (np.bincount(staged.regions, minlength=4) / max(len(staged.regions), 1)).tolist(),
+        "region_shares": _region_shares(staged),
         "scan_vertices": len(staged.scan.vertices),
         "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
+    }
+    return pack(arrays, facts)
+
+
+def pack_surfaces(
+    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, why: str, largest: int | None = None
+) -> bytes:
+    """Return what the widget of a fit needs where there is no scan to show: as `pack_fit`, without scan and distances.
+
+    Args:
+        surfaces: `final`, and `dense` where there is one, with the same triangles, in the model's frame.
+        record: of the fit.
+        name: of the fit.
+        label: what pictures call it.
+        why: there is no scan to show, as the end of a sentence.
+        largest: for a report: how many triangles (or points) are kept; None packs all as it is.
+    """
+    last = list(surfaces.values())[-1]
+    model, kept = (last, np.arange(len(last.vertices))) if largest is None else _small(last, largest)
+    small = largest is not None
+    places = {f"surface_{stage}": surface.vertices[kept] for stage, surface in surfaces.items()}
+    arrays: dict[str, npt.NDArray[Any] | Steps] = {}
+    if model.faces is not None:
+        arrays["faces"] = _indices(model.faces, len(model.vertices), coded=small)
+    arrays |= _alike(places) if small else {key: _places(points, small) for key, points in places.items()}
+    arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
+    facts = {
+        "kind": "fit",
+        "name": name,
+        "label": label,
+        "status": record.status,
+        "reason": record.reason,
+        "stages": list(surfaces),
+        "without_scan": f"The fitted surface is shown alone, since {why}",
+        "thinned": len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
 
@@ -445,6 +482,13 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     first = moved.argmin(axis=1)[:, None]
     moved = np.take_along_axis(moved, (first + np.arange(3)) % 3, axis=1)
     return order, moved[np.lexsort((moved[:, 2], moved[:, 1], moved[:, 0]))]
+
+
+def _region_shares(staged: StagedFit) -> list[float]:
+    """Return the share of each region of `fit.regions.REGIONS`; empty where the regions were not saved."""
+    if staged.regions is None:
+        return []
+    return (np.bincount(staged.regions, minlength=4) / max(len(staged.regions), 1)).tolist()
 
 
 def _mean(signed_mm: FloatArray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
@@ -26,7 +26,7 @@ from shapespace.report.page import Page
 from shapespace.report.saved import SavedFit
 from shapespace.report.staged import REGIONS, StagedFit, measured_mm, nice_ceiling
 from shapespace.report.wording import counted, isfinite, listed, mm, percent
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, Mesh
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
@@ -197,6 +197,8 @@ def fit_in_full(
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
     told = "More pictures: stages, both ways of distance, regions, thresholds, iterations, coefficients"
+    if fit.regions is None:
+        told = "More pictures: both ways of distance, thresholds, coefficients"
     return [*turning, Folded(told, [pictures]) if folded else pictures]
 
 
@@ -216,9 +218,32 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
         page.image(still, strip_alt(fit, limit_mm)),
-        f"{fit.label}: the scan, and the model at each stage.",
+        f"{fit.label}: the scan, and the {'fitted model' if fit.regions is None else 'model at each stage'}.",
         label=f"Scan and model of {fit.label}, to be turned",
         still=f"The still shows the scan, both over each other, and {scale}",
+    )
+
+
+def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why: str) -> Turning | Figure:
+    """Return the fitted surface of a fit whose scan cannot be shown, as a still where nothing turns.
+
+    Args:
+        page: that it goes to.
+        fit: of which it is.
+        surfaces: `final`, and `dense` where there is one, in the model's frame.
+        why: the scan is not shown, as the end of a sentence.
+    """
+    from shapespace.report import stills
+    from shapespace.report.scene import pack_surfaces
+
+    still = stills.mesh_still(surfaces["final"], (420, 420))
+    return page.turning(
+        "fit",
+        pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=why, largest=SCAN_TRIANGLES),
+        page.image(still, f"The fitted surface of {fit.name}"),
+        f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
+        label=f"Fitted surface of {fit.label}, to be turned",
+        still="The still shows the fitted surface.",
     )
 
 
@@ -261,6 +286,9 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
         "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
     }
 
+    if fit.regions is None:
+        alts = {name: alt for name, alt in alts.items() if name not in _OF_STAGES}
+
     def picture(name: str, alt: str) -> Figure:
         more = {"population": population} if name == "coefficients_figure" else {}
         drawing = getattr(figures, name)(fit, **more)
@@ -272,6 +300,8 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
     )
 
 
+_OF_STAGES = ("stages_figure", "regions_figure", "history_figure")
+"""Figures that need what only --stages saves."""
 _CAPTIONS = {
     "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
     "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "
@@ -295,7 +325,9 @@ _OF_PAPER = {
 
 
 def region_shares(fit: StagedFit) -> str:
-    """Return the share of each region in words."""
+    """Return the share of each region in words; of a fit without saved stages, that they are not known."""
+    if fit.regions is None:
+        return "not saved"
     counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
     return listed([f"{name} {percent(float(share))}" for name, share in zip(REGIONS, counts, strict=True)])
 

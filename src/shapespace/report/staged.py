@@ -14,6 +14,9 @@ from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.fit.regions import REGIONS, UNSEEN
 from shapespace.fit.result import STAGES, FitResult
 from shapespace.fit.stages import STAGES_VERSION, stage_arrays
+from shapespace.geometry.closest import build_engine, on_boundary
+from shapespace.geometry.distance import surface_distances
+from shapespace.geometry.surface import boundary_vertices, rms_size, vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
@@ -52,16 +55,17 @@ class StagedFit:
         status: `converged`, `max_iterations` or `doubtful`.
         reason: one sentence on why.
         scan: the raw surface or points, as repaired.
-        surfaces: the model at each stage: `before`, `initial`, `final`, and `dense` where there was one.
+        surfaces: the model at each stage: `final`; `before` and `initial` where the stages were saved; `dense` where
+            there was one.
         model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model;
             not-a-number at vertices where the scan shows nothing, of which the nearest point says nothing.
         scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
-        regions: (V,) codes of `fit.regions.REGIONS`.
+        regions: (V,) codes of `fit.regions.REGIONS`; None where the stages were not saved.
         b: (K,) mm.
         z: (K,) in standard deviations of the model.
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
-        history: the iterations, in order.
+        history: the iterations, in order; empty where the stages were not saved.
     """
 
     name: str
@@ -72,7 +76,7 @@ class StagedFit:
     surfaces: Mapping[str, Mesh]
     model_to_scan_mm: Mapping[str, FloatArray]
     scan_to_model_mm: Mapping[str, FloatArray]
-    regions: IntArray
+    regions: IntArray | None
     b: FloatArray
     z: FloatArray
     b_stddev: FloatArray
@@ -89,6 +93,50 @@ class StagedFit:
         """Return what pictures need of `result`, which was fitted by `model`."""
         arrays = stage_arrays(result, model)
         return StagedFit.from_arrays(arrays, result, name=result.scan_name, label=label or result.scan_name)
+
+    @staticmethod
+    def from_surfaces(
+        surfaces: Mapping[str, Mesh], scan: Mesh, record: FitRecord, *, name: str, label: str
+    ) -> StagedFit:
+        """Return a fit from its saved surfaces and its scan, with distances that are measured now.
+
+        A vertex counts as not shown by the scan where its closest point lies on the border of the scan, and more than
+        1 % of the size of the model to the side; nowhere where the record says that the scan shows the whole model.
+
+        Args:
+            surfaces: `final`, and `dense` where there is one, in the model's frame.
+            scan: as repaired, in the model's frame.
+            record: of the fit.
+            name: of the fit.
+            label: what pictures call it.
+
+        Raises:
+            FileFormatError: the numbers of the record do not fit together.
+        """
+        b, z, b_stddev, shrinkage = (
+            np.array(values, dtype=np.float64) for values in (record.b, record.z, record.b_stddev, record.shrinkage)
+        )
+        if not all(values.shape == b.shape for values in (z, b_stddev, shrinkage)):
+            raise FileFormatError(f"{name}: the coefficients of its record do not fit together; fit the scan again.")
+        engine = build_engine(scan)
+        whole = record.shown is not None and record.shown.model_seen_share == 1.0
+        forward: dict[str, FloatArray] = {}
+        backward: dict[str, FloatArray] = {}
+        for stage, surface in surfaces.items():
+            distances = surface_distances(surface, scan, scan_engine=engine)
+            unseen = np.zeros(len(surface.vertices), dtype=bool)
+            if scan.faces is not None and surface.faces is not None and not whole:
+                nearest = engine.query(surface.vertices)
+                along = np.einsum("ij,ij->i", nearest.points - surface.vertices, vertex_normals(surface))
+                sideways = np.sqrt(np.maximum(nearest.distance**2 - along**2, 0.0))
+                beside = sideways > _SIDEWAYS_SHARE * rms_size(surface.vertices)
+                unseen = on_boundary(nearest, scan, boundary_vertices(scan)) & beside
+            forward[stage] = np.where(unseen, np.nan, distances.model_to_scan_signed_mm)
+            backward[stage] = distances.scan_to_model_signed_mm
+        return StagedFit(
+            name, label, record.status, record.reason, scan, surfaces, forward, backward, None, b, z, b_stddev,
+            shrinkage, (),
+        )  # fmt: skip
 
     @staticmethod
     @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
@@ -158,6 +206,8 @@ def measured_mm(distances_mm: FloatArray) -> FloatArray:
     return np.abs(distances_mm[np.isfinite(distances_mm)])
 
 
+_SIDEWAYS_SHARE = 0.01
+"""Of the model's size: the share within which the robust fit follows a scan to its border (fit/final_matches.py)."""
 _MEDIANS = 5.0
 """Of the distances, at which a scale ends at the latest; beyond it lies what is no part of the object."""
 

@@ -206,10 +206,10 @@ class StudyParts:
             part.subjects, part.mean, low=low, high=high, band=part.band or "interval", ceiling=part.ceiling
         )
         told = [
-            f"{100 * mean:.1f} % from {count:g} people" for count, mean in zip(part.subjects, part.mean, strict=True)
+            f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
         ]
         said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
-        about = "Share of right answers on people who were not learned from, against how many were."
+        about = "Share of right answers on subjects who were not learned from, against how many were."
         return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
 
     def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
@@ -317,7 +317,7 @@ class StudyParts:
             raise self.kept.wrong("the values of a map are no numbers, or its mask is none")
         values = values.astype(np.float64)
         figure = figures.surface_map_figure(
-            mesh, values, unit=part.unit, signed=part.signed, limit=part.limit, mask=mask, title=title
+            mesh, values, unit=part.unit, signed=part.signed, limit=part.limit, mask=mask, title=None
         )
         known = values[np.isfinite(values)]
         inside = "" if mask is None else f"; {percent(float(mask.mean()))} of the vertices are marked"
@@ -325,7 +325,7 @@ class StudyParts:
             f"{title}: the surface from several sides, coloured by {part.unit}, {known.min():.3g} to {known.max():.3g}"
             f"{inside}"
         )
-        return [self.drawn((figure, f"{title}: {part.unit}.", alt), note, chart=False)]
+        return [self.drawn((figure, f"Seen from several sides; {part.unit}.", alt), note, chart=False)]
 
     def morph(self, part: MorphPart, title: str, note: str) -> list[Block]:
         """Return two shapes between which a slider moves; beside each other where nothing turns."""
@@ -339,7 +339,7 @@ class StudyParts:
         turn, _ = figures.looked_at(first)
         both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
         labels = part.low_label or "low", part.high_label or "high"
-        still = figures.encode_webp(figures.morph_figure(*both, labels, title=title))
+        still = figures.encode_webp(figures.morph_figure(*both, labels, title=None))
         told = f"{title}: {labels[0]}, and {labels[1]}"
         times = ""
         if part.times != 1:
@@ -357,7 +357,7 @@ class StudyParts:
 
         figure = figures.histogram_figure(
             part.edges, [(one.label, one.counts) for one in part.series], x=part.x, observed=part.observed,
-            observed_label=part.observed_label or "observed", title=title,
+            observed_label=part.observed_label or "observed",
         )  # fmt: skip
         about = f"How {part.x} is spread."
         if part.observed is not None:

@@ -15,12 +15,17 @@ from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import write_rows
+from shapespace.reprs import short_repr
 from shapespace.schemas import Analysis, Part, Target, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
 Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
+
+
+LESS_SO_THAT_NONE_FLIPS = "Drawn smaller than it is, so that no triangle turns over."
+"""The note of a morph whose full size would turn triangles over."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,8 @@ class Answer:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     model_hashes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def analysis(self) -> Analysis:
         """Return what analysis.json says."""

@@ -23,10 +23,11 @@ from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.observed import weights_of
 from shapespace.statistics.sides import Sides, find_sides, given_sides
-from shapespace.types import BoolArray, FloatArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
 LEVEL = 0.95
@@ -74,6 +75,8 @@ class Scores:
     high: FloatArray
     raw_mm: FloatArray
     error_mm: float
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +159,13 @@ class Asymmetry:
         """Return it as it is kept and reported."""
         return late("answer_of_asymmetry")(self)
 
+    def __repr__(self) -> str:
+        rows = listed_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
+        return f"<Asymmetry of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def measure_asymmetry(
     cohort: Cohort,
@@ -185,6 +195,7 @@ def measure_asymmetry(
         InputError: an object without mirror symmetry, pairs that cannot be, fewer than three subjects, no such column,
             a subject in two groups, or a reference group of fewer than three.
     """
+    require(cohort, Cohort, "measure_asymmetry", "read one with shapespace.read_cohort")
     if permutations < 0 or seed < 0:
         raise InputError("The number of permutations and the seed must be 0 or more.")
     sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)

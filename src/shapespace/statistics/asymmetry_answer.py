@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.geometry.distortion import factor_to_draw, flip_factor
+from shapespace.geometry.surface import rms_size
 from shapespace.schemas import (
     Counts,
     HistogramPart,
@@ -18,7 +20,7 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
@@ -27,7 +29,8 @@ _ALPHA = 0.05
 _SHOWN = 2
 _LISTED = 10
 _BINS = 20
-_MORPH_MM = 3.0
+_MORPH_SHARE = 0.05
+"""Of the size (RMS distance from the middle): the largest displacement that a morph is exaggerated to."""
 _FILE = "asymmetry.npz"
 _FEW_REPEATS = 10
 
@@ -256,9 +259,13 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
         ),
     ]  # fmt: skip
 
+    faces = found.sides.faces
+
     def morph(title: str, key: str, middle: FloatArray, part: FloatArray, note: str, low: str, high: str) -> None:
         most = float(np.linalg.norm(part, axis=1).max())
-        times = float(max(1.0, np.floor(_MORPH_MM / most))) if most > 0 else 1.0
+        wanted = max(1.0, _MORPH_SHARE * rms_size(middle) / most) if most > 0 else 1.0
+        flips_at = min(flip_factor(middle, way * part, faces) for way in (1.0, -1.0))
+        times = factor_to_draw(wanted, flips_at)
         arrays[f"{key}_low"], arrays[f"{key}_high"] = middle - times * part, middle + times * part
         parts.append(
             MorphPart(
@@ -269,7 +276,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
                 low_label=low,
                 high_label=high,
                 times=times,
-                note=note,
+                note=note if times >= 1 else f"{note} {LESS_SO_THAT_NONE_FLIPS}",
             )
         )
 

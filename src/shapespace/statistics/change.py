@@ -15,6 +15,7 @@ from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_edges, vertex_areas
+from shapespace.late import late
 from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.change_align import stable_vertices
@@ -36,7 +37,7 @@ from shapespace.statistics.change_maps import (
 from shapespace.statistics.change_repeat import Repeatability, Rescans
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
 from shapespace.statistics.observed import weights_of
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, require
 
 WHOLE = "whole"
 """What the whole surface is called beside its regions."""
@@ -52,6 +53,9 @@ class Change(Found):
     def answer(self) -> Answer:
         """Return what is kept of it: a report, tables, arrays and meshes."""
         return answer_of(self)
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
 
 
 def change(
@@ -73,6 +77,7 @@ def change(
         InputError: another gauge, no triangles, subjects or times missing, times without an order, two scans of a visit
             that are not marked as rescans, no such stable region, groups other than two, or nobody with two visits.
     """
+    require(cohort, Cohort, "change", "read one with shapespace.read_cohort")
     settings = settings or ChangeSettings()
     if cohort.gauge != "form":
         raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")

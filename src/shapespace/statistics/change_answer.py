@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.table import named
+from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.schemas import (
     CurvePart,
     MorphPart,
@@ -19,18 +21,19 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Rows
 from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
 from shapespace.statistics.change_group import MapTest
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
-from shapespace.types import Mesh
+from shapespace.types import FloatArray, Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
 SHOWN = 6
 """Subjects whose maps the report draws."""
 LISTED, CURVES = 50, 12
 _LEVEL = 0.05
-_MM3_PER_ML = 1000.0
+_LEAST_ML_MM3 = 100.0
+"""Volumes below this, mm³, are stated in mm³ and others in ml: two decimals of 0.1 ml say too little."""
 _FEW = 10
 _SOURCES = {
     "rescans": "Standard deviations are those of rescans.",
@@ -105,32 +108,56 @@ def _summary(change: Found) -> list[str]:
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     ]
     if change.group is not None and change.group_volumes is not None:
-        volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects]) / _MM3_PER_ML
+        volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects])
         low, high = interval_of_mean(volumes)
+        unit = _VolumeUnit.of(volumes.mean(), low, high)
         told.append(_of_test(change, change.group, "the mean change", "none"))
         what = "The volume changed by" if change.closed else "The open surface swept"
         told.append(
-            f"{what} {volumes.mean():+.2f} ml{_per(change)} on average (95 %: {low:+.2f} to {high:+.2f}), "
+            f"{what} {unit.told(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.told(low)} to "
+            f"{unit.told(high)}), "
             f"{_p(float(change.group_volumes.p[0]))}."
         )
     if change.between is not None and change.between_volumes is not None:
         first, second = change.groups
         told.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
+        difference = float(change.between_volumes.effect[0])
+        unit = _VolumeUnit.of(difference)
         told.append(
-            f"The volume of {second} changed by {change.between_volumes.effect[0] / _MM3_PER_ML:+.2f} ml{_per(change)} "
+            f"The volume of {second} changed by {unit.told(difference)} {unit.name}{_per(change)} "
             f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
         )
     if change.repeatability is None:
         told.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:
         known, smallest = change.repeatability, change.repeatability.smallest_mm
+        least = float(known.volumes_smallest_mm3[0])
+        unit = _VolumeUnit.of(least)
         told.append(
             f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
-            f"surface; {smallest.max():.2f} mm at most), and {known.volumes_smallest_mm3[0] / _MM3_PER_ML:.2f} ml of "
+            f"surface; {smallest.max():.2f} mm at most), and {unit.told(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
         )
     return told
+
+
+@dataclass(frozen=True)
+class _VolumeUnit:
+    """A unit of volumes, by its name, and how many mm³ it is."""
+
+    name: str
+    mm3: float
+
+    @staticmethod
+    def of(*mm3: float | FloatArray) -> _VolumeUnit:
+        """Return ml where one of some volumes, mm³, is at least `_LEAST_ML_MM3`, else mm³."""
+        largest = max((float(np.abs(one).max(initial=0.0)) for one in map(np.asarray, mm3)), default=0.0)
+        return _VolumeUnit("mm³", 1.0) if largest < _LEAST_ML_MM3 else _VolumeUnit("ml", 1000.0)
+
+    def told(self, mm3: float) -> str:
+        """Return a volume, mm³, in this unit with its sign."""
+        return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
 
 
 def _of_test(change: Found, test: MapTest, what: str, other: str) -> str:
@@ -179,10 +206,7 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
             title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
             mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
         ),
-        MorphPart(
-            title="From before to after", arrays=ARRAYS, low="before", high="after", low_label="mean first visit",
-            high_label="mean with its change",
-        ),
+        _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change"),
     ]  # fmt: skip
     if change.group_volumes is not None and len(change.parts) > 1:
         parts.append(_region_table(change, change.group_volumes))
@@ -201,15 +225,16 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
 
 def _region_table(change: Found, test: MapTest) -> Part:
     rows: list[tuple[Any, ...]] = []
+    volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3 for one in change.subjects])
+    unit = _VolumeUnit.of(volumes.mean(axis=0))
     for at, name in enumerate(change.parts):
-        own = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[at] for one in change.subjects])
-        low, high = interval_of_mean(own / _MM3_PER_ML)
-        rows.append((name, float(own.mean() / _MM3_PER_ML), low, high, float(test.p[at])))
+        own = volumes[:, at] / unit.mm3
+        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[at])))
     return TablePart(
         title="Volumes swept",
         columns=(
             TableColumn(name="of"),
-            *(TableColumn(name=name, kind="number") for name in ("mean, ml", "low", "high")),
+            *(TableColumn(name=name, kind="number") for name in (f"mean, {unit.name}", "low", "high")),
             TableColumn(name="p", kind="p"),
         ),
         rows=tuple(rows),
@@ -301,10 +326,12 @@ def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
 def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     every = len(change.subjects)
     more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
+    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:LISTED])
+    unit = _VolumeUnit.of(*volumes)
     columns = [
         TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
         TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
-        TableColumn(name="volume, ml", kind="number"), TableColumn(name="stddev, ml", kind="number"),
+        *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
     ]  # fmt: skip
     if change.closed:
         columns.append(TableColumn(name="of the volume before", kind="percent"))
@@ -314,7 +341,7 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
     for one in change.subjects[:LISTED]:
         volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
         row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
-        row += [volume / _MM3_PER_ML, _or_none(stddev / _MM3_PER_ML)]
+        row += [volume / unit.mm3, _or_none(stddev / unit.mm3)]
         row += [volume / one.before_mm3] if change.closed else []
         rows.append((*row, *([one.group] if change.groups else [])))
     parts: list[Part] = [
@@ -343,9 +370,9 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
         )  # fmt: skip
         if number == 1:
             parts.append(
-                MorphPart(
-                    title=f"{subject.name} from before to after", arrays=ARRAYS, low=f"{key}_before",
-                    high=f"{key}_after", low_label=subject.visits[0].label, high_label=subject.visits[-1].label,
+                _morph(
+                    f"{subject.name} from before to after", arrays, f"{key}_before", f"{key}_after",
+                    subject.visits[0].label, subject.visits[-1].label,
                 )
             )  # fmt: skip
     if len(change.subjects) > SHOWN:
@@ -353,14 +380,30 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
     return parts
 
 
+def _morph(
+    title: str, arrays: dict[str, npt.NDArray[Any]], low: str, high: str, low_label: str, high_label: str
+) -> MorphPart:
+    """Return the morph between two shapes of `arrays`; where triangles would turn over, a part of the way is drawn."""
+    before, change = arrays[low], arrays[high] - arrays[low]
+    times = factor_to_draw(1.0, flip_factor(before, change, arrays["faces"]))
+    if times < 1:
+        high = f"{high}_drawn"
+        arrays[high] = before + times * change
+    return MorphPart(
+        title=title, arrays=ARRAYS, low=low, high=high, low_label=low_label, high_label=high_label, times=times,
+        note="" if times == 1 else LESS_SO_THAT_NONE_FLIPS,
+    )  # fmt: skip
+
+
 def _over_time(change: Found) -> list[Part]:
     if not change.unit or all(len(one.visits) < 3 for one in change.subjects):
         return []
+    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:CURVES] for visit in one.visits))
     series = tuple(
         Series(
             label=one.name,
             x=tuple(visit.at for visit in one.visits),
-            y=tuple(visit.volume_mm3 / _MM3_PER_ML for visit in one.visits),
+            y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
         )
         for one in change.subjects[:CURVES]
     )
@@ -368,7 +411,7 @@ def _over_time(change: Found) -> list[Part]:
     more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
     return [
         CurvePart(
-            title="Over time", level=2, series=series, x=change.unit, y="volume since the first visit, ml",
+            title="Over time", level=2, series=series, x=change.unit, y=f"volume since the first visit, {unit.name}",
             note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
         )
     ]  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.change_align import stable_vertices
 from shapespace.statistics.change_group import MapTest
 from shapespace.statistics.change_maps import aligned
@@ -70,6 +71,8 @@ class VisitChange:
     rms_mm: float
     volume_mm3: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -92,6 +95,8 @@ class Estimate:
     volumes_mm3: FloatArray
     volumes_stddev_mm3: FloatArray
     quantile: float = NINETY_FIVE
+
+    __repr__ = short_repr
 
     @property
     def beyond(self) -> BoolArray:
@@ -135,6 +140,8 @@ class SubjectChange:
     def unobserved(self) -> BoolArray | None:
         """(V,) where maps of the subject are blank; None for nowhere."""
         return None if self.observed is None else ~self.observed
+
+    __repr__ = short_repr
 
     @property
     def rms_mm(self) -> float:
@@ -200,6 +207,14 @@ class Found:
     def by_name(self) -> Mapping[str, SubjectChange]:
         """Subject -> what changed in it."""
         return {subject.name: subject for subject in self.subjects}
+
+    def __repr__(self) -> str:
+        tests = {"mean change": self.group, " and ".join(self.groups) + " differ": self.between}
+        told = listed_briefly([f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None])
+        return (
+            f"<{type(self).__name__} of {len(self.subjects)} subjects, {len(self.cohort)} scans; uncertainty from "
+            f"{self.uncertainty}{f'; {told}' if told else ''}>"
+        )
 
     def surfaces(self, name: str) -> tuple[Mesh, Mesh]:
         """Return a subject's surface at its first visit and, aligned to it, at its last."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray
 
 _BLOCK = 64
@@ -41,6 +42,8 @@ class MapTest:
     permutations: int
     every: bool
     n: tuple[int, ...]
+
+    __repr__ = short_repr
 
 
 def mean_test(

@@ -8,6 +8,7 @@ import numpy as np
 
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_areas
+from shapespace.reprs import short_repr
 from shapespace.statistics.change_maps import Aligned, swept_mm3
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
@@ -40,6 +41,8 @@ class Repeatability:
     icc: FloatArray
     shape_icc: float
     volume_icc: float
+
+    __repr__ = short_repr
 
     @property
     def smallest_mm(self) -> FloatArray:

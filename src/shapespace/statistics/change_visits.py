@@ -8,6 +8,7 @@ from datetime import date
 
 from shapespace.cohort.table import Table, named
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 
 TIMES = ("time", "visit", "date")
 """The columns that may tell the time; the first that is there does."""
@@ -44,6 +45,8 @@ class Visits:
     of: Mapping[str, tuple[Visit, ...]]
     unit: str
     column: str
+
+    __repr__ = short_repr
 
     @property
     def rescans(self) -> int:

@@ -19,6 +19,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.late import late
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.compare_formula import (
     Design,
@@ -32,7 +33,7 @@ from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less
 from shapespace.statistics.compare_within import Strata, Within, strata_of
 from shapespace.statistics.observed import information, weights_of
-from shapespace.types import FloatArray, read_only
+from shapespace.types import FloatArray, read_only, require
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
 TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
@@ -110,6 +111,8 @@ class TermTest:
     p: float
     arrangements: FloatArray
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Remainder:
@@ -157,6 +160,8 @@ class Effect:
     p: float
     p_family: float
     map: EffectMap | None = None
+
+    __repr__ = short_repr
 
     @property
     def label(self) -> str:
@@ -222,6 +227,13 @@ class Comparison:
         """Return it as it is kept and reported."""
         return late("answer_of_comparison")(self)
 
+    def __repr__(self) -> str:
+        terms = listed_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
+        return f"<Comparison of {len(self.cohort)} shapes of {self.subjects} subjects; {terms}>"
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def compare(
     cohort: Cohort,
@@ -247,6 +259,7 @@ def compare(
             few subjects show.
         ShapespaceError: the extra `statistics` is not installed.
     """
+    require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
     options = options or CompareOptions()
     own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)

@@ -19,6 +19,7 @@ import numpy as np
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.late import other_package
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 INSTALL = "'shapespace[statistics]'"
@@ -116,6 +117,8 @@ class Design:
     _parts: dict[tuple[frozenset[str], ...], Design] = field(
         default_factory=lambda: dict[tuple[frozenset[str], ...], "Design"](), repr=False
     )
+
+    __repr__ = short_repr
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
         """Return the (n, p) columns where each variable, by its name inside, has these n values."""

@@ -18,6 +18,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import other_package
+from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
@@ -51,6 +52,8 @@ class Tested:
     p_family: FloatArray
     q: FloatArray
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class EffectMap:
@@ -81,6 +84,8 @@ class EffectMap:
     def blank(self) -> BoolArray | None:
         """(V,) where the map is blank, as too few shapes observe the vertex; None for nowhere."""
         return None if self.weight is None or self.weight.all() else self.weight == 0
+
+    __repr__ = short_repr
 
     @property
     def shown_mm(self) -> FloatArray:

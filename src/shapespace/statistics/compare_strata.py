@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import Design, Term
 from shapespace.types import FloatArray
 
@@ -67,6 +68,8 @@ class Stratum:
     units: Rows | None = None
     n_units: int = 0
     constant: FloatArray | None = None
+
+    __repr__ = short_repr
 
     @property
     def df_error(self) -> int:

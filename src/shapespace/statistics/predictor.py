@@ -24,6 +24,8 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
 from shapespace.io.json_files import plain_json
+from shapespace.late import late
+from shapespace.reprs import short_repr, told_briefly
 from shapespace.statistics.smoothers import IndexArray
 from shapespace.types import FloatArray, read_only
 
@@ -50,6 +52,11 @@ class Predictions:
     low: FloatArray
     high: FloatArray
     outside: tuple[str, ...]
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        return late("html_of_predictions")(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +95,15 @@ class Predictor:
     subjects: int
     level: float
     method: str
+
+    def __repr__(self) -> str:
+        return (
+            f"<Predictor of {told_briefly(self.target)} from {self.subjects} subjects; {self.method}; targets from "
+            f"{self.lowest:.4g} to {self.highest:.4g}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return late("html_of_predictor")(self)
 
     def predict(self, cohort: Cohort) -> Predictions:
         """Return what is predicted of the shapes of a cohort, of subjects that were not learned from.
@@ -142,25 +158,26 @@ class Predictor:
             return f"{self.target} was learned between {self.lowest:g} and {self.highest:g} alone"
         return ""
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write it as numbers alone, .npz.
 
         Raises:
             FileError: the folder cannot be written.
         """
-        facts = {name: getattr(self, name) for name in _FACTS}
+        path, facts = Path(path), {name: getattr(self, name) for name in _FACTS}
         told = json.dumps({"format": FORMAT, "format_version": VERSION, **facts}, allow_nan=False)
         arrays: dict[str, npt.NDArray[Any]] = {name: getattr(self, name) for name in _FLOATS}
         write_arrays(path, {**arrays, "fold": self.fold.astype(np.int64), "facts": np.array(told)})
 
     @staticmethod
-    def load(path: Path) -> Predictor:
+    def load(path: Path | str) -> Predictor:
         """Return the predictor in a file, which is checked, and of which nothing is run.
 
         Raises:
             FileError: it cannot be read.
             FileFormatError: it is none, of another version, or damaged.
         """
+        path = Path(path)
         arrays = read_arrays(path, _AGAIN, (*_FLOATS, "fold", "facts"))
         try:
             facts = _facts(arrays)

@@ -15,6 +15,7 @@ from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
+from shapespace.reprs import listed_briefly, told_briefly
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.statistics.smoothers import (
@@ -27,7 +28,7 @@ from shapespace.statistics.smoothers import (
     nested,
     weighted_mean,
 )
-from shapespace.types import FloatArray, Mesh, read_only
+from shapespace.types import FloatArray, Mesh, read_only, require
 
 FEWEST, SMALL = 10, 100
 """Subjects below which nothing is learned, and below which a sample is said to be small."""
@@ -131,6 +132,17 @@ class Regression:
         """
         return late("answer_of_regression")(self, new)
 
+    def __repr__(self) -> str:
+        told = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
+        tested = [] if self.p is None else [f"p {self.p:.3g}"]
+        return (
+            f"<Regression of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} subjects; "
+            f"{listed_briefly([*tested, *told])}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def regress(
     cohort: Cohort,
@@ -162,6 +174,7 @@ def regress(
         InputError: no such column, values that are missing, no numbers or all the same, fewer than ten subjects, fewer
             subjects than folds, or options that cannot be.
     """
+    require(cohort, Cohort, "regress", "read one with shapespace.read_cohort")
     _check_options(folds, permutations, draws, level, seed)
     y = cohort.table.numbers(target)
     _check_target(cohort, target, y)

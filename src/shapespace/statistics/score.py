@@ -21,8 +21,9 @@ from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
+from shapespace.reprs import listed_briefly
 from shapespace.statistics.answer import Answer
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
 FEWEST_PEOPLE, SMALL = 5, 30
 """The least reference, and one below which the answer says that it is small."""
@@ -138,6 +139,18 @@ class Scores:
         """Return it as it is kept and reported."""
         return late("answer_of_scores")(self)
 
+    def __repr__(self) -> str:
+        told = listed_briefly(
+            [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
+        )
+        return (
+            f"<Scores of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
+            f"{self.modes} modes; {told}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def score(
     reference: Cohort,
@@ -163,6 +176,8 @@ def score(
             subject who is in the reference, or something missing in the column that says who is scanned.
         CorrespondenceError: shapes of different vertices.
     """
+    require(reference, Cohort, "score", "read one with shapespace.read_cohort")
+    require(subjects, Cohort, "score", "read one with shapespace.read_cohort")
     options = options or ScoreOptions()
     if options.subject is not None:
         reference = reference.complete([options.subject], drop_missing=options.drop_missing)
@@ -251,7 +266,7 @@ def _people(reference: Cohort, column: str | None) -> IntArray:
     count = int(codes.max()) + 1
     if count < FEWEST_PEOPLE:
         raise InputError(
-            f"A reference of {count} {'shapes' if column is None else 'people'} is too small to tell what is usual; "
+            f"A reference of {count} {'shapes' if column is None else 'subjects'} is too small to tell what is usual; "
             f"give {FEWEST_PEOPLE} or more, better {SMALL} and more."
         )
     return codes.astype(np.int32)
@@ -266,7 +281,7 @@ def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
     most = min(there, count - 3)
     if wanted is not None:
         if not 1 <= wanted <= most:
-            raise InputError(f"A reference of {count} people has 1 to {most} modes to measure by, not {wanted}.")
+            raise InputError(f"A reference of {count} subjects has 1 to {most} modes to measure by, not {wanted}.")
         return wanted
     enough = int(np.searchsorted(np.cumsum(variance) / variance.sum(), _SHARE)) + 1
     return max(1, min(enough, count // _PEOPLE_PER_MODE, most))
@@ -500,7 +515,7 @@ def _on_size(people: int) -> list[str]:
         return []
     step = 100 / (people + 1)
     return [
-        f"The reference is small: with {people} people shares are told in steps of {step:.0f} %, and what is usual is "
+        f"The reference is small: with {people} subjects shares come in steps of {step:.0f} %, and what is usual is "
         "known roughly."
     ]
 

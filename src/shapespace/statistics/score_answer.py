@@ -63,7 +63,8 @@ def _sentence(scores: Scores, k: int) -> str:
     small = " (a small reference)" if scores.people < SMALL else ""
     told = (
         f"{scores.names[k]} lies {scores.distance[k]:.1f} standard deviations from the reference's mean in "
-        f"{scores.modes} modes, farther out than {scores.percentile[k]:.0f} % of its {scores.people} people{small}; by "
+        f"{scores.modes} modes, farther out than {scores.percentile[k]:.0f} % of its {scores.people} subjects{small}; "
+        "by "
         f"the F distribution p = {scores.p_value[k]:.3g}. Nearest to it: {near}."
     )
     if not scores.outside[k]:
@@ -73,16 +74,16 @@ def _sentence(scores: Scores, k: int) -> str:
 
 def _how(scores: Scores) -> tuple[str, ...]:
     limit = (
-        f"Of 95 % of the reference's people no vertex lies beyond {scores.z_limit:.1f} standard deviations."
+        f"Of 95 % of the reference's subjects no vertex lies beyond {scores.z_limit:.1f} standard deviations."
         if math.isfinite(scores.z_limit)
-        else "With fewer than 19 people in the reference, how far out single vertices lie by chance is not known."
+        else "With fewer than 19 subjects in the reference, how far out single vertices lie by chance is not known."
     )
     unsure = "" if scores.subjects.fitted is None else " and each fit's own uncertainty"
     return (
         f"Distances are Mahalanobis distances in the {scores.modes} modes of the reference that hold "
         f"{100 * scores.variance_share:.0f} % of its variance, by its covariance{unsure}.",
-        "Percentiles are found by leaving out the reference's people in turn, and hold whatever the distribution; p is "
-        "by the F distribution of normal shapes, which is too large where the reference is small.",
+        "Percentiles are found by leaving out the reference's subjects in turn, and hold whatever the distribution; p "
+        "is by the F distribution of normal shapes, which is too large where the reference is small.",
         limit,
     )
 
@@ -114,7 +115,7 @@ def _table(scores: Scores) -> TablePart:
         rows = [(*row[:7], *row[8:]) for row in rows]
     return TablePart(
         title="Scores", columns=tuple(columns), rows=tuple(rows),
-        note="Percentiles: share of the reference's people who lie nearer to its mean. On average 4.6 % of the "
+        note="Percentiles: share of the reference's subjects who lie nearer to its mean. On average 4.6 % of the "
         "vertices of a usual shape lie beyond 2 SD.",
     )  # fmt: skip
 

@@ -19,6 +19,7 @@ from shapespace.geometry.surface import rms_size
 from shapespace.io.files import read_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.tables import table_rows
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh
 
 LARGEST_OFF = 0.02
@@ -51,6 +52,8 @@ class Sides:
     paired: bool
     off_share: float
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.vertices)

@@ -21,7 +21,8 @@ from shapespace.io.files import read_bytes, read_error
 from shapespace.io.json_files import LARGEST_BYTES, json_of, read_json
 from shapespace.io.meshes import read_mesh
 from shapespace.io.tables import CHECKSUM
-from shapespace.late import other_package
+from shapespace.late import late, other_package
+from shapespace.reprs import told_briefly
 from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
 from shapespace.store.rows import FLAGS, META, coefficient_columns, kind_of, store_row
@@ -199,6 +200,12 @@ class Results:
     def names(self) -> list[str]:
         """Return the names of all fits, in order."""
         return sorted({*self.singles, *self._stored})
+
+    def __repr__(self) -> str:
+        return f"<Results in {told_briefly(str(self.folder))}: {len(self):,} fits>"
+
+    def _repr_html_(self) -> str:
+        return late("html_of_results")(self)
 
     def __len__(self) -> int:
         return len(self.singles) + sum(name not in self.singles for name in self._stored)

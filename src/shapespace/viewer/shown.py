@@ -16,8 +16,18 @@ from shapespace.errors import FileError, FileFormatError, InputError, Shapespace
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.population import neediest
-from shapespace.report.saved import Folder, SavedFit, find_fits, has_fits, model_of, saved_fit, staged_fit
-from shapespace.report.scene import pack_model
+from shapespace.report.saved import (
+    Folder,
+    SavedFit,
+    ScanNotFoundError,
+    find_fits,
+    has_fits,
+    model_of,
+    saved_fit,
+    saved_surfaces,
+    staged_fit,
+)
+from shapespace.report.scene import pack_model, pack_surfaces
 from shapespace.report.wording import without_folders
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest
@@ -126,7 +136,7 @@ class Shown:
         """Return the pictures of the fit `name`.
 
         Raises:
-            FileError: its stages cannot be read.
+            FileError: its surfaces cannot be read.
             FileFormatError: they were not saved, or are damaged.
             InputError: they do not belong to the model.
             KeyError: there is no such fit.
@@ -153,7 +163,11 @@ class Shown:
         if not self._ours(fit):
             raise InputError(f"{name} was fitted by another model; give that one with --model.")
         with _as_damaged(name):
-            return packed(staged_fit(self.folder, fit))
+            try:
+                return packed(staged_fit(self.folder, fit))
+            except ScanNotFoundError as error:
+                surfaces = saved_surfaces(self.folder, fit)
+                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=self.told(str(error)))
 
     def _ours(self, fit: SavedFit) -> bool:
         return fit.record.model.hash == self.model.content_hash
@@ -171,7 +185,7 @@ class Shown:
         if pictured and not self._ours(fit):
             pictured, why = False, "It was fitted by another model."
         elif not pictured and fit.status not in ("failed", "unreadable"):
-            why = "Its surfaces were not saved; fit the scan again with --stages."
+            why = "Its fitted surface is not in the folder; fit the scan again."
         row: dict[str, Any] = {
             "name": fit.name,
             "label": fit.label,

@@ -55,20 +55,20 @@ def _add_who(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
     sub.add_argument("--gallery", metavar="EXPR",
                      help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all; of "
-                     "identify the first scan of each person)")  # fmt: skip
+                     "identify the first scan of each subject)")  # fmt: skip
     sub.add_argument("--probe", metavar="EXPR", help="who is searched for (default: all others)")
-    sub.add_argument("--train", metavar="EXPR", help="who is learned from (default: the people of other folds)")
+    sub.add_argument("--train", metavar="EXPR", help="who is learned from (default: the subjects of other folds)")
     sub.add_argument("--role", metavar="COLUMN",
                      help="that says gallery, probe or train instead (default: role, if there is one)")  # fmt: skip
     sub.add_argument(
-        "--folds", type=int, metavar="N", help="parts of the people, each tested by the others (default 4)"
+        "--folds", type=int, metavar="N", help="parts of the subjects, each tested by the others (default 4)"
     )
     sub.add_argument("--scores", type=_names, metavar="LIST",
                      help="plda, cosine, mahalanobis or distance, first the one that is told of first "
                      "(default: all)")  # fmt: skip
     sub.add_argument("--modes", type=int, metavar="K", help="leading coefficients of identity (default: all)")
     sub.add_argument("--no-uncertainty", action="store_true", help="take all fits for exact")
-    sub.add_argument("--draws", type=int, default=1000, metavar="N", help="of people, for intervals (default 1000)")
+    sub.add_argument("--draws", type=int, default=1000, metavar="N", help="of subjects, for intervals (default 1000)")
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of folds and draws (default 0)")
 
 

@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
         options = CohortOptions(
             arguments.new_shapes, arguments.model, arguments.surfaces, arguments.gauge, arguments.doubtful, least=1
         )
-        fresh = read_cohort(arguments.predict, options, onto=cohort)
+        with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
+            fresh = read_cohort(arguments.predict, options, onto=cohort, on_shape=step)
         there = subject is not None and subject in fresh.table.columns
         refuse_known(
             found.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where

@@ -349,9 +349,11 @@
       const { view, controls } = stage(element, `Scan and fitted model of ${facts.label || facts.name}`);
       const stages = facts.stages;
       // How far the fit lies from the scan is what one looks for first.
-      const state = { stage: "final", map: "model", threshold: null };
-      const scanShown = { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan };
-      view.setSurface("scan", { ...scanShown, opacity: 0.5, visible: false });
+      const state = { stage: "final", map: arrays.scan ? "model" : "none", threshold: null };
+      if (arrays.scan) {
+        const scanShown = { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan };
+        view.setSurface("scan", { ...scanShown, opacity: 0.5, visible: false });
+      }
       view.setSurface("model", {
         positions: arrays[`surface_${state.stage}`], faces: arrays.faces || null, colour: colours().model,
       });
@@ -374,7 +376,7 @@
           const beyond = state.threshold === null ? [] : [[`beyond ${state.threshold.toFixed(1)} mm`, signal]];
           Shapespace.colourBar(bar, { ...scale, keys: [...beyond, ...scale.keys] });
         }
-        view.paint("scan", state.map === "scan" ? values() : null, map);
+        if (arrays.scan) view.paint("scan", state.map === "scan" ? values() : null, map);
         if (state.map === "colour") {
           view.paint("scan", arrays.scan_colours, { rgb: true });
           view.paint("model", arrays[`colours_${state.stage}`] || arrays.colours_final, { rgb: true });
@@ -386,7 +388,7 @@
         bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey is what the fit does not follow on the scan." : "Where scan and model overlap, the nearer one is shown.";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey is what the fit does not follow on the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
         said.hidden = !said.textContent;
       }
 
@@ -441,21 +443,25 @@
           view.set(id, { visible: percent > 0, opacity: percent / 100 });
         } };
       };
-      const scan = layer("scan", "Scan", 0), model = layer("model", "Model", 100);
-      controls.append(
-        choice("Stage", stages.map((name) => [name, STAGES[name] || name]), state.stage, (name) => {
+      const scan = arrays.scan ? layer("scan", "Scan", 0) : null, model = layer("model", "Model", 100);
+      const maps = [["none", "plain"]];
+      if (arrays.scan) maps.push(["model", "distance, model to scan"], ["scan", "distance, scan to model"]);
+      if (arrays.regions) maps.push(["regions", "what the fit used"]);
+      if (arrays.colours_final && arrays.scan_colours) maps.push(["colour", "colour of the scan"]);
+      const called = (name) => (name === "final" && !stages.includes("initial") ? "Fitted" : STAGES[name] || name);
+      if (stages.length > 1) {
+        controls.append(choice("Stage", stages.map((name) => [name, called(name)]), state.stage, (name) => {
           state.stage = name;
           view.move("model", arrays[`surface_${name}`]);
           paint();
-        }),
-        make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, scan.row, model.row),
-        select("Colour", [
-          ["none", "plain"], ["model", "distance, model to scan"], ["scan", "distance, scan to model"], ["regions", "what the fit used"],
-          ...(arrays.colours_final && arrays.scan_colours ? [["colour", "colour of the scan"]] : []),
-        ], state.map, (key) => {
+        }));
+      }
+      controls.append(
+        make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, ...[scan && scan.row, model.row].filter(Boolean)),
+        select("Colour", maps, state.map, (key) => {
           state.map = key;
           // The coloured surface is seen alone; the sliders bring the other one back.
-          scan.show(key === "scan" || key === "none" ? 100 : 0);
+          if (scan) scan.show(key === "scan" || key === "none" ? 100 : 0);
           model.show(key === "scan" ? 0 : 100);
           paint();
         }).row,

@@ -83,7 +83,7 @@ def surface_map_figure(
     signed: bool = True,
     limit: float | None = None,
     mask: BoolArray | None = None,
-    title: str = "",
+    title: str | None = "",
 ) -> Figure:
     """Draw a number for each vertex on a surface, seen from several sides.
 
@@ -94,7 +94,7 @@ def surface_map_figure(
         signed: whether two colours part at zero.
         limit: where the colours end; None for what 98 % of the numbers stay below.
         mask: (V,) outside which the colour is pale; None for none.
-        title: above the figure.
+        title: above the figure; None for none, as in a page that has a heading.
 
     Raises:
         InputError: another number of values or of the mask's, no finite value, a limit that is none, or no extent.
@@ -128,7 +128,7 @@ def surface_map_figure(
     notes += ["Pale: outside of what is marked."] if mask is not None and not mask.all() else []
     return grid(
         [Row(panels, [name for name, _ in sides])],
-        title=title or f"{plain(unit)} on the surface",
+        title=None if title is None else title or f"{plain(unit)} on the surface",
         scale=Scale(short(unit, 70), colours, low, end, beyond),
         note=" ".join(notes),
     )
@@ -150,14 +150,14 @@ def _mixed(one: Image, other: Image, share: FloatArray) -> Image:
     return np.rint(other + (one.astype(float) - other) * share[:, :, None]).astype(np.uint8)
 
 
-def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str = "") -> Figure:
+def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str | None = "") -> Figure:
     """Draw two shapes in correspondence beside each other, from one camera.
 
     Args:
         low: one shape.
         high: the other.
         labels: what they are.
-        title: above the figure.
+        title: above the figure; None for none, as in a page that has a heading.
 
     Raises:
         InputError: no extent, or one beyond all measure.
@@ -170,7 +170,8 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str =
     cameras, size = _views(points, yaws, 4)
     panels = [render(Layer(mesh), camera=camera, size=size) for mesh in both for camera in cameras]
     names = [short(label, 30) for label in labels for _ in yaws]
-    return grid([Row(panels, names)], title=title or f"{plain(labels[0])}, and {plain(labels[1])}")
+    both_named = f"{plain(labels[0])}, and {plain(labels[1])}"
+    return grid([Row(panels, names)], title=None if title is None else title or both_named)
 
 
 def histogram_figure(

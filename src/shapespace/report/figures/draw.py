@@ -5,6 +5,7 @@ A figure is 960 pixels wide, and its smallest type stays legible when a phone sh
 
 from __future__ import annotations
 
+import io
 import re
 import textwrap
 import warnings
@@ -60,6 +61,16 @@ _GAP, _EDGE = 8, 4
 _MOST_LINES = 4
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 _Item = TypeVar("_Item")
+
+
+class ShownFigure(Figure):
+    """A figure that shows itself once as the value of a notebook's cell, also where pyplot was never imported."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        with without_glyph_warnings():
+            FigureCanvasAgg(self).print_png(stream)
+        return stream.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,18 +143,25 @@ def surroundings(fit: StagedFit) -> FloatArray:
 def grid(
     rows: Sequence[Row],
     *,
-    title: str,
+    title: str | None,
     note: str = "",
     scale: Scale | None = None,
     keys: Sequence[tuple[str, Colour]] = (),
 ) -> Figure:
-    """Lay out pictures pixel for pixel in rows below `title`, with a key or a scale and a `note` below them.
+    """Lay out pictures pixel for pixel in rows, with a key or a scale and a `note` below them.
+
+    Args:
+        rows: of pictures.
+        title: above them; None where the page has it already.
+        note: below all.
+        scale: a colour bar, or None.
+        keys: names of colours.
 
     Raises:
         InputError: there are no pictures.
     """
     if not rows or not rows[0].panels:
-        raise InputError(f"{plain(title)}: there is nothing to draw.")
+        raise InputError(f"{plain(title or 'The figure')}: there is nothing to draw.")
     columns = max(len(row.panels) for row in rows)
     widest = max(row.panels[0].shape[1] for row in rows)
     total_w = max(WIDTH, columns * widest + (columns - 1) * _GAP)
@@ -158,7 +176,8 @@ def grid(
             texts.append((x, y + baseline(k, size), line, {"fontsize": size, "va": "baseline", **style}))
         return height_of(wrapped, size)
 
-    y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
+    if title is not None:
+        y += write(_EDGE, title, total_w - 2 * _EDGE, TITLE, fontweight="bold", color=INK) + 8
     for r, row in enumerate(rows):
         y += 10 if r and any(row.captions) and not row.heading else 0
         panels = without_empty_rows(row.panels)
@@ -196,7 +215,7 @@ def _drawn(
     total_h: int,
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
-    figure = Figure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    figure = ShownFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
     for x, top, image in pictures:
         high, wide = image.shape[:2]
         axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
@@ -269,7 +288,7 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
     top = (height_of(wrapped, TITLE) + 14) / DPI
     bottom = (height_of(below, SMALL) + 12) / DPI if below else 0.03
     total = sum(heights) + top + bottom
-    figure = Figure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
+    figure = ShownFigure(figsize=(WIDTH / DPI, total), dpi=DPI, facecolor="white")
     places = figure.add_gridspec(len(heights), columns, height_ratios=list(heights))
     axes = [figure.add_subplot(places[r, c]) for r in range(len(heights)) for c in range(columns)]
     start = total * DPI - height_of(below, SMALL) - 2

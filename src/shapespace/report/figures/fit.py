@@ -340,7 +340,13 @@ def z_stddev(fit: StagedFit) -> FloatArray:
 
 
 def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw the scan beside the parts of the model that followed it, were rejected, lay at its border or unseen."""
+    """Draw the scan beside the parts of the model that followed it, were rejected, lay at its border or unseen.
+
+    Raises:
+        InputError: the regions were not saved.
+    """
+    if fit.regions is None:
+        raise InputError(f"{short(fit.label)} has no saved regions; fit the scan again with --stages.")
     table = np.array([REGION_COLOURS[name] for name in REGIONS])
     layer = Layer(
         fit.surfaces["final"], scalars=fit.regions.astype(np.float64), colormap=table, vmin=-0.5,
@@ -369,7 +375,8 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
     points = surroundings(fit)
-    before, final = fit.surfaces["before"].vertices, fit.surfaces["final"].vertices
+    final = fit.surfaces["final"].vertices
+    before = fit.surfaces["before"].vertices if "before" in fit.surfaces else final
     # Of a start that was near, all is shown; one that was far away would make the rest small.
     if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
         points = np.concatenate([points, before])

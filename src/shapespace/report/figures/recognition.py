@@ -224,16 +224,17 @@ def learning_curve_figure(
     Raises:
         InputError: lists that are empty or of different lengths.
     """
-    x = _numbers(subjects, "the numbers of people of a learning curve")
+    x = _numbers(subjects, "the numbers of subjects of a learning curve")
     y = 100 * _numbers(mean, "the accuracies of a learning curve")
     if not len(x) or x.shape != y.shape:
-        raise InputError(f"A learning curve of {len(x)} numbers of people cannot have {len(y)} accuracies.")
+        raise InputError(f"A learning curve of {len(x)} numbers of subjects cannot have {len(y)} accuracies.")
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
-    said = f"{_share(y[0])} right with {counted(round(x[0]), 'person').replace('persons', 'people')} to learn from"
+    said = f"{_share(y[0])} right with {counted(round(x[0]), 'subject')} to learn from"
     if len(x) > 1:
         said = (
-            f"Learning from {x[-1]:g} people instead of {x[0]:g} takes the share of right answers from {_share(y[0])} "
+            f"Learning from {x[-1]:g} subjects instead of {x[0]:g} takes the share of right answers from "
+            f"{_share(y[0])} "
             f"to {_share(y[-1])}"
         )
     figure, axes = chart(title or said, height=3.3)
@@ -246,7 +247,7 @@ def learning_curve_figure(
     if ceiling is not None:
         axes.axhline(100 * ceiling, color=INK, ls=(0, (4, 3)), lw=1.4, label=f"ceiling: {_share(100 * ceiling)}")
         bottom = min(bottom, 100 * ceiling)
-    axes.set(xlabel="people learned from", ylabel="right answers, unseen people (%)", xlim=(0, 1.04 * float(x[-1])))
+    axes.set(xlabel="subjects learned from", ylabel="right answers, unseen subjects (%)", xlim=(0, 1.04 * float(x[-1])))
     axes.set_ylim(max(0.0, 10 * np.floor((bottom - 4) / 10)), 101)
     axes.locator_params(axis="x", integer=True)
     legend(axes, loc="lower right")

@@ -11,11 +11,12 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.late import late
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.rates import Figure, figure, people_drawn
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
 from shapespace.statistics.identity.scores import score_name
-from shapespace.types import BoolArray, FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)
 """Shares of searches for people who are not enrolled that find somebody, at which the misses are told."""
@@ -39,6 +40,8 @@ class Searches:
     rank: IntArray
     own: FloatArray
     best_other: FloatArray
+
+    __repr__ = short_repr
 
     @property
     def people(self) -> int:
@@ -95,6 +98,8 @@ class Identified:
     band: FloatArray
     fnir: Mapping[float, Figure]
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Identification:
@@ -124,6 +129,13 @@ class Identification:
         """Return it as it is kept and reported."""
         return late("answer_of_identification")(self)
 
+    def __repr__(self) -> str:
+        told = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
+        return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {told}>"
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
     """Return what probes find: a person's score is that of the scan of them that is most like the probe.
@@ -138,7 +150,7 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
     """
     people, whose = np.unique(gallery, return_inverse=True)
     if len(people) < 2:
-        raise InputError(f"{len(people)} people are enrolled, and two are the least to tell apart; use fewer folds.")
+        raise InputError(f"{len(people)} subjects are enrolled, and two are the least to tell apart; use fewer folds.")
     best = np.full((len(people), len(probes)), -np.inf)
     np.maximum.at(best, whose, scores)
     own = people[:, None] == probes
@@ -164,6 +176,7 @@ def identify(
         InputError: as `trial_of`, or too few people to learn from.
         ShapespaceError: scikit-learn is not installed.
     """
+    require(cohort, Cohort, "identify", "read one with shapespace.read_cohort")
     options = options or IdentityOptions()
     trial = trial_of(cohort, options, enrol=True)
     parts: dict[str, list[Searches]] = {name: [] for name in options.scores}

@@ -29,7 +29,7 @@ def answer_of_identification(found: Identification) -> Answer:
     strangers = int((~first.searches.enrolled).sum())
     summary = seen(
         [
-            f"By {called(first.name)} the right person is the first of {found.enrolled} in "
+            f"By {called(first.name)} the right subject is the first of {found.enrolled} in "
             f"{in_percent(first.rank_1)} of {found.probes - strangers} searches.",
             *(
                 f"Where {100 * rate:g} % of searches for strangers may find somebody, "
@@ -38,7 +38,7 @@ def answer_of_identification(found: Identification) -> Answer:
                 if one.value is not None
             ),
             *(
-                f"By {called(one.name)} the right person is the first in {in_percent(one.rank_1)}."
+                f"By {called(one.name)} the right subject is the first in {in_percent(one.rank_1)}."
                 for one in found.scores[1:]
             ),
             who_was_tested(trial, found.trained_on),
@@ -55,7 +55,7 @@ def answer_of_identification(found: Identification) -> Answer:
             else "",
             ""
             if strangers
-            else "Nobody is a stranger, so each probe is searched for once more without its own person.",
+            else "Nobody is a stranger, so each probe is searched for once more without its own subject.",
         ]
     )
     told = ("score", "figure", "value", "low", "high")
@@ -104,7 +104,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
     ranks = tuple(float(k) for k in range(1, found.enrolled + 1))
     return (
         TablePart(
-            title="How well people are found",
+            title="How well subjects are found",
             note="FPIR: searches for somebody who is not enrolled that find somebody. FNIR: searches for somebody "
             "enrolled that do not find them first and above the threshold.",
             columns=tuple(columns),
@@ -112,7 +112,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
         ),
         CurvePart(
             title="CMC curve",
-            note="How often the right person is within the first so many.",
+            note="How often the right subject is within the first so many.",
             series=tuple(
                 Series(x=ranks, y=tuple(one.cmc.tolist()), label=called(one.name),
                        low=tuple(one.band[0].tolist()), high=tuple(one.band[1].tolist()))
@@ -125,9 +125,9 @@ def _parts(found: Identification) -> tuple[Part, ...]:
             title="How it was measured",
             text=(
                 who_was_tested(found.trial, found.trained_on),
-                f"{found.enrolled} people are enrolled"
+                f"{found.enrolled} subjects are enrolled"
                 + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
-                + " A person's score is that of the scan of them that is most like the probe; ties count against the"
+                + " A subject's score is that of the scan of them that is most like the probe; ties count against the"
                 f" right one. {INTERVALS}",
             ),
         ),

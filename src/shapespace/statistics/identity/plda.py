@@ -61,8 +61,8 @@ class TwoCovariance:
         counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
         if len(names) < 3 or counts.max(initial=0.0) < 2:
             raise InputError(
-                f"The PLDA score learns from people who are not tested, and there are {len(names)}, of whom "
-                f"{int((counts > 1).sum())} have two scans; give three people or more and several scans of each, or "
+                f"The PLDA score learns from subjects who are not tested, and there are {len(names)}, of whom "
+                f"{int((counts > 1).sum())} have two scans; give three subjects or more and several scans of each, or "
                 "leave it out of --scores."
             )
         n, k = training.x.shape

@@ -10,6 +10,7 @@ import numpy as np
 
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 _LEVEL = 0.95
@@ -29,6 +30,8 @@ class Pairs:
     one: IntArray
     other: IntArray
     rows: IntArray
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.one)
@@ -66,6 +69,8 @@ class Roc:
     far: FloatArray
     tar: FloatArray
 
+    __repr__ = short_repr
+
     @property
     def eer(self) -> float:
         """Where as many genuine pairs are refused as impostors accepted, between the two nearest thresholds."""
@@ -96,7 +101,7 @@ class Sweep:
             raise InputError("Rates need a finite score for each pair.")
         if same.all() or not same.any():
             raise InputError(
-                f"There are {int(same.sum())} pairs of one person and {int((~same).sum())} of two; rates need both."
+                f"There are {int(same.sum())} pairs of one subject and {int((~same).sum())} of two; rates need both."
             )
         self._order = np.argsort(-score, kind="stable")
         ranked = score[self._order]
@@ -123,6 +128,13 @@ class Figure:
     value: float | None
     low: float | None = None
     high: float | None = None
+
+    def briefly(self) -> str:
+        """Return the figure as percent with its interval, for a line at a prompt."""
+        if self.value is None:
+            return "unknown"
+        interval = "" if self.low is None or self.high is None else f" ({100 * self.low:.3g} to {100 * self.high:.3g})"
+        return f"{100 * self.value:.3g} %{interval}"
 
 
 def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table, named
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.statistics.identity.samples import Samples, samples_of
 from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores, score_name
@@ -94,6 +95,8 @@ class Trial:
     all_pairs: bool
     notes: tuple[str, ...]
 
+    __repr__ = short_repr
+
     @cached_property
     def subjects(self) -> tuple[str, ...]:
         """(N,) whom each scan shows."""
@@ -165,13 +168,13 @@ def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -
     if both:
         raise InputError(
             f"{table.where}: {named(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put all "
-            "scans of a person on one side."
+            "scans of a subject on one side."
         )
     if enrol and not gallery:
         first = {int(person[row]): row for row in reversed(probes)}
         gallery, chosen = sorted(first.values()), set(first.values())
         probes = [row for row in probes if row not in chosen]
-        notes.append("No gallery was named, so the first scan of each person is enrolled and the others are probes.")
+        notes.append("No gallery was named, so the first scan of each subject is enrolled and the others are probes.")
     all_pairs = not gallery
     if all_pairs:
         gallery = probes
@@ -230,7 +233,7 @@ def _rounds(
 ) -> tuple[IntArray, tuple[Round, ...]]:
     """Return the group of each person, and the rounds."""
     if not gallery:
-        raise InputError("Nobody is left to be tested; learn from fewer people.")
+        raise InputError("Nobody is left to be tested; learn from fewer subjects.")
     tested = np.unique(person[[*gallery, *probes]])
     if training:
         parts = max(min(_GROUPS, len(tested) // 2), 1)
@@ -238,12 +241,12 @@ def _rounds(
         parts = options.folds or max(min(_FOLDS, len(tested) // 2), 1)
         if options.folds and not 2 <= options.folds <= len(tested) // 2:
             raise InputError(
-                f"{len(tested)} people cannot be parted into {options.folds} folds; each needs two of them, and two "
+                f"{len(tested)} subjects cannot be parted into {options.folds} folds; each needs two of them, and two "
                 "folds are the least."
             )
         if parts < 2:
             raise InputError(
-                f"There are {len(tested)} people, and four are the least: two to learn from, and two to tell apart."
+                f"There are {len(tested)} subjects, and four are the least: two to learn from, and two to tell apart."
             )
     order = np.random.default_rng((options.seed, 3)).permutation(len(tested))
     group = np.zeros(people, dtype=np.int32)
@@ -261,8 +264,8 @@ def _rounds(
 def _refuse_too_few(trial: Trial, table: Table) -> None:
     tested = int(trial.tested.sum())
     if tested < 2:
-        raise InputError(f"{table.where}: {tested} person is compared, and two are the least.")
+        raise InputError(f"{table.where}: {tested} subject is compared, and two are the least.")
     if not any(trial.pairs(one)[0].same.any() for one in trial.rounds):
         raise InputError(
-            f"{table.where}: no two scans that are compared show one person; nobody can be recognised by one scan."
+            f"{table.where}: no two scans that are compared show one subject; nobody can be recognised by one scan."
         )

@@ -9,6 +9,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.errors import InputError
+from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 
 _NO_VARIANCE = 1e-9
@@ -34,6 +35,8 @@ class Samples:
     mm: FloatArray
     subjects: tuple[str, ...]
     n_vertices: int = 1
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         n = len(self.subjects)
@@ -93,8 +96,8 @@ def samples_of(
         return Samples(x, variance if uncertainty else np.zeros_like(x), mm, tuple(subjects), vertices)
     if len(training) < 3:
         raise InputError(
-            "Surfaces without fits are whitened by those of people who are not tested, of whom there are "
-            f"{len(training)} and three are the least; ask for folds, or name people to train on."
+            "Surfaces without fits are whitened by those of subjects who are not tested, of whom there are "
+            f"{len(training)} and three are the least; ask for folds, or name subjects to train on."
         )
     known = mm[np.asarray(training, dtype=np.intp)]
     mean = known.mean(axis=0)

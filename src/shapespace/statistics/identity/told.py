@@ -24,8 +24,8 @@ CALLED = {
 }
 """What scores are called in words."""
 INTERVALS = (
-    "95 % intervals are percentiles over draws of people with replacement; near 0 and 1 they are at least as wide as "
-    "the exact interval of Clopper and Pearson for no error among as many people."
+    "95 % intervals are percentiles over draws of subjects with replacement; near 0 and 1 they are at least as wide as "
+    "the exact interval of Clopper and Pearson for no error among as many subjects."
 )
 """What the intervals of error rates are, for reports."""
 
@@ -66,12 +66,12 @@ def thinned(x: FloatArray, y: FloatArray, label: str) -> Series:
 def who_was_tested(trial: Trial, trained_on: int) -> str:
     """Return in words who was compared, and who was learned from."""
     tested = int(trial.tested.sum())
-    learned = f"{trained_on} other people" if trained_on else "nobody"
+    learned = f"{trained_on} other subjects" if trained_on else "nobody"
     if len(trial.rounds) == 1:
-        return f"{tested} people were tested; what is learned was learned from {learned}."
+        return f"{tested} subjects were tested; what is learned was learned from {learned}."
     return (
-        f"{tested} people were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
-        f"learned from the other parts, of {trained_on} people at least."
+        f"{tested} subjects were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
+        f"learned from the other parts, of {trained_on} subjects at least."
     )
 
 
@@ -102,8 +102,9 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean that there are none: up to {100 * zero_bound(people):.1f} "
-        "% of people may be ones with whom errors happen (95 %, Clopper-Pearson, with people as the units)."
+        else f"No error among {people} subjects does not mean that there are none: up to "
+        f"{100 * zero_bound(people):.1f} % of them may be ones with whom errors happen (95 %, Clopper-Pearson, "
+        "with subjects as the units)."
     )
 
 

@@ -11,12 +11,13 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.late import late
+from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
 from shapespace.statistics.identity.scores import score_name
-from shapespace.types import BoolArray, FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FAR = (1e-1, 1e-2, 1e-3)
 """Shares of impostor pairs accepted, at which the genuine pairs accepted are told."""
@@ -41,6 +42,8 @@ class Part:
     impostor: int
     eer: Figure
     tar: Mapping[float, Figure]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,8 @@ class Verified:
     by: Mapping[str, Part]
     curve: Mapping[int, float]
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Verification:
@@ -102,6 +107,13 @@ class Verification:
         """Return it as it is kept and reported."""
         return late("answer_of_verification")(self)
 
+    def __repr__(self) -> str:
+        told = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
+        return f"<Verification of {len(self.people)} subjects; {told}>"
+
+    def _repr_html_(self) -> str:
+        return late("html_of_analysis")(self)
+
 
 def verify(
     cohort: Cohort, options: IdentityOptions | None = None, *, on_step: Callable[[int, int], None] | None = None
@@ -117,6 +129,7 @@ def verify(
         InputError: as `trial_of`, or too few people to learn from.
         ShapespaceError: scikit-learn is not installed.
     """
+    require(cohort, Cohort, "verify", "read one with shapespace.read_cohort")
     options = options or IdentityOptions()
     trial = trial_of(cohort, options)
     pairs, scores = _pairs_and_scores(trial, options, options.modes)

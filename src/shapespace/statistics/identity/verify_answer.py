@@ -39,9 +39,9 @@ def answer_of_verification(found: Verification) -> Answer:
     summary = seen(
         [
             f"By {called(first.name)} the equal error rate is {in_percent(first.eer)}, over {genuine} pairs of one "
-            f"person and {impostor} pairs of two.",
+            f"subject and {impostor} pairs of two.",
             *(
-                f"At a false accept rate of {100 * far:g} % it accepts {in_percent(one)} of the pairs of one person."
+                f"At a false accept rate of {100 * far:g} % it accepts {in_percent(one)} of the pairs of one subject."
                 for far, one in first.tar.items()
                 if one.value is not None
             ),
@@ -60,7 +60,7 @@ def answer_of_verification(found: Verification) -> Answer:
             "nothing is stated."
             if thin
             else "",
-            "There are too few people to calibrate scores on others than those tested, so there are no likelihood "
+            "There are too few subjects to calibrate scores on others than those tested, so there are no likelihood "
             "ratios."
             if first.llr is None
             else "",
@@ -135,8 +135,8 @@ def _parts(found: Verification) -> tuple[Part, ...]:
             text=(
                 who_was_tested(found.trial, found.trained_on),
                 f"{INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by "
-                "a logistic regression on pairs of people of other groups. Whether the shape model "
-                "was built from people tested here cannot be seen from its file; it must not have been.",
+                "a logistic regression on pairs of subjects of other groups. Whether the shape model "
+                "was built from subjects tested here cannot be seen from its file; it must not have been.",
             ),
         )
     )
@@ -154,8 +154,8 @@ def _table(found: Verification) -> TablePart:
         told = [cell for figure in (one.eer, *one.tar.values()) for cell in (figure.value, interval(figure))]
         rows.append((called(one.name), *told, one.cllr.value, one.cllr_min))
     return TablePart(
-        title="How well one person is told from two",
-        note="EER: where as many pairs of one person are refused as pairs of two accepted. TAR: pairs of one person "
+        title="How well one subject is told from two",
+        note="EER: where as many pairs of one subject are refused as pairs of two accepted. TAR: pairs of one subject "
         "accepted, at a rate FAR of pairs of two accepted. Cllr: what the likelihood ratios miss, 0 to 1 and more.",
         columns=tuple(columns),
         rows=tuple(rows),
@@ -226,7 +226,7 @@ def _histogram(one: Verified, found: Verification) -> HistogramPart:
     edges = np.linspace(float(values.min()), float(values.max()) + 1e-12, _BINS + 1)
     counts = [
         Counts(counts=tuple((np.histogram(values[kind], edges)[0] / kind.sum()).tolist()), label=label)
-        for kind, label in ((found.pairs.same, "one person"), (~found.pairs.same, "two people"))
+        for kind, label in ((found.pairs.same, "one subject"), (~found.pairs.same, "two subjects"))
     ]
     return HistogramPart(
         title=f"Scores: {called(one.name)}",

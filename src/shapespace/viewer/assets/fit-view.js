@@ -73,8 +73,12 @@
       this.stddev = this.context.about.stddev;
       this.limit = facts.scale_mm > 0 ? facts.scale_mm : 1;
       const keep = this.view || {};
+      this.colours = [["plain", "Plain"]];
+      if (arrays.scan) this.colours.push(["model", "Model to scan"], ["scan", "Scan to model"]);
+      if (arrays.regions) this.colours.push(["regions", "Regions"]);
+      if (arrays.colours_final && arrays.scan_colours) this.colours.push(["colour", "Colour of the scan"]);
       this.view = {
-        stage: "final", moment: null, layout: keep.layout || "overlay", colour: keep.colour === "colour" && !arrays.colours_final ? "plain" : keep.colour || "plain",
+        stage: "final", moment: null, layout: (arrays.scan && keep.layout) || "overlay", colour: this.colours.some(([key]) => key === keep.colour) ? keep.colour : "plain",
         scanOpacity: 1, modelOpacity: 1, marked: false, threshold: Math.min(this.limit / 2, 2),
       };
       this._build();
@@ -93,7 +97,7 @@
     _build() {
       const { prefix, view } = this, { arrays, facts } = this.payload;
       const id = (name) => `${prefix}-${name}`;
-      this.stageButtons = segments(facts.stages.map((s) => [s, STAGES[s] || s]), "Stage", id("stage"), (stage) => {
+      this.stageButtons = segments(facts.stages.map((s) => [s, s === "final" && !facts.stages.includes("initial") ? "Fitted" : STAGES[s] || s]), "Stage", id("stage"), (stage) => {
         this.stop();
         Object.assign(this.view, { stage, moment: null });
         this.draw();
@@ -103,9 +107,7 @@
         this._opacities();
         this.draw();
       });
-      const colours = [["plain", "Plain"], ["model", "Model to scan"], ["scan", "Scan to model"], ["regions", "Regions"]];
-      if (arrays.colours_final && arrays.scan_colours) colours.push(["colour", "Colour of the scan"]);
-      this.colourButtons = segments(colours, "Colour", id("colour"), (colour) => {
+      this.colourButtons = segments(this.colours, "Colour", id("colour"), (colour) => {
         this.view.colour = colour;
         if (this.view.moment !== null) Object.assign(this.view, { moment: null, stage: "final" });
         this.stop();
@@ -143,8 +145,9 @@
         h("button", { type: "button", "data-testid": id("export-csv"), onclick: () => this._csv() }, "Coefficients CSV"),
         h("button", { type: "button", "data-testid": id("use"), onclick: () => this.context.apply(this._z(), facts.label || facts.name) }, "Use in Model"));
       this.element.replaceChildren(
-        ...[h("h2", {}, "Stage"), this.stageButtons, h("h2", {}, "Show"), this.layoutButtons, this.colourButtons,
-          this.scanSlider.row, this.modelSlider.row, this.mapControls, this.steps, this.bars, this.exported, exports].filter(Boolean));
+        ...[facts.without_scan ? h("p", { "data-testid": id("without-scan") }, facts.without_scan) : null,
+          ...(facts.stages.length > 1 ? [h("h2", {}, "Stage"), this.stageButtons] : []), h("h2", {}, "Show"), arrays.scan ? this.layoutButtons : null, this.colourButtons,
+          arrays.scan ? this.scanSlider.row : null, this.modelSlider.row, this.mapControls, this.steps, this.bars, this.exported, exports].filter(Boolean));
       if (this.steps) Viewer.rmsChart(this.rms, Array.from(arrays.history_rms_mm), Array.from(arrays.history_phase), null);
       const error = Array.from(arrays.b_stddev, (sd, k) => sd / (k < this.stddev.length ? this.stddev[k] : NaN));
       Viewer.coefficientChart(this.bars, [{ z: this._z(), error }], this.K);
@@ -169,7 +172,7 @@
     /** Put the surfaces of the payload into the views. */
     _fill() {
       const { arrays } = this.payload;
-      this.scan = { positions: arrays.scan, faces: arrays.scan_faces || null };
+      this.scan = arrays.scan ? { positions: arrays.scan, faces: arrays.scan_faces || null } : null;
       this.surface = (stage) => arrays[`surface_${stage}`];
       this._moved = new Float32Array(this.surface("final").length);
     }
@@ -244,21 +247,23 @@
       if (stage.holds !== this) {
         stage.clear();
         stage.holds = this;
-        stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
+        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
         this._drawn = payload;
       } else if (this._drawn !== payload) {
-        stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
+        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
+        else stage.a.remove("scan");
         model.remove("model");
         this._drawn = payload;
       }
       if (!model.has("model")) model.setSurface("model", { positions, faces: arrays.faces || null, colour: about.model_colour });
       else model.move("model", positions);
-      stage.a.set("scan", { opacity: view.scanOpacity, visible: view.scanOpacity > 0.01 });
+      if (this.scan) stage.a.set("scan", { opacity: view.scanOpacity, visible: view.scanOpacity > 0.01 });
       model.set("model", { opacity: view.modelOpacity, visible: view.modelOpacity > 0.01 });
       this._paint(model);
       if (frame) stage.a.frame(["scan", "model"].filter((id) => stage.a.has(id)));
       if (frame && side) stage.a.link(stage.b);
-      const when = view.moment === null ? STAGE_TITLES[view.stage] || view.stage
+      const ended = view.stage === "final" && !facts.stages.includes("initial");
+      const when = view.moment === null ? (ended ? "The fitted model" : STAGE_TITLES[view.stage] || view.stage)
         : `Phase ${arrays.history_phase[view.moment]}, iteration ${arrays.history_iteration[view.moment]}: RMS ${arrays.history_rms_mm[view.moment].toFixed(2)} mm`;
       const name = facts.label || facts.name;
       stage.captions(side ? `${name}: the scan` : `${name}. ${when}`, side ? when : "");
@@ -267,15 +272,15 @@
 
     _paint(model) {
       const { view } = this, { arrays } = this.payload, { stage, about } = this.context;
-      stage.a.paint("scan", null);
+      if (this.scan) stage.a.paint("scan", null);
       model.paint("model", null);
       stage.bar(null);
       stage.legend(null);
       this.shared = null;
       if (view.moment !== null || view.colour === "plain") {
-        const both = [["scan", about.scan_colour], ["model", about.model_colour]];
+        const both = [...(this.scan ? [["scan", about.scan_colour]] : []), ["model", about.model_colour]];
         const opaque = view.scanOpacity > 0.99 && view.modelOpacity > 0.99;
-        stage.legend(view.layout === "overlay" ? both : null, opaque ? NEARER : "");
+        stage.legend(view.layout === "overlay" ? both : null, opaque && this.scan ? NEARER : "");
         return;
       }
       if (view.colour === "regions") {

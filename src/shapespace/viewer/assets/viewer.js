@@ -521,6 +521,12 @@
     if (!count) $("fit-next").title = $("fit-previous").title = "No fit is doubtful";
   }
 
+  /** The fit to open on: the first good one that can be drawn, or else the first that can. */
+  function firstFit() {
+    const good = listed.findIndex((row) => row.pictured && row.status === "converged");
+    return Math.max(0, good >= 0 ? good : listed.findIndex((row) => row.pictured));
+  }
+
   /** Show the fits whose name, label or status holds what is typed. */
   function filterFits() {
     const wanted = $("fit-filter").value.trim().toLowerCase();
@@ -1029,7 +1035,7 @@
       stage.clear();
       stage.split(false);
       if (name === "fits") {
-        if (listed.length && !fitView.payload) selectFit(selected >= 0 ? selected : Math.max(0, listed.findIndex((row) => row.pictured)));
+        if (listed.length && !fitView.payload) selectFit(selected >= 0 ? selected : firstFit());
         else if (fitView.payload) fitView.draw(true);
         else drawEmpty();
       } else if (own && own.placing) drawPlacing(true);
