@@ -42,6 +42,9 @@ class Design:
 DESIGNS = (
     Design(12, 12, 0.0, 0.0),
     Design(12, 12, 0.1, 0.8),
+    Design(12, 12, 0.1, 0.8, 0.4),
+    Design(12, 12, 0.0, 1.0),
+    Design(8, 24, 0.1, 0.8),
     Design(8, 24, 0.0, 1.0),
 )
 
@@ -105,7 +108,7 @@ def false_positives(design: Design, studies: int, seed: int) -> tuple[float, flo
 def main() -> None:
     """Print the table of docs/missing.md."""
     words = argparse.ArgumentParser(description=__doc__)
-    words.add_argument("--studies", type=int, default=200, metavar="N", help="of each design (default 200)")
+    words.add_argument("--studies", type=int, default=400, metavar="N", help="of each design (default 400)")
     words.add_argument("--seed", type=int, default=1, metavar="S")
     asked = words.parse_args()
     print(
