@@ -76,7 +76,7 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
     for test in comparison.tests:
         told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
-        where = f" {test.stratum}" if test.stratum else ""
+        where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
         else:
@@ -117,9 +117,9 @@ def _near(cohort: Cohort, vertex: int) -> str:
     """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
     if not cohort.landmarks:
         return ""
-    names, places = list(cohort.landmarks), np.array(list(cohort.landmarks.values()))
-    far = np.linalg.norm(cohort.reference[places] - cohort.reference[vertex], axis=1)
-    return f" near {names[int(far.argmin())]}"
+    places = cohort.landmarks.interpolate(cohort.reference)
+    far = np.linalg.norm(places - cohort.reference[vertex], axis=1)
+    return f" near {cohort.landmarks.names[int(far.argmin())]}"
 
 
 def _column(name: str, kind: Any = "text") -> TableColumn:
