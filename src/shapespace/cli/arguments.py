@@ -89,8 +89,8 @@ def _add_demo(commands: Any) -> None:
 
 
 def _add_data(commands: Any) -> None:
-    sub = commands.add_parser("data", help="open data sets, simulated faces and organs").add_subparsers(
-        required=True, metavar="list|get|faces|organs"
+    sub = commands.add_parser("data", help="open data sets, simulated faces, organs and bones").add_subparsers(
+        required=True, metavar="list|get|faces|organs|bones"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
     listing.set_defaults(run=run.data_list)
@@ -125,6 +125,14 @@ def _add_data(commands: Any) -> None:
     organs.add_argument("--seed", type=_natural, default=0, metavar="S")
     organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
     organs.set_defaults(run=run.data_organs)
+    bones = _add(sub, "bones", "write raw scans (PLY) of simulated bones of two groups, with bones.csv",
+                 "shapespace data bones -o bones --count 16")  # fmt: skip
+    bones.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    bones.add_argument("--count", type=_positive, default=16, metavar="N", help="of both groups in turn (default 16)")
+    bones.add_argument("--seed", type=_natural, default=0, metavar="S")
+    bones.add_argument("--effect", type=float, default=4.0, metavar="MM",
+                       help="how much longer the snouts of the second group are (default 4)")  # fmt: skip
+    bones.set_defaults(run=run.data_bones)
 
 
 def _add_surface(commands: Any) -> None:
@@ -337,7 +345,7 @@ def _add_report(commands: Any) -> None:
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
     sub.add_argument("--labels", type=Path, metavar="FILE",
-                     help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
+                     help="table of scans and labels (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.report)
 
@@ -393,7 +401,7 @@ def _add_recognise_train(commands: Any) -> None:
                "--classifier mean-direction")  # fmt: skip
     sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
     sub.add_argument("--labels", type=Path, required=True, metavar="FILE",
-                     help="CSV of file and label, and of subject if known")  # fmt: skip
+                     help="table of scans and their labels, and subjects if known")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.skops")
     sub.add_argument("--classifier", default="lda", metavar="NAME",
                      help="mean-direction, knn, lda (default), qda, logistic or svm")  # fmt: skip

@@ -120,6 +120,19 @@ def data_organs(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def data_bones(arguments: argparse.Namespace) -> int:
+    """Write simulated bones of two groups."""
+    from shapespace.commands.data import write_simulated_bones
+
+    out, count = arguments.output, arguments.count
+    write_simulated_bones(out, count=count, seed=arguments.seed, effect_mm=arguments.effect, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"folder": str(out), "bones": count})
+    else:
+        show(f"{count} bones in {out}")
+    return 0
+
+
 def surface(arguments: argparse.Namespace) -> int:
     """Surfaces of labels in volumes."""
     from shapespace.commands.surface import write_surfaces

@@ -76,7 +76,7 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
     for test in comparison.tests:
         told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
-        where = f" {test.stratum}" if test.stratum else ""
+        where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
         else:

@@ -9,7 +9,7 @@ measures with the error of subject by condition, and in the two-stage analysis o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +30,8 @@ from shapespace.types import FloatArray
 
 _ESTIMABLE = 1e-6
 """Share of a column's standard deviation below which a subject's own variation of it is rounding."""
+_SHARES = np.append(np.linspace(0.0, 0.95, 20), 0.99)
+"""Of the variance of a typical subject's response, that of its estimate; 1 would trust one subject without limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +41,12 @@ class Responses:
     Args:
         subjects: (s,) which subjects these are.
         values: (s, d, K) mm; d orthonormal contrasts.
-        weights: (s,) roots of the weights of subjects, 1 for all where they have the same conditions.
+        variances: (s,) of the estimates by unit variance of the cells, mean of the contrasts; by the median of all.
     """
 
     subjects: Rows
     values: FloatArray
-    weights: FloatArray
+    variances: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +107,33 @@ class Within:
             )  # fmt: skip
         return tuple(strata)
 
+    def conditions(self) -> Iterator[tuple[Term, FloatArray]]:
+        """Yield the terms within subjects with the subjects' means of their columns, less those of most subjects.
+
+        The median is the balanced condition where most subjects have it, so that theirs needs no adjustment.
+        """
+        means = means_of(self.effects.matrix[self.rows], self.at)
+        means = means - np.median(means, axis=0)
+        first = np.array([self.rows[np.flatnonzero(self.at == one)[0]] for one in range(self.count)])
+        scale = self.effects.matrix.std(axis=0)
+        for effect, terms in self.terms.items():
+            columns = list(self.effects.terms[effect].columns)
+            own = means[:, columns] / scale[columns]
+            if np.abs(own).max() <= _ESTIMABLE:
+                continue
+            for term in terms:
+                between = self.design.part([term.factors - self.factors]).matrix[first]
+                yield term, (own[:, :, None] * between[:, None, :]).reshape(self.count, -1)
+
     def holds(self, variables: frozenset[str]) -> bool:
         """Return whether the joint effect of variables, by their names inside, may differ between subjects."""
         own = variables & self.variables
         return bool(own) and any(own <= self.effects.terms[effect].variables for effect in self.random)
+
+    @property
+    def factors(self) -> frozenset[str]:
+        """Factors of the terms that differ within subjects."""
+        return frozenset(factor for term in self.effects.terms for factor in term.factors)
 
     @property
     def variables(self) -> frozenset[str]:
@@ -181,12 +206,13 @@ class Within:
             )
         columns = np.arange(matrix.shape[1], dtype=np.intp)
         refuse_aliased(matrix, columns, terms, self.design, where)
-        weighted = responses.weights[:, None] * matrix
+        roots = np.sqrt(_weights(responses, matrix))
+        weighted = roots[:, None] * matrix
         whole: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
         constant = np.zeros((s, d))
-        constant[:, 0] = responses.weights
+        constant[:, 0] = roots
         stratum = Stratum(
-            where, (responses.weights[:, None, None] * responses.values).reshape(s * d, -1), whole,
+            where, (roots[:, None, None] * responses.values).reshape(s * d, -1), whole,
             np.repeat(columns, d), terms, np.zeros(s, dtype=np.intp), 0, 2, scheme="subjects", width=d,
             units=responses.subjects, n_units=self.count, constant=constant.ravel(),
         )  # fmt: skip
@@ -196,12 +222,10 @@ class Within:
         """Return the terms that contain some effects, and the design of their parts between subjects."""
         chosen = [term for effect in effects for term in self.terms[effect]]
         chosen.sort(key=self.design.terms.index)
-        inside = {factor for term in self.effects.terms for factor in term.factors}
-        parts = list(dict.fromkeys(term.factors - inside for term in chosen))
-        parts.sort(key=len)
+        parts = sorted(dict.fromkeys(term.factors - self.factors for term in chosen), key=len)
         made = self.design.part(parts)
         # Terms of several effects with the same part between subjects share its columns.
-        terms = [replace(term, columns=made.terms[parts.index(term.factors - inside)].columns) for term in chosen]
+        terms = [replace(term, columns=made.terms[parts.index(term.factors - self.factors)].columns) for term in chosen]
         return tuple({term.columns: term for term in terms}.values()), made
 
     def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> Responses:
@@ -228,9 +252,35 @@ class Within:
         information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
         metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
         own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
-        weight = 2.0 / (1.0 + own / np.median(own))
         shown = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
-        return Responses(np.array(chosen, dtype=np.intp), shown, np.sqrt(weight))
+        return Responses(np.array(chosen, dtype=np.intp), shown, own / np.median(own))
+
+
+def _weights(responses: Responses, matrix: FloatArray) -> FloatArray:
+    """Return the (s,) weights of subjects in a model (s, q) of their responses, 1 for all where they are as precise.
+
+    The variance of a response is that between subjects plus that of its estimate. The share of the latter is the one of
+    `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), the same for all
+    coordinates.
+    """
+    v = responses.variances
+    if np.ptp(v) <= _ESTIMABLE:
+        return np.ones(len(v))
+    y = responses.values.reshape(len(v), -1)
+    gram = y @ y.T
+    free = len(v) - matrix.shape[1]
+    best, chosen = np.inf, v
+    for share in _SHARES:
+        variance = 1.0 - share + share * v
+        roots = 1.0 / np.sqrt(variance)
+        q, r = np.linalg.qr(roots[:, None] * matrix)
+        white = roots[:, None] * gram * roots
+        left = float(np.trace(white) - np.trace(q.T @ white @ q))
+        cost = np.log(variance).sum() + 2.0 * np.log(np.abs(np.diag(r))).sum() + free * np.log(max(left, 1e-300))
+        if cost < best:
+            best, chosen = float(cost), variance
+    weights = 1.0 / chosen
+    return weights / weights.mean()
 
 
 def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
@@ -313,10 +363,10 @@ def strata_of(
     elif random:
         raise _no_effect(random[0], design)
     if outer:
-        own = np.array([term in inner for term in design.terms for _ in term.columns])
-        conditions = np.where(own, design.matrix - design.with_held(varying), 0.0) if inner else 0.0 * design.matrix
+        first = np.array([np.flatnonzero(at == one)[0] for one in range(len(names))])
+        conditions = () if within is None else tuple(within.conditions())
         strata.insert(
-            0, between_stratum(means, design.matrix[rows], conditions[rows], at, design, outer, inner, blocks)
+            0, between_stratum(means_of(means, at), design.matrix[rows[first]], conditions, design, outer, blocks)
         )
     notes, warnings = list[str](), list[str]()
     if len(rows) < n:
