@@ -71,7 +71,8 @@ def main() -> None:
         measure(arguments.one[0], int(arguments.one[1]))
         return
     print(
-        "| labels | voxels of the box, million | vertices, million | measured, GB | estimate, GB |\n|---|---|---|---|---|"
+        "| labels | voxels of the box, million | vertices, million | measured, GB | estimate, GB |\n"
+        "|---|---|---|---|---|"
     )
     for kind in KINDS:
         for side in arguments.side:
