@@ -24,6 +24,7 @@ import numpy as np
 from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, study_config
 
 from shapespace.model.additive import AdditiveModel
+from shapespace.statistics.identity.calibration import cllr
 from shapespace.statistics.identity.identify import Searches, identified, joined, search
 from shapespace.statistics.identity.rates import Figure, Pairs, Sweep, people_drawn
 from shapespace.statistics.identity.samples import Samples
@@ -34,7 +35,7 @@ from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import STATUSES, model_path, person_path, read_fits
 from study_people import StudyPeople
 
-AS_EXACT = "likelihood-ratio, fits taken for exact"
+AS_EXACT = "plda, fits taken for exact"
 MODES = (1, 2, 3, 5, 10, 20, 40, 80, 160)
 STUDY = "10 % missing"
 
@@ -106,7 +107,7 @@ def score_matrices(folds: Sequence[Fold], name: str, modes: int | None) -> list[
                  for part in (fold.training, fold.gallery, fold.probes)]  # fmt: skip
         if name == AS_EXACT:
             parts = [replace(part, variance=np.zeros_like(part.x)) for part in parts]
-        scorer = SCORES["likelihood-ratio" if name == AS_EXACT else name](parts[0])
+        scorer = SCORES["plda" if name == AS_EXACT else name](parts[0])
         out.append(scorer(parts[1], parts[2]))
     return out
 
@@ -142,6 +143,9 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
             told.score[~pairs.same].std()
         )
         out[name]["margin"] = least
+        if name.startswith("plda"):
+            # The score is a difference of log likelihoods, so its cost as it stands can be compared.
+            out[name]["cllr_of_the_score"] = cllr(told.score, pairs.same)
     out["pairs"] = {"people": len(people), "genuine": int(pairs.same.sum()), "impostor": int((~pairs.same).sum())}
     return out
 

@@ -378,7 +378,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         hash: SHA-256 of its content.
         status: `corresponding` or `set aside`.
         reason: why it is set aside.
-        seen_share: share of the template's vertices that it shows; the others are not-a-number.
+        seen_share: share of the template's vertices that it shows; the others are estimates.
         covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
             parts that the scan shows.
@@ -393,6 +393,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
         landmark_rms: distance of its landmarks from their places on the surface.
+        landmark_distances: name -> distance of each given landmark from the surface of the scan, in its unit.
         metadata: by the columns of the list that named it.
     """
 
@@ -422,6 +423,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     moved_share: list[float] = []
     cpu_s: list[float] = []
     landmark_rms: float | None = None
+    landmark_distances: Mapping[str, float] = {}
     metadata: Mapping[str, str | int | float | None] = {}
     format: str = FORMAT
     format_version: int = VERSION
@@ -439,6 +441,9 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         settings: of the run.
         version: of shapespace.
+        inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
+            reuses the results.
+        results_hash: SHA-256 of the files that the run wrote, except this one.
     """
 
     CALLED: ClassVar = "a correspondence"
@@ -455,6 +460,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     settings: dict[str, Any]
     version: str
     other_units: dict[str, float] = {}
+    inputs_hash: str = ""
+    results_hash: str = ""
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -9,24 +9,51 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.cohort.classes import class_notes
+from shapespace.cohort.incomplete import completed_by, completed_shapes
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
 
+ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces"]
+"""Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, or any other surfaces."""
+
+_TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
+
+
+@dataclass(frozen=True)
+class ShapeSource:
+    """Source of the shapes of a cohort, and the share of shape variance that it can represent.
+
+    Args:
+        kind: coefficients, fitted or dense surfaces of fits, corresponding surfaces, or other surfaces.
+        modes: number of model modes that the shapes are combinations of; None if the shapes are not limited to modes.
+        explained_variance_ratio: share of the model's training variance in these modes, 0 to 1; None as for `modes`.
+    """
+
+    kind: ShapeKind = "surfaces"
+    modes: int | None = None
+    explained_variance_ratio: float | None = None
+
+    def __str__(self) -> str:
+        if self.modes is None or self.explained_variance_ratio is None:
+            return f"{self.kind} surfaces" if self.kind != "surfaces" else "surfaces"
+        return f"{self.kind}, {self.modes} modes, {100 * self.explained_variance_ratio:.0f} % of the variance"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +83,19 @@ class Fitted:
         """(N, K) coefficients in standard deviations of the model."""
         return read_only(self.model.to_z(self.b))
 
+    def source(self, kind: ShapeKind) -> ShapeSource:
+        """Return the source of shapes of one kind of these fits.
+
+        Args:
+            kind: `coefficients` and `fitted` surfaces are limited to the modes of the fits; `dense` surfaces are not.
+        """
+        if kind not in _TRUNCATED:
+            return ShapeSource(kind)
+        modes = self.b.shape[1]
+        total = max(self.model.total_variance, float((self.model.stddev**2).sum()))
+        ratio = float((self.model.stddev[:modes] ** 2).sum()) / total if total > 0 else 1.0
+        return ShapeSource(kind, modes, ratio)
+
     def take(self, rows: Sequence[int]) -> Fitted:
         """Return those of some rows."""
         at = np.asarray(rows, dtype=np.intp)
@@ -82,9 +122,13 @@ class Cohort:
         table: what is known of each, N rows in this order.
         gauge: `shape` or `form`.
         faces: (F, 3) triangles; None for points.
-        landmarks: name -> vertex.
+        landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
+        source: where the shapes come from.
+        observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
+        analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
+            nothing varies. None if all are analysed.
     """
 
     names: tuple[str, ...]
@@ -95,12 +139,20 @@ class Cohort:
     table: Table
     gauge: Gauge = "shape"
     faces: IntArray | None = None
-    landmarks: Mapping[str, int] | None = None
+    landmarks: SurfaceLandmarks | None = None
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
+    source: ShapeSource = ShapeSource()
+    observed: BoolArray | None = None
+    analysed: BoolArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
+        agree = (self.observed is None or self.observed.shape == (n, len(self.reference))) and (
+            self.analysed is None or self.analysed.shape == (len(self.reference),)
+        )
+        if not agree:
+            raise InputError("The masks of a cohort need a flag for each vertex, and that of observed ones a row each.")
         agree = (
             self.coefficients.shape == (n, len(self.basis))
             and self.basis.shape[1] == self.reference.size
@@ -109,6 +161,8 @@ class Cohort:
         )
         if not agree:
             raise InputError("A cohort needs a row of coefficients, a size and a row of the table for each shape.")
+        if self.landmarks is not None:
+            object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -117,6 +171,31 @@ class Cohort:
     def n_vertices(self) -> int:
         """Number of vertices, V."""
         return len(self.reference)
+
+    @property
+    def observed_share(self) -> FloatArray:
+        """(V,) share of the shapes that observe each vertex; 0 for vertices that are not analysed."""
+        share = np.ones(self.n_vertices) if self.observed is None else self.observed.mean(axis=0)
+        return share if self.analysed is None else np.where(self.analysed, share, 0.0)
+
+    @property
+    def estimated_share(self) -> FloatArray:
+        """(N,) share of the analysed vertices of each shape that are estimates."""
+        if self.observed is None:
+            return np.zeros(len(self))
+        mask = self.observed if self.analysed is None else self.observed[:, self.analysed]
+        return 1.0 - mask.mean(axis=1)
+
+    def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
+        """Return (V,) whether all of some shapes observe a vertex that is analysed; None if they observe all."""
+        if self.observed is None and self.analysed is None:
+            return None
+        seen: BoolArray = np.ones(self.n_vertices, np.bool_)
+        if self.observed is not None:
+            seen = np.logical_and.reduce(self.observed[list(rows)], axis=0, dtype=np.bool_)
+        if self.analysed is not None:
+            seen = np.logical_and(seen, self.analysed)
+        return None if seen.all() else seen
 
     def vertices(self, shape: int | FloatArray) -> FloatArray:
         """Return the vertices (V, 3), mm, of a shape by its number, or of coefficients (K,)."""
@@ -143,11 +222,12 @@ class Cohort:
             sizes_mm=read_only(self.sizes_mm[at]),
             table=self.table.take(rows),
             fitted=None if self.fitted is None else self.fitted.take(rows),
+            observed=None if self.observed is None else self.observed[at],
             notes=(*self.notes, *notes),
         )
 
     def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
-        """Return the cohort of the shapes of which all `columns` are known.
+        """Return the cohort of the shapes of which all `columns` are known, with notes on the classes of these.
 
         Args:
             columns: of the table.
@@ -158,7 +238,8 @@ class Cohort:
         """
         missing = self.table.missing(columns)
         if not missing:
-            return self
+            new = [note for note in class_notes(self.table, columns) if note not in self.notes]
+            return replace(self, notes=(*self.notes, *new)) if new else self
         who = named([self.names[row] for row in missing])
         if not drop_missing:
             raise InputError(
@@ -169,7 +250,8 @@ class Cohort:
             raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
         lost = set(missing)
         note = f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing ({who})."
-        return self.take([row for row in range(len(self)) if row not in lost], note)
+        kept = self.take([row for row in range(len(self)) if row not in lost], note)
+        return kept.complete(columns)
 
     @staticmethod
     def of_shapes(
@@ -183,35 +265,55 @@ class Cohort:
         landmarks: Mapping[str, int] | None = None,
         onto: Cohort | None = None,
         least: int = 2,
+        observed: BoolArray | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
+        Missing vertices are estimated by their conditional means, by PCA with missing data. Vertices that fewer than
+        half of the shapes observe are not analysed.
+
         Args:
-            shapes: (N, V, 3) mm.
+            shapes: (N, V, 3) mm; vertices that are not-a-number are missing.
             columns: name -> N values, of the table; None and NaN are missing.
             names: of the shapes; None numbers them.
             faces: (F, 3) triangles.
             gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
             align: False takes them as they stand.
-            landmarks: name -> vertex.
+            landmarks: named points on the surfaces (`place_landmarks`), or name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
             least: how many shapes there must be, where `onto` is None.
+            observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
 
         Raises:
-            InputError: too few shapes, values that are not finite, columns of another length, two shapes that are the
-                same, or other vertices than those of `onto`.
+            InputError: too few shapes, values that are infinite, hardly a vertex observed in a shape, columns of
+                another length, two shapes that are the same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
         fewest = least if onto is None else 1
-        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or not np.isfinite(shapes).all():
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or np.isinf(shapes).any():
             said = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {said} or more finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
+        there: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
+        there = there if observed is None else np.logical_and(there, observed)
+        mask, analysed = None if there.all() else there, None
         sizes = read_only([centroid_size(shape) for shape in shapes])
         if onto is not None:
-            gauge = onto.gauge
+            gauge, analysed = onto.gauge, onto.analysed
+            _refuse_other_vertices(shapes, onto)
+            if analysed is not None:
+                mask = None if there[:, analysed].all() else np.logical_and(there, analysed)
+            if mask is not None:
+                shapes = _completed_by(onto, shapes, there, called)
+            if mask is not None or analysed is not None:
+                part = slice(None) if analysed is None else analysed
+                sizes = read_only([centroid_size(shape[part]) for shape in shapes])
             _bring_onto(shapes, onto)
+        elif mask is not None:
+            found = completed_shapes(shapes, there, called, gauge, faces, align=align)
+            shapes, mask, sizes = found.shapes, found.observed, read_only(found.sizes_mm)
+            analysed = None if found.analysed.all() else found.analysed
         elif align:
             align_in_place(shapes, gauge)
             if gauge == "shape":
@@ -219,8 +321,9 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks
-        )
+            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces,
+            None if landmarks is None else SurfaceLandmarks.of(landmarks), observed=mask, analysed=analysed,
+        )  # fmt: skip
         refuse_twice(cohort)
         return cohort
 
@@ -237,14 +340,8 @@ class Cohort:
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
-            InputError: as `of_shapes`, or meshes with missing vertices.
+            InputError: as `of_shapes`.
         """
-        holed = [mesh.name for mesh in meshes if not np.isfinite(mesh.vertices).all()]
-        if holed:
-            raise InputError(
-                f"{len(holed)} of {len(meshes)} meshes lack vertices that their scans do not show ({named(holed)}); "
-                "build a model of all and fit it to the scans, or leave these out."
-            )
         first = meshes[0]
         for mesh in meshes[1:]:
             if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
@@ -254,7 +351,11 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least)
+        whole = np.ones(len(first.vertices), dtype=np.bool_)
+        observed = np.stack([whole if mesh.observed is None else mesh.observed for mesh in meshes])
+        found = Cohort.of_shapes(
+            shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed
+        )
         return replace(found, table=table)
 
     @staticmethod
@@ -301,7 +402,7 @@ class Cohort:
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
-            dict(model.landmarks), fitted,
+            model.landmarks, fitted, source=fitted.source("coefficients"),
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort
@@ -309,18 +410,33 @@ class Cohort:
 
 def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
     """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
-    mean = onto.vertices(onto.coefficients.mean(axis=0))
-    if shapes.shape[1:] != mean.shape:
-        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {len(mean)}.")
+    whole = onto.vertices(onto.coefficients.mean(axis=0))
+    part = slice(None) if onto.analysed is None else onto.analysed
+    mean = whole[part]
     middle = mean - mean.mean(axis=0)
-    for k, shape in enumerate(shapes):
+    for k, shape in enumerate(shapes[:, part]):
         if centroid_size(shape) <= 0:
             raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
         moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
         if onto.gauge == "shape":
             along = float(np.sum(moved * middle)) / float(np.sum(middle**2))
             moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
-        shapes[k] = moved
+        shapes[k] = whole
+        shapes[k, part] = moved
+
+
+def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
+    if shapes.shape[1] != onto.n_vertices:
+        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {onto.n_vertices}.")
+
+
+def _completed_by(onto: Cohort, shapes: FloatArray, there: BoolArray, names: Sequence[str]) -> FloatArray:
+    """Return shapes (M, V, 3) in which analysed vertices that are not `there` (M, V) are estimated by a cohort."""
+    part = np.ones(onto.n_vertices, dtype=np.bool_) if onto.analysed is None else onto.analysed
+    population = np.stack([onto.vertices(k) for k in range(len(onto))])[:, part]
+    out = shapes.copy()
+    out[:, part] = completed_by(population, population.mean(axis=0), shapes[:, part], there[:, part], names, onto.gauge)
+    return out
 
 
 def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -31,21 +33,27 @@ from shapespace.correspondence.rounds import (
     first_template,
 )
 from shapespace.correspondence.scans import copies, unit_ratios
-from shapespace.errors import MeshError, ShapespaceError
-from shapespace.geometry.closest import build_engine
+from shapespace.errors import ShapespaceError
 from shapespace.geometry.distortion import Distortion
-from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.doctor import NON_FINITE, repair
+from shapespace.geometry.landmarks import far_landmarks, place_landmarks
+from shapespace.geometry.surface import face_areas, rms_size, without_estimates
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
-from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.json_files import read_json
+from shapespace.io.landmarks import write_surface_landmarks
+from shapespace.io.meshes import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.types import Mesh
+from shapespace.types import Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
 _KEPT = ".rounds"
+_BROKEN = "broken: "
+"""How the reason of a scan begins that cannot be used at all."""
+_UNREADABLE = "unreadable"
+_WITH_OTHER_FILES = (".gltf",)
+"""Endings of meshes whose vertices may lie in other files."""
 _LISTED = 10
 _ANOTHER_SHAPE = 0.25
 """The mean change of another object, as a share of its size."""
@@ -66,6 +74,7 @@ class CorrespondFiles:
         landmarks: a folder of files that are named as the scans, or None.
         where: scans are registered.
         recursive: take scans in folders below those given too.
+        strict: exclude scans with triangles that use vertices with non-finite coordinates.
     """
 
     scans: Sequence[str | Path]
@@ -74,6 +83,7 @@ class CorrespondFiles:
     landmarks: Path | None = None
     where: Where = field(default_factory=Where)
     recursive: bool = False
+    strict: bool = False
 
 
 def correspond_files(
@@ -115,7 +125,12 @@ def _corresponding(
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
-    read = _read_all(jobs, marks, quiet=quiet)
+    inputs_hash = _inputs_hash(jobs, marks, files, settings)
+    if (finished := _finished(jobs, folder, inputs_hash)) is not None:
+        say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
+        return finished
+    read = _read_all(jobs, marks, strict=files.strict, quiet=quiet)
+    _say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     marks.tell(say)
@@ -133,6 +148,7 @@ def _corresponding(
         _note_other_objects(made, notes)
     records = _records(made, read, jobs, folder)
     _tell(records, made, given, say)
+    _report_landmarks(records, read, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
@@ -146,10 +162,75 @@ def _corresponding(
         settings=asdict(settings),
         version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
+        inputs_hash=inputs_hash,
+        results_hash=_results_hash(jobs, folder),
     )
     write_text(folder / SUMMARY, json_text(summary))
     shutil.rmtree(folder / _KEPT, ignore_errors=True)
     return summary, records
+
+
+def _inputs_hash(
+    jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, settings: CorrespondSettings
+) -> str:
+    """Return the SHA-256 of all inputs of a run, without parsing the scans; where it runs makes no difference."""
+
+    def landmarks_hash(scan: Path, own: Path | None) -> str:
+        file = own or marks.of_scan(scan)
+        return "" if file is None else _hash_of(file)
+
+    scans: list[object] = []
+    for job in jobs:
+        try:
+            with job.readable() as file:
+                content = _hash_of(file)
+        except ShapespaceError:
+            content = _UNREADABLE
+        scans.append([job.name, content, landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
+    template = None if files.template is None else [_hash_of(files.template), landmarks_hash(files.template, None)]
+    model = None if files.model is None else _hash_of(files.model)
+    inputs = [scans, template, model, asdict(settings), files.strict, __version__]
+    content = json.dumps(inputs, sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _hash_of(file: Path) -> str:
+    """Return the SHA-256 of a file, and of the vertices of a mesh that names other files with its content."""
+    try:
+        own = sha256_of_file(file)
+        if ending_of(file) not in _WITH_OTHER_FILES:
+            return own
+        mesh = read_mesh(file)
+    except ShapespaceError:
+        return _UNREADABLE
+    parts = [own.encode(), mesh.vertices.tobytes(), b"" if mesh.faces is None else mesh.faces.tobytes()]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def _results_hash(jobs: Sequence[Job], folder: Path) -> str:
+    """Return the SHA-256 of the names and contents of all files of a run except its summary."""
+    names = [MEAN, LANDMARKS, *(f"{job.name}{ending}" for job in jobs for ending in (RECORD, SURFACE))]
+    digest = hashlib.sha256()
+    for name in names:
+        if (folder / name).is_file():
+            digest.update(f"{name} {sha256_of_file(folder / name)}\n".encode())
+    return digest.hexdigest()
+
+
+def _finished(
+    jobs: Sequence[Job], folder: Path, inputs_hash: str
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
+    """Return the summary and records of a finished run with the same inputs whose files are whole; else None."""
+    try:
+        summary = CorrespondenceRecord.from_json(read_json(folder / SUMMARY, CORRESPOND_AGAIN))
+        if summary.inputs_hash != inputs_hash or summary.results_hash != _results_hash(jobs, folder):
+            return None
+        files = [folder / f"{job.name}{RECORD}" for job in jobs]
+        return summary, [
+            read(CorrespondRecord, read_json(file, CORRESPOND_AGAIN), file.name, CORRESPOND_AGAIN) for file in files
+        ]
+    except ShapespaceError:
+        return None
 
 
 class _Rounds:
@@ -176,9 +257,19 @@ class _Read:
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     hashes: dict[str, str] = field(default_factory=dict[str, str])
     unread: dict[str, str] = field(default_factory=dict[str, str])
+    landmark_distances: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
-def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Read:
+def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
+    """Name the scans that are excluded, with the reason, before anything long begins."""
+    for name, reason in reasons.items():
+        say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
+    if reasons:
+        say(f"{len(reasons)} of {scans} {'scan is' if scans == 1 else 'scans are'} excluded before the first round.")
+
+
+def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet: bool) -> _Read:
+    """Read and repair every scan; those that cannot be used are in `unread`, with the reason."""
     read = _Read()
     with progress(len(jobs), "reading", "scan", quiet=quiet) as bar:
         for job in jobs:
@@ -186,23 +277,63 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Rea
                 with job.readable() as file:
                     mesh, content_hash = read_mesh(file), sha256_of_file(file)
                 mesh = marks.onto(mesh, job.scan, job.landmarks)
-            except ShapespaceError as error:
-                read.unread[job.name] = f"broken: {error}"
-            else:
-                own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
-                read.scans[job.name], read.notes[job.name] = _looked_at(own)
                 read.hashes[job.name] = content_hash
+                own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
+                read.scans[job.name], read.notes[job.name] = scan, notes = _looked_at(own, strict=strict)
+                if scan.landmarks:
+                    placed = place_landmarks(scan, scan.landmarks)
+                    read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
+                    notes += _far_notes(scan, placed)
+            except ShapespaceError as error:
+                read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
     return read
 
 
-def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
-    try:
-        mesh, findings = repair(scan)
-    except MeshError:
-        return scan, []  # it is set aside with that reason
-    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note"]
+def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
+    """Return the repaired scan, and what the user should know of it.
+
+    Raises:
+        MeshError: it cannot be used.
+    """
+    mesh, findings = repair(scan, strict=strict)
+    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
     return without_astray(mesh), [*notes, *_told_astray(mesh)]
+
+
+def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
+    """Return a sentence on landmarks of `scan` that are off its surface by more than their placing can explain."""
+    far = far_landmarks(scan, placed)
+    if not far:
+        return []
+    listed = sorted(far, key=lambda name: -far[name])[:_LISTED]
+    named = ", ".join(f"{name} ({far[name]:.2g})" for name in listed) + (", ..." if len(far) > _LISTED else "")
+    return [
+        "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
+        f"{named}."
+    ]
+
+
+def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:
+    """Say how far the given landmarks are from the scans, and from their places on the corresponding surfaces."""
+    shares = {
+        (name, scan): distance / rms_size(read.scans[scan].vertices)
+        for scan, distances in read.landmark_distances.items()
+        for name, distance in distances.items()
+    }
+    if not shares:
+        return
+    name, scan = max(shares, key=lambda key: shares[key])
+    sentence = (
+        f"The given landmarks of {len(read.landmark_distances)} scans are {100 * np.mean(list(shares.values())):.2g} % "
+        f"of the size from the surface of their scan on average, at most {100 * shares[name, scan]:.2g} % ({name} of "
+        f"{scan})"
+    )
+    off = [
+        one.landmark_rms / rms_size(read.scans[one.name].vertices) for one in records if one.landmark_rms is not None
+    ]
+    after = f"; from their places on the corresponding surfaces {100 * np.mean(off):.2g} % (RMS)" if off else ""
+    say(f"{sentence}{after}.")
 
 
 def _told_astray(scan: Mesh) -> list[str]:
@@ -275,8 +406,9 @@ def _records(
         record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
         record = structs.replace(record, metadata=dict(job.metadata))
         if one is not None and one.vertices is not None:
-            surface = Mesh(one.vertices, made.template.faces, name=name)
+            surface = without_estimates(Mesh(one.vertices, made.template.faces, name=name, observed=one.observed))
             record = _judged(record, surface, made.template, read.scans[name])
+        record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
@@ -339,14 +471,12 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         if record.reason or one is None or one.vertices is None:
             remove_file(surface)
         else:
-            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name))
+            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name, observed=one.observed))
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
-    if made.template.landmarks:
-        points = np.stack(list(made.template.landmarks.values()))
-        nearest = build_engine(made.template).query(points).vertex
-        write_landmark_indices(folder / LANDMARKS, dict(zip(made.template.landmarks, nearest.tolist(), strict=True)))
+    if made.landmarks:
+        write_surface_landmarks(folder / LANDMARKS, made.landmarks)
     else:
         remove_file(folder / LANDMARKS)
 

@@ -24,7 +24,9 @@ from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
 
 
-def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def check(
+    paths: Sequence[Path], *, recursive: bool, strict: bool = False, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
 
     A file that cannot be read, or takes more memory than there is, is reported with an error, and the next one read.
@@ -32,6 +34,7 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
     Args:
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
+        strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
         say: told what was not taken.
     """
     reports: list[dict[str, Any]] = []
@@ -40,7 +43,7 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
         say(sentence)
     for path in found.files:
         try:
-            report = examine(read_mesh(path))
+            report = examine(read_mesh(path), strict=strict)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue
@@ -175,6 +178,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({} if model.residuals is None else _residual_facts(model)),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
+        **_landmark_distances(model),
         **({"regions": {name: len(at) for name, at in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
@@ -182,6 +186,12 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "licence": model.licence,
         "hash": model.content_hash,
     }
+
+
+def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:
+    """Return how far the given landmarks were from the surface; nothing where none was off it."""
+    distances = model.landmarks.distance_mm.tolist()
+    return {"landmark_distances_mm": dict(zip(model.landmarks, distances, strict=True))} if any(distances) else {}
 
 
 def _residual_facts(model: ShapeModel) -> dict[str, Any]:

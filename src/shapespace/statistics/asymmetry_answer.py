@@ -20,7 +20,8 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
-from shapespace.types import FloatArray, Mesh
+from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
+from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
 _SHOWN = 2
@@ -44,7 +45,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         *pictures,
     ]
     fitted = cohort.fitted
-    return Answer(
+    answer = Answer(
         question="asymmetry",
         title="How symmetric?",
         summary=_summary(found, order),
@@ -64,6 +65,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
     )
+    return with_shape_data(answer, cohort)
 
 
 def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
@@ -226,12 +228,12 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
     half = found.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
         "vertices": found.mean,
-        "directional_mm": found.directional,
+        "directional_mm": blank_where(found.directional, found.blank),
         "directional_p": found.directional_p,
         "shown": found.directional_p <= _ALPHA,
-        "fluctuating_mm": found.fluctuating,
+        "fluctuating_mm": blank_where(found.fluctuating, found.blank),
         "subjects": np.array(found.subjects),
-        "maps_mm": found.maps.astype(np.float32),
+        "maps_mm": blank_where(found.maps, _unobserved(found)).astype(np.float32),
         "symmetric": found.symmetric.astype(np.float32),
         "asymmetric": (found.difference / 2.0).astype(np.float32),
         "vertex_of_cohort": found.sides.vertices,
@@ -245,11 +247,12 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if unshown else "shown",
             note="Mean over the subjects, along the normals." + (
-                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}."),
+                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}.") + _told_grey(found),
         ),
         SurfaceMapPart(
             title="Fluctuating asymmetry", arrays=_FILE, values="fluctuating_mm", signed=False,
-            note="Standard deviation over the subjects, about the directional asymmetry, with measurement error.",
+            note="Standard deviation over the subjects, about the directional asymmetry, with measurement error."
+            + _told_grey(found),
         ),
     ]  # fmt: skip
 
@@ -282,7 +285,8 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
         morph("What subjects differ by most", "pattern", found.mean, pattern, note, "two one way", "two the other")
     for rank, k in enumerate(shown, 1):
         name = found.subjects[k]
-        arrays[f"subject_{rank}_mm"] = found.maps[k]
+        hidden = _unobserved(found)
+        arrays[f"subject_{rank}_mm"] = blank_where(found.maps[k], None if hidden is None else hidden[k])
         parts.append(
             SurfaceMapPart(
                 title=f"{name}: the sides",
@@ -298,8 +302,16 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
     return arrays, parts
 
 
+def _unobserved(found: Asymmetry) -> BoolArray | None:
+    return None if found.observed is None else ~found.observed
+
+
+def _told_grey(found: Asymmetry) -> str:
+    return "" if found.blank is None else f" {told_blank(int(found.blank.sum()), len(found.blank))}"
+
+
 def _points(found: Asymmetry) -> TablePart:
-    of = {v: name for name, v in (found.cohort.landmarks or {}).items()}
+    of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
         TableColumn(name="point"), TableColumn(name="directional", kind="mm"), TableColumn(name="p", kind="p"),
         TableColumn(name="fluctuating", kind="mm"),

@@ -35,7 +35,8 @@ from shapespace.statistics.change_maps import (
 )
 from shapespace.statistics.change_repeat import Repeatability, Rescans
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.statistics.observed import weights_of
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 WHOLE = "whole"
 """What the whole surface is called beside its regions."""
@@ -90,12 +91,12 @@ def change(
         )
     groups = _groups(cohort, settings, visits, single)
     stable = stable_vertices(cohort, settings.stable)
-    landmarks = dict(cohort.landmarks or {})
+    landmarks = cohort.landmarks or SurfaceLandmarks()
     regions = _regions(cohort, settings)
     parts = np.zeros((len(regions), cohort.n_vertices))
     for row, vertices in zip(parts, regions.values(), strict=True):
         row[vertices] = 1.0
-    rescans = Rescans(cohort.reference, faces_in(cohort), list(landmarks.values()), parts)
+    rescans = Rescans(cohort.reference, faces_in(cohort), landmarks, parts)
     drafts: list[_Draft] = []
     source: Literal["rescans", "fits", "stable"] = (
         "rescans" if visits.rescans else "fits" if cohort.fitted is not None else "stable"
@@ -106,9 +107,7 @@ def change(
         found = aligned(cohort, own, stable)
         rescans.add(found)
         if len(own) > 1:
-            drafts.append(
-                _draft(cohort, name, found, list(landmarks.values()), parts, source, visits.unit, closed=closed)
-            )
+            drafts.append(_draft(cohort, name, found, landmarks, parts, source, visits.unit, closed=closed))
             before += found.means[0]
             moved += found.means[-1] - found.means[0]
         if on_step is not None:
@@ -142,6 +141,7 @@ class _Draft:
     stable: BoolArray
     area_mm2: FloatArray
     before_mm3: float
+    observed: BoolArray | None
 
     def subject(self, group: str, repeatability: Repeatability | None) -> SubjectChange:
         sums = list(self.sums)
@@ -159,7 +159,7 @@ class _Draft:
             ]
         rate = sums[1] if len(sums) > 1 else None
         return SubjectChange(
-            self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3
+            self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3, self.observed,
         )  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def _draft(
     cohort: Cohort,
     name: str,
     found: Aligned,
-    landmarks: list[int],
+    landmarks: SurfaceLandmarks,
     parts: FloatArray,
     source: Literal["rescans", "fits", "stable"],
     unit: str,
@@ -203,7 +203,7 @@ def _draft(
             known = known_by_fits(cohort, found, weights, landmarks, parts)
         else:
             known = Known(np.zeros(len(area)), np.zeros(len(landmarks)), np.zeros(len(parts)))
-        moved = np.tensordot(weights, found.means[:, landmarks], axes=1)
+        moved = landmarks.interpolate(np.tensordot(weights, found.means, axes=1))
         sums.append(
             Estimate(
                 weights @ along,
@@ -216,7 +216,7 @@ def _draft(
         )
     stable = found.weights > _COUNTED * area
     before_mm3 = volume_mm3(first, faces) if closed else float("nan")
-    return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3)
+    return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3, found.observed)
 
 
 def _regions(cohort: Cohort, settings: ChangeSettings) -> dict[str, IntArray]:
@@ -260,6 +260,15 @@ def _groups(cohort: Cohort, settings: ChangeSettings, visits: Visits, single: Se
     return found
 
 
+def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
+    """Return (V,) where maps of the group are blank: too few subjects observe the vertex, over all or in a group."""
+    every = np.ones(len(subjects[0].area_mm2), dtype=np.bool_)
+    observed = np.stack([every if one.observed is None else one.observed for one in subjects])
+    groups = np.array([one.group for one in subjects])
+    shares = [observed[groups == group].mean(axis=0) for group in dict.fromkeys(groups.tolist())]
+    return weights_of(np.min(shares, axis=0)) == 0
+
+
 def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     """Return the same with its tests over subjects."""
     settings, subjects = answer.settings, answer.subjects
@@ -269,18 +278,23 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
         return answer
     asked = [effect_of(subject, rate=settings.rate) for subject in subjects]
     maps = np.stack([one.along_mm for one in asked])
+    blank, landmarks = _blank(subjects), answer.landmarks
+    at_landmarks = landmarks.interpolate(maps.T)
+    at_landmarks[blank[landmarks.corners].any(axis=1)] = 0.0
+    # Without variation a vertex is found nowhere, and takes no part in the maxima.
+    maps[:, blank] = 0.0
     volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
-    vertices = list(answer.landmarks.values())
     run = (settings.permutations, settings.seed)
-    whole, few = np.ones(len(answer.parts)), np.ones(len(vertices))
+    whole, few = np.ones(len(answer.parts)), np.ones(len(landmarks))
     names: tuple[str, ...] = tuple(sorted(set(groups.values())))
     second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
     return replace(
         answer,
+        blank=blank if blank.any() else None,
         group=mean_test(maps, area, *run),
         group_volumes=mean_test(volumes, whole, *run),
-        group_landmarks=mean_test(maps[:, vertices], few, *run) if vertices else None,
+        group_landmarks=mean_test(at_landmarks.T, few, *run) if landmarks else None,
         between=None if second is None else difference_test(maps, second, area, *run),
         between_volumes=None if second is None else difference_test(volumes, second, whole, *run),
         groups=names,

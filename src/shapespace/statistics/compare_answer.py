@@ -24,6 +24,7 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.compare import Comparison, Effect
+from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHOWN_SHARE = 0.05
@@ -44,7 +45,7 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
     ]
     fitted = comparison.cohort.fitted
-    return Answer(
+    answer = Answer(
         question="compare",
         title=f"Shape {comparison.design.formula.strip()}",
         summary=tuple(_summary(comparison)),
@@ -52,11 +53,12 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         tables=_tables(comparison),
         arrays={f"effect_{at}.npz": _arrays(comparison, effect) for at, effect in enumerate(effects, 1)},
         meshes=dict(_meshes(comparison)),
-        notes=comparison.cohort.notes,
+        notes=(*comparison.cohort.notes, *comparison.notes),
         settings={
             "formula": comparison.design.formula,
             "squares": comparison.options.squares,
             "blocks": comparison.options.blocks,
+            "random": comparison.options.random,
             "permutations": comparison.options.permutations,
             "seed": comparison.options.seed,
             "bump_width_mm": comparison.options.bump_width_mm,
@@ -67,13 +69,14 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
     )
+    return with_shape_data(answer, comparison.cohort)
 
 
 def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
     for test in comparison.tests:
         told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
-        where = f" {test.stratum}" if test.stratum else ""
+        where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
         else:
@@ -92,6 +95,8 @@ def _summary(comparison: Comparison) -> Iterator[str]:
             )
         else:
             yield f"{effect.label}: no vertex is found to differ {held}."
+        if effect.map.blank is not None:
+            yield f"{effect.label}: {told_blank(int(effect.map.blank.sum()), len(effect.map.blank))}"
         if effect.map.bump is not None and effect.map.bump_mm is not None:
             at = int(effect.map.bump.f.argmax())
             if effect.map.bump.p_family[at] <= level:
@@ -112,9 +117,9 @@ def _near(cohort: Cohort, vertex: int) -> str:
     """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
     if not cohort.landmarks:
         return ""
-    names, places = list(cohort.landmarks), np.array(list(cohort.landmarks.values()))
-    far = np.linalg.norm(cohort.reference[places] - cohort.reference[vertex], axis=1)
-    return f" near {names[int(far.argmin())]}"
+    places = cohort.landmarks.interpolate(cohort.reference)
+    far = np.linalg.norm(places - cohort.reference[vertex], axis=1)
+    return f" near {cohort.landmarks.names[int(far.argmin())]}"
 
 
 def _column(name: str, kind: Any = "text") -> TableColumn:
@@ -192,6 +197,8 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     )
     if effect.map is not None:
         kept = _arrays(comparison, effect)
+        blank = effect.map.blank
+        note = _PALE if blank is None else f"{_PALE} {told_blank(int(blank.sum()), len(blank))}"
         for title, values, mask in (
             (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
             (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
@@ -200,7 +207,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
         ):
             if values in kept:
                 yield SurfaceMapPart(
-                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=_PALE
+                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=note
                 )
     if comparison.cohort.faces is not None:
         times = _times(comparison, effect)
@@ -265,13 +272,15 @@ def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[
     made = effect.map
     if made is None:
         return out
-    out |= {"change_mm": made.change_mm, "length_mm": made.length_mm}
+    out |= {"change_mm": made.change_mm, "length_mm": blank_where(made.length_mm, made.blank)}
+    if made.weight is not None:
+        out["information"] = made.weight
     named = {"length": made.any_way}
     if made.along is not None and made.normal_mm is not None:
-        out["normal_mm"] = made.normal_mm
+        out["normal_mm"] = blank_where(made.normal_mm, made.blank)
         named["normal"] = made.along
     if made.bump is not None and made.bump_mm is not None:
-        out["bump_mm"] = made.bump_mm
+        out["bump_mm"] = blank_where(made.bump_mm, made.blank)
         named["bump"] = made.bump
     for name, test in named.items():
         out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}

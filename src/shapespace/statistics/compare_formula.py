@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ast
 import itertools
+import math
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,13 @@ FUNCTIONS: Mapping[str, str] = {
 
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
 _MOST_CELLS = 100_000
+_MOST_COLUMNS = 5000
+"""Before repeated or implied ones are left out; more take seconds to expand, and as many shapes to estimate."""
+_DEEPEST = 30
+"""Brackets in brackets."""
+_SPLINE = 4
+"""Columns of a polynomial or spline of which no number is given; 3 for cubic ones."""
+_TOKEN = re.compile(r"\s*(`[^`]*`|[\w.]+|\*\*|[-+*:/^()])")
 _PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
 _POWER = re.compile(r"\*\*|\^")
 _ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
@@ -93,6 +101,7 @@ class Design:
         terms: of it, those of fewer variables first.
         variables: that it names.
         values: N of each variable, by its name inside.
+        factors: the variable, by its name inside, of each factor of the terms, in the order of the formula.
     """
 
     formula: str
@@ -100,30 +109,73 @@ class Design:
     terms: tuple[Term, ...]
     variables: tuple[Variable, ...]
     values: Mapping[str, Sequence[str | float]]
+    factors: Mapping[str, str]
+    _codes: Mapping[str, str] = field(repr=False)
     _spec: Any = field(repr=False)
+    _skipped: int = field(default=1, repr=False)
+    _parts: dict[tuple[frozenset[str], ...], Design] = field(
+        default_factory=lambda: dict[tuple[frozenset[str], ...], "Design"](), repr=False
+    )
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
         """Return the (n, p) columns where each variable, by its name inside, has these n values."""
+        made = self._spec.get_model_matrix(self._frame(values), context=_CONTEXT)
+        return np.asarray(made, dtype=np.float64)[:, self._skipped :]
+
+    def part(self, products: Sequence[frozenset[str]]) -> Design:
+        """Return the columns of other products of the same factors, for the same rows.
+
+        Args:
+            products: factors of each, as in `Term.factors`; the empty product is the constant and comes first.
+        """
+        key = tuple(products)
+        if key in self._parts:
+            return self._parts[key]
+        formulaic = other_package("formulaic", "A formula", INSTALL)
+        ordered = [[factor for factor in self.factors if factor in product] for product in products]
+        written = [":".join(self._codes[factor] for factor in product) or "1" for product in ordered]
+        with np.errstate(all="ignore"):
+            made = formulaic.Formula(written, _ordering="none").get_model_matrix(
+                self._frame(self.values), context=_CONTEXT, na_action="ignore"
+            )
+        spec = made.model_spec
+        slices = [tuple(int(at) for at in indices) for indices in spec.term_indices.values()]
+        terms = tuple(
+            Term(":".join(product) or "1", frozenset(product), frozenset(self.factors[one] for one in product), own)
+            for product, own in zip(ordered, slices, strict=True)
+        )
+        matrix = read_only(np.asarray(made, dtype=np.float64))
+        made = replace(self, matrix=matrix, terms=terms, _spec=spec, _skipped=0, _parts={})
+        self._parts[key] = made
+        return made
+
+    def _frame(self, values: Mapping[str, Sequence[str | float]]) -> Any:
         pandas = other_package("pandas", "A formula", INSTALL)
         frame: dict[str, Any] = {}
         for one in self.variables:
             own = list(values[one.column])
             frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
-        made = self._spec.get_model_matrix(pandas.DataFrame(frame), context=_CONTEXT)
-        return np.asarray(made, dtype=np.float64)[:, 1:]
+        return pandas.DataFrame(frame)
 
-    def with_held(self, held: Collection[str]) -> FloatArray:
-        """Return `matrix` as it were if some variables, by their names inside, were the same in all rows.
+    def average(self, fixed: Mapping[str, str | float]) -> FloatArray:
+        """Return the (p,) columns, averaged over the classes of variables in the terms, with numbers at their mean.
 
-        Numbers are held at their mean, of classes it is the average.
+        Args:
+            fixed: values of variables that are not averaged, by their names inside.
         """
-        own = [one for one in self.variables if one.column in held]
-        cells = _cells([one.levels or (one.middle,) for one in own], self.formula)
-        total = np.zeros(self.matrix.shape)
-        for cell in cells:
-            same = {one.column: [value] * len(total) for one, value in zip(own, cell, strict=True)}
-            total += self.rows({**self.values, **same})
-        return total / len(cells)
+        used = {name for term in self.terms for name in term.variables}
+        choices: list[Sequence[str | float]] = []
+        for one in self.variables:
+            if one.column in fixed:
+                choices.append((fixed[one.column],))
+            elif one.levels:
+                choices.append(one.levels if one.column in used else one.levels[:1])
+            else:
+                choices.append((one.middle,))
+        cells = _cells(choices, self.formula)
+        return read_only(
+            self.rows({one.column: [cell[at] for cell in cells] for at, one in enumerate(self.variables)}).mean(axis=0)
+        )
 
     def contrast(
         self, column: str, low: str | float, high: str | float, fixed: Mapping[str, str | float] | None = None
@@ -173,6 +225,31 @@ def columns_of(formula: str, table: Table) -> tuple[str, ...]:
     return tuple(dict.fromkeys(factor.name for term in _parsed(formula, table) for factor in term))
 
 
+def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], ...], str]:
+    """Return the effects that vary by subject, as products of factors, and the column that names the subject.
+
+    Args:
+        random: such as `1 + time | subject`; the 1, the mean of each subject, is always one of them.
+        table: whose columns it names.
+
+    Raises:
+        InputError: it cannot be read, leaves out the 1, or names something that is no column.
+        ShapespaceError: the extra `statistics` is not installed.
+    """
+    effects, bar, column = (part.strip() for part in random.partition("|"))
+    column = column.strip("`")
+    if not bar or not effects or not column:
+        raise InputError(f"The random terms {random[:80]!r} cannot be read; write them as '1 + time | subject'.")
+    if column not in table.columns:
+        raise InputError(
+            f"The random terms {random[:80]!r} name {column[:60]!r}, which is no column; there is "
+            f"{', '.join(table.columns)}."
+        )
+    if effects == "1":
+        return (), column
+    return tuple(frozenset(factor.text for factor in term) for term in _parsed(effects, table)), column
+
+
 def design_of(formula: str, table: Table) -> Design:
     """Return the columns of a linear model of the rows of a table, in which nothing that is named is missing.
 
@@ -197,12 +274,14 @@ def design_of(formula: str, table: Table) -> Design:
                 pandas.Categorical(values, categories=variable.levels) if classes else np.asarray(values)
             )
     written, labels = ["1"], list[str]()
+    variable_of, codes = dict[str, str](), dict[str, str]()
     factors, members = list[frozenset[str]](), list[frozenset[str]]()
     for term in parsed:
         own = [inside[factor.name, factor.holds_classes(table)] for factor in term]
-        written.append(
-            ":".join(f.written(one.column, classes=bool(one.levels)) for f, one in zip(term, own, strict=True))
-        )
+        for factor, one in zip(term, own, strict=True):
+            variable_of[factor.text] = one.column
+            codes[factor.text] = factor.written(one.column, classes=bool(one.levels))
+        written.append(":".join(codes[factor.text] for factor in term))
         labels.append(":".join(factor.text for factor in term))
         factors.append(frozenset(factor.text for factor in term))
         members.append(frozenset(one.column for one in own))
@@ -221,7 +300,9 @@ def design_of(formula: str, table: Table) -> Design:
     for term in terms:
         if not np.isfinite(matrix[:, [at + 1 for at in term.columns]]).all():
             raise InputError(f"{table.where}: {term.label} is not finite in all rows, as a logarithm of 0 would be.")
-    return Design(formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, spec)
+    return Design(
+        formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, variable_of, codes, spec
+    )
 
 
 @dataclass(frozen=True)
@@ -281,6 +362,12 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
         raise InputError(f"{where} is too long; write a shorter one.")
     if not _PLAIN.fullmatch(right) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", right):
         raise InputError(f"{where} holds something other than columns, + - * : / ^ and the functions of a formula.")
+    columns = _Bound(right, table, where).columns()
+    if columns > _MOST_COLUMNS:
+        raise InputError(
+            f"{where} makes up to {columns if columns < 10**9 else 'billions of'} columns, and {_MOST_COLUMNS} are "
+            "the limit; leave out interactions or classes."
+        )
     try:
         terms = list(formulaic.Formula("~ " + right, _ordering="degree"))
         keeps_mean = any(str(term) == "1" for term in terms)
@@ -295,6 +382,126 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
     if not drawn:
         raise InputError(f"{where} names no column; write one such as '~ sex + age'.")
     return drawn
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Upper bounds of the columns of a part of a formula, and of the product of all its factors."""
+
+    columns: int
+    product: int
+
+
+class _Bound:
+    """Bounds the number of columns of a formula without expanding it: its operators are those of R, by precedence."""
+
+    def __init__(self, text: str, table: Table, where: str) -> None:
+        self.table, self.where = table, where
+        self.tokens: list[str] = []
+        at = 0
+        while text[at:].strip():
+            found = _TOKEN.match(text, at)
+            # Only arguments of functions have other characters, and these are read by name and numbers alone.
+            self.tokens.append(found.group(1) if found else text[at])
+            at = found.end() if found else at + 1
+        self.at = self.depth = 0
+
+    def columns(self) -> int:
+        """Return an upper bound of the columns.
+
+        Raises:
+            InputError: brackets or operators do not match.
+        """
+        if not self.tokens:
+            return 0
+        size = self._sum()
+        if self.at < len(self.tokens):
+            raise self._unreadable()
+        return size.columns
+
+    def _unreadable(self) -> InputError:
+        near = self.tokens[min(self.at, len(self.tokens) - 1)]
+        return InputError(f"{self.where} cannot be read near {near[:20]!r}; write one such as '~ sex + age'.")
+
+    def _next(self, *wanted: str) -> str:
+        """Return the next token and pass it if it is one of those wanted, else nothing."""
+        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        if token not in wanted:
+            return ""
+        self.at += 1
+        return token
+
+    def _sum(self) -> _Size:
+        self._next("+", "-")
+        size = self._product()
+        while self._next("+", "-"):
+            other = self._product()
+            size = _Size(size.columns + other.columns, size.product * other.product)
+        return size
+
+    def _product(self) -> _Size:
+        size = self._interaction()
+        while operator := self._next("*", "/"):
+            other = self._interaction()
+            # a / b is a + a:b, with all factors of a in the product.
+            own = size.columns if operator == "*" else size.product
+            columns = size.columns + own * other.columns + (other.columns if operator == "*" else 0)
+            size = _Size(columns, size.product * other.product)
+        return size
+
+    def _interaction(self) -> _Size:
+        size = self._power()
+        while self._next(":"):
+            other = self._power()
+            size = _Size(size.columns * other.columns, size.product * other.product)
+        return size
+
+    def _power(self) -> _Size:
+        size = self._atom()
+        while self._next("**", "^"):
+            exponent = self._next("2", "3")
+            if not exponent:
+                raise self._unreadable()
+            # Products of different terms, in whatever order.
+            each = range(1, int(exponent) + 1)
+            size = _Size(sum(size.columns**k // math.factorial(k) + 1 for k in each), size.product)
+        return size
+
+    def _atom(self) -> _Size:
+        if self._next("("):
+            self.depth += 1
+            if self.depth > _DEEPEST:
+                raise self._unreadable()
+            size = self._sum()
+            self.depth -= 1
+            if not self._next(")"):
+                raise self._unreadable()
+            return size
+        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        if not re.match(r"[\w.`]", token):
+            raise self._unreadable()
+        self.at += 1
+        if not self._next("("):
+            return self._size_of(token.strip("`"))
+        inside, depth = list[str](), 1
+        while depth and self.at < len(self.tokens):
+            inside.append(self.tokens[self.at])
+            depth += {"(": 1, ")": -1}.get(inside[-1], 0)
+            self.at += 1
+        if depth:
+            raise self._unreadable()
+        if token in ("poly", "bs"):
+            columns = max([_SPLINE, *(int(one) for one in inside if one.isdecimal() and len(one) < 3)])
+            return _Size(columns, columns)
+        return max(
+            (self._size_of(one.strip("`"), classes=token == "C") for one in inside), key=lambda size: size.columns
+        )
+
+    def _size_of(self, name: str, *, classes: bool = False) -> _Size:
+        if name not in self.table.columns or not (classes or self.table.kind(name) == "text"):
+            return _Size(1, 1)
+        levels = len(set(self.table.texts(name)))
+        return _Size(levels, levels)
 
 
 def _factor(factor: Any, table: Table, where: str) -> _Factor:
