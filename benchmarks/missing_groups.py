@@ -42,9 +42,6 @@ class Design:
 DESIGNS = (
     Design(12, 12, 0.0, 0.0),
     Design(12, 12, 0.1, 0.8),
-    Design(12, 12, 0.0, 1.0),
-    Design(12, 12, 0.1, 0.8, 0.4),
-    Design(8, 24, 0.1, 0.8),
     Design(8, 24, 0.0, 1.0),
 )
 
