@@ -10,6 +10,8 @@ import pytest
 from conftest import Run
 from raw_blobs import LANDMARKS, marked, raw_blob
 from shapespace.cli import main
+from shapespace.commands import correspond
+from shapespace.errors import InputError
 from shapespace.io.landmarks import read_surface_landmarks, write_landmarks
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -176,3 +178,28 @@ def test_a_model_of_another_object_is_told(run: Run, raw: Path, tmp_path: Path) 
     scans = [raw / f"blob{k}.ply" for k in range(2)]
     outcome = run("correspond", *scans, "-o", tmp_path / "same", "--model", tmp_path / "model.h5", *QUICK)
     assert "set aside" in outcome.err or "hardly an object of their kind" in outcome.err
+
+
+def test_scans_that_cannot_be_used_are_named_before_the_first_round(
+    run: Run, raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = read_mesh(raw / "blob1.ply")
+    assert scan.faces is not None
+    vertices = scan.vertices.copy()
+    vertices[scan.faces[0, 0], 2] = np.inf
+    write_mesh(tmp_path / "hole.ply", Mesh(vertices, scan.faces))
+    write_mesh(tmp_path / "flat.ply", Mesh(scan.vertices * (1, 1, 0), scan.faces))
+
+    def stop(*_: object) -> None:
+        raise InputError("The template is chosen here.")
+
+    monkeypatch.setattr(correspond, "first_template", stop)
+    for strict, excluded in (((), ["flat", "torn"]), (("--strict",), ["flat", "hole", "torn"])):
+        scans = (raw, tmp_path / "hole.ply", tmp_path / "flat.ply")
+        outcome = run("correspond", *scans, "-o", tmp_path / "o", *QUICK, *strict)
+        lines = outcome.err.splitlines()
+        named = [line.split()[1] for line in lines if " is excluded: " in line]
+        assert sorted(named) == excluded and f"{len(excluded)} of {SCANS + 3} scans are excluded" in outcome.err
+        assert lines[-1].endswith("The template is chosen here.") and outcome.code == 2
+    _, notes = correspond._looked_at(Mesh(vertices, scan.faces, name="hole"), strict=False)
+    assert any("1 vertex with coordinates that are NaN or infinite, used by" in note for note in notes)

@@ -129,15 +129,15 @@ def _corresponding(
     if (finished := _finished(jobs, folder, inputs_hash)) is not None:
         say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
         return finished
+    template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
+    model = None if files.model is None else ShapeModel.load(files.model)
     read = _read_all(jobs, marks, strict=files.strict, quiet=quiet)
     _say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
-    template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     marks.tell(say)
     if template is not None:
         for sentence in _told_astray(template):
             say(f"{template.name}: {sentence}")
-    model = None if files.model is None else ShapeModel.load(files.model)
     rounds = _Rounds(folder / _KEPT, files.where, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings, model)

@@ -31,7 +31,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
-"""Scans of so many bytes together are read whole before the first fit (256 MiB: about 5 s of binary PLY)."""
+"""Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
 _LISTED = 10
 _SURFACES = (".fitted.ply", ".dense.ply")
 

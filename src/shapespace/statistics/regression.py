@@ -475,9 +475,9 @@ def _percentiles(
     own = sorted(weights)
     weight = np.array([weights[key] for key in own])
     place = np.cumsum(weight) - 0.5 * (weight + 1.0)
-    at = np.array(percent) / 100.0 * (weight.sum() - 1.0)
+    last = float(weight.sum()) - 1.0
     values = np.array([value for value, _ in own])
-    low, high = (float(np.interp(one, place, values)) for one in at)
+    low, high = (float(np.interp(one / 100.0 * last, place, values)) for one in percent)
     return low, high
 
 
