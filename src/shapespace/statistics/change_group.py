@@ -1,4 +1,4 @@
-"""Tests of maps over subjects: by sign flips against none, by permutation between two groups; maxima over vertices.
+"""Tests of maps over subjects: the mean by sign flips, two groups by permutation, or by sign flips if variances differ.
 
 Nichols and Holmes, Human Brain Mapping 15, 2002; Winkler et al., NeuroImage 92, 2014.
 """
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapespace.statistics.dispersion import welch_flips
 from shapespace.types import BoolArray, FloatArray
 
 _BLOCK = 64
@@ -32,6 +33,7 @@ class MapTest:
         permutations: that were made, the data's own among them.
         every: whether these are all there are.
         n: subjects, or subjects of each group.
+        unequal_variances: whether t is Welch's, compared with sign flips, which allows groups of unequal variance.
     """
 
     effect: FloatArray
@@ -41,6 +43,7 @@ class MapTest:
     permutations: int
     every: bool
     n: tuple[int, ...]
+    unequal_variances: bool = False
 
 
 def mean_test(
@@ -87,11 +90,23 @@ def difference_test(
     permutations: int,
     seed: int,
     on_step: Callable[[int, int], None] | None = None,
+    *,
+    unequal_variances: bool = False,
 ) -> MapTest:
     """Return whether the mean of `maps` (N, V) differs between subjects that are `second` (N,) and those that are not.
 
-    Subjects change places between the groups, and arguments are those of `mean_test`; each group has two or more.
+    Subjects are permuted between the groups, which assumes equal variances of the groups; with `unequal_variances`
+    Welch's t is compared with sign flips of residuals instead. Other arguments are those of `mean_test`; each group has
+    two subjects or more.
     """
+    if unequal_variances:
+        t, arrangements, every = welch_flips(maps, second, area, permutations, seed)
+        largest, whole = arrangements
+        p = (len(largest) - np.searchsorted(np.sort(largest), np.abs(t) * (1 - _TIE))) / len(largest)
+        omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
+        counts = (int((~second).sum()), int(second.sum()))
+        effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
+        return MapTest(effect, t, p, omnibus, len(largest), every, counts, unequal_variances=True)
     n, of_second = len(maps), int(second.sum())
     of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
