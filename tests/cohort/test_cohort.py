@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shapespace.batch.results import coefficient_row, read_record, write_coefficients
-from shapespace.cohort.cohort import Cohort, Fitted, with_columns
+from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource, with_columns
 from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
@@ -397,3 +397,16 @@ def test_a_table_with_one_mesh_is_too_few(meshes: Callable[..., Path], tmp_path:
         read_cohort(tmp_path / "one.csv", CohortOptions(shapes=tmp_path / "meshes"))
     with pytest.raises(InputError, match="give a CSV table of its meshes"):
         read_cohort(tmp_path / "meshes")
+
+
+# Sources of shapes
+
+
+@pytest.mark.parametrize("modes", [MODES, 2])
+def test_coefficients_state_their_modes_and_share_of_the_variance(modes: int) -> None:
+    given = model()
+    cohort = Cohort.of_fits(fitted_of(given, modes=modes), *blank(COUNT), np.full(COUNT, np.nan))
+    share = float((given.stddev[:modes] ** 2).sum() / given.total_variance)
+    assert cohort.source == ShapeSource("coefficients", modes, share)
+    assert str(cohort.source) == f"coefficients, {modes} modes, {100 * share:.0f} % of the variance"
+    assert cohort.take([0, 1]).source == cohort.source

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +25,33 @@ from shapespace.types import FloatArray, IntArray, Mesh, read_only
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
 
+ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces"]
+"""Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, or any other surfaces."""
+
+_TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
+
+
+@dataclass(frozen=True)
+class ShapeSource:
+    """Source of the shapes of a cohort, and the share of shape variance that it can represent.
+
+    Args:
+        kind: coefficients, fitted or dense surfaces of fits, corresponding surfaces, or other surfaces.
+        modes: number of model modes that the shapes are combinations of; None if the shapes are not limited to modes.
+        explained_variance_ratio: share of the model's training variance in these modes, 0 to 1; None as for `modes`.
+    """
+
+    kind: ShapeKind = "surfaces"
+    modes: int | None = None
+    explained_variance_ratio: float | None = None
+
+    def __str__(self) -> str:
+        if self.modes is None or self.explained_variance_ratio is None:
+            return f"{self.kind} surfaces" if self.kind != "surfaces" else "surfaces"
+        return f"{self.kind}, {self.modes} modes, {100 * self.explained_variance_ratio:.0f} % of the variance"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +80,19 @@ class Fitted:
     def z(self) -> FloatArray:
         """(N, K) coefficients in standard deviations of the model."""
         return read_only(self.model.to_z(self.b))
+
+    def source(self, kind: ShapeKind) -> ShapeSource:
+        """Return the source of shapes of one kind of these fits.
+
+        Args:
+            kind: `coefficients` and `fitted` surfaces are limited to the modes of the fits; `dense` surfaces are not.
+        """
+        if kind not in _TRUNCATED:
+            return ShapeSource(kind)
+        modes = self.b.shape[1]
+        total = max(self.model.total_variance, float((self.model.stddev**2).sum()))
+        ratio = float((self.model.stddev[:modes] ** 2).sum()) / total if total > 0 else 1.0
+        return ShapeSource(kind, modes, ratio)
 
     def take(self, rows: Sequence[int]) -> Fitted:
         """Return those of some rows."""
@@ -85,6 +123,7 @@ class Cohort:
         landmarks: name -> vertex.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
+        source: where the shapes come from.
     """
 
     names: tuple[str, ...]
@@ -98,6 +137,7 @@ class Cohort:
     landmarks: Mapping[str, int] | None = None
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
+    source: ShapeSource = ShapeSource()
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -301,7 +341,7 @@ class Cohort:
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
-            dict(model.landmarks), fitted,
+            dict(model.landmarks), fitted, source=fitted.source("coefficients"),
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource
 from shapespace.cohort.table import Table, named, read_table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge
@@ -210,6 +210,7 @@ def _of_results(
             fitted=fitted,
             landmarks=dict(model.landmarks),
             sizes_mm=sizes,
+            source=fitted.source(options.surfaces),
         )
     return replace(cohort, notes=(*notes, *cohort.notes))
 
@@ -240,7 +241,9 @@ def _of_surfaces(
         if on_shape is not None:
             on_shape(done, len(kept))
     cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto, options.least)
-    return replace(cohort, notes=(*notes, *cohort.notes))
+    corresponding = all(file.name.endswith(SURFACE) for file, _ in kept)
+    source = ShapeSource("corresponding" if corresponding else "surfaces")
+    return replace(cohort, notes=(*notes, *cohort.notes), source=source)
 
 
 def _tell_unmatched(
