@@ -25,10 +25,14 @@ from shapespace.types import FloatArray, IntArray, Mesh, read_only
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
 
+LengthUnit: TypeAlias = Literal["mm", ""]
+"""Unit of the lengths of a cohort; empty for coordinates without a unit."""
 ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces"]
 """Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, or any other surfaces."""
 
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
+_UNIT_SIZE = 1e-2
+"""Tolerance of unit centroid sizes, by which aligned coordinates are known; tangent projection changes them by less."""
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
@@ -124,6 +128,7 @@ class Cohort:
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
         source: where the shapes come from.
+        unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
     """
 
     names: tuple[str, ...]
@@ -138,6 +143,7 @@ class Cohort:
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
     source: ShapeSource = ShapeSource()
+    unit: LengthUnit = "mm"
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -223,6 +229,7 @@ class Cohort:
         landmarks: Mapping[str, int] | None = None,
         onto: Cohort | None = None,
         least: int = 2,
+        unit: LengthUnit | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -236,6 +243,8 @@ class Cohort:
             landmarks: name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
             least: how many shapes there must be, where `onto` is None.
+            unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
+                after a Procrustes superimposition, which divides the unit out.
 
         Raises:
             InputError: too few shapes, values that are not finite, columns of another length, two shapes that are the
@@ -259,8 +268,9 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks
-        )
+            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks,
+            unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
+        )  # fmt: skip
         refuse_twice(cohort)
         return cohort
 

@@ -15,7 +15,7 @@ from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import write_rows
-from shapespace.schemas import Analysis, Part, Target, json_text
+from shapespace.schemas import Analysis, Methods, Part, Target, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
@@ -39,6 +39,7 @@ class Answer:
         notes: who was left out and why, a sentence each.
         settings: all that the result depends on, seeds among it.
         model_hashes: of the models of the fits.
+        methods: sample sizes, tests and assumptions, which the last parts state in words; None of predictions alone.
     """
 
     question: str
@@ -54,6 +55,7 @@ class Answer:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     model_hashes: tuple[str, ...] = ()
+    methods: Methods | None = None
 
     def analysis(self) -> Analysis:
         """Return what analysis.json says."""
@@ -69,6 +71,7 @@ class Answer:
             settings=self.settings,
             versions={"shapespace": __version__, "numpy": np.__version__},
             model_hashes=self.model_hashes,
+            methods=self.methods,
         )
 
     def save(self, folder: Path | str) -> Path:

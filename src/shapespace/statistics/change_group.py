@@ -19,6 +19,8 @@ _BLOCK = 64
 _TIE = 1e-10
 """Share by which a statistic that is the same in other words may differ by rounding."""
 _FLOOR = 1e-12
+LEVEL = 0.05
+"""Family-wise error of maps, and one minus the confidence of their intervals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,8 @@ class MapTest:
         permutations: that were made, the data's own among them.
         every: whether these are all there are.
         n: subjects, or subjects of each group.
+        critical_t: of |t|, above which `p` is at most `LEVEL`; effect ± |effect / t| critical_t are simultaneous
+            intervals.
         unequal_variances: whether t is Welch's, compared with sign flips, which allows groups of unequal variance.
     """
 
@@ -43,7 +47,13 @@ class MapTest:
     permutations: int
     every: bool
     n: tuple[int, ...]
+    critical_t: float
     unequal_variances: bool = False
+
+    def interval(self, vertex: int) -> tuple[float, float]:
+        """Return the interval of the effect at a vertex, simultaneous over all vertices at the level 1 - `LEVEL`."""
+        half = abs(float(self.effect[vertex] / self.t[vertex])) * self.critical_t if self.t[vertex] else 0.0
+        return float(self.effect[vertex]) - half, float(self.effect[vertex]) + half
 
 
 def mean_test(
@@ -79,8 +89,8 @@ def mean_test(
         yield np.ones(n)
         yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
 
-    t, p, omnibus_p = _permuted(maps, area, draws(), count, t_of, on_step)
-    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,))
+    t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, on_step)
+    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,), critical)
 
 
 def difference_test(
@@ -106,7 +116,7 @@ def difference_test(
         omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
         counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
-        return MapTest(effect, t, p, omnibus, len(largest), every, counts, unequal_variances=True)
+        return MapTest(effect, t, p, omnibus, len(largest), every, counts, _critical(largest), unequal_variances=True)
     n, of_second = len(maps), int(second.sum())
     of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
@@ -133,8 +143,8 @@ def difference_test(
         rng = np.random.default_rng(seed)
         yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
 
-    t, p, omnibus_p = _permuted(centred, area, draws(), count, t_of, on_step)
-    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second))
+    t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, on_step)
+    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second), critical)
 
 
 def _permuted(
@@ -144,8 +154,8 @@ def _permuted(
     count: int,
     t_of: Callable[[FloatArray], FloatArray],
     on_step: Callable[[int, int], None] | None,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return t of the first of `draws`, its p (V,) against the maxima of all, and the p of the omnibus test."""
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return t of the first of `draws`, its p (V,) against the maxima of all, the omnibus p and the critical |t|."""
     gram = (maps * area) @ maps.T
     observed, own = np.zeros(maps.shape[1]), 0.0
     maxima: list[float] = []
@@ -162,7 +172,12 @@ def _permuted(
             on_step(len(maxima), count)
     ordered = np.sort(maxima)
     below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))
-    return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima)
+    return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima), _critical(ordered)
+
+
+def _critical(maxima: FloatArray) -> float:
+    """Return the value that the largest statistics (P,) of a share of `LEVEL` of the arrangements exceed."""
+    return float(np.sort(maxima)[-(int(LEVEL * len(maxima) * (1 + _TIE)) + 1)])
 
 
 def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
