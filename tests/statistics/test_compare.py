@@ -15,7 +15,8 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import PARTS, Analysis, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
-from shapespace.statistics.compare_formula import FUNCTIONS
+from shapespace.statistics.compare_formula import FUNCTIONS, design_of
+from shapespace.statistics.compare_within import strata_of
 from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
@@ -224,37 +225,39 @@ def test_a_difference_of_scans_is_tested_within_subjects() -> None:
     found = compare(
         cohort(table, noise, stddev=0.0), "~ sex * smile", CompareOptions(blocks="subject", permutations=20)
     )
-    flat = noise.reshape(36, -1)
-    subject, smile = np.eye(9)[np.repeat(np.arange(9), 4)][:, 1:], coded(table["smile"])
-    both = smile * coded(table["sex"])
+    # Two scans of each smile are one observation of it.
+    flat = noise.reshape(9, 2, 2, -1).mean(axis=1).reshape(18, -1)
+    cells = {name: np.array(table[name]).reshape(9, 2, 2)[:, 0].ravel().tolist() for name in ("sex", "smile")}
+    subject, smile = np.eye(9)[np.repeat(np.arange(9), 2)][:, 1:], coded(cells["smile"])
+    both = smile * coded(cells["sex"])
     (without, _), (with_it, df) = left(flat, [subject, both]), left(flat, [subject, both, smile])
     test = found.test("smile")
     # Type II: without the interaction, of which smile is a part; the error is that of the whole model.
     error = with_it / df
     (without, _), (with_it, _) = left(flat, [subject]), left(flat, [subject, smile])
-    assert [one.stratum for one in found.tests] == ["between subject", "within subject", "within subject"]
+    assert [one.stratum for one in found.tests] == ["between subject", *["within subject: smile"] * 2]
     np.testing.assert_allclose(test.squares, without - with_it, rtol=1e-8)
     np.testing.assert_allclose(test.f, (without - with_it) / error, rtol=1e-8)
-    assert found.remainders[1].df == df
+    assert found.remainders[1].df == df == 7
 
 
-def test_whole_subjects_are_permuted_and_scans_only_within_theirs() -> None:
+def test_cells_are_permuted_only_within_their_subject_where_all_respond_alike() -> None:
     table, noise = repeated(6, 3, 2)
-    from shapespace.statistics.compare_formula import design_of
-    from shapespace.statistics.compare_strata import strata_of
-
+    table["visit"] = ["a", "b", "c"] * 6
     shapes = cohort(table, noise, stddev=0.0)
-    strata = strata_of(shapes.coefficients, design_of("~ sex + smile", shapes.table), table["subject"], "subject")
-    between, within = strata
+    design = design_of("~ sex + visit", shapes.table)
+    between, within = strata_of(shapes.coefficients, design, table["subject"], "subject", "II", ()).every
     assert len(between.shapes) == 6
     who = np.repeat(np.arange(6), 3)
-    for start, rows in within.arrangements(120, 0):
+    moved: list[IntArray] = []
+    for start, rows, signs in within.arrangements(120, 0):
+        assert signs is None
         assert (np.sort(rows, axis=1) == np.arange(18)).all()
         assert (who[rows] == who).all()
         if start == 0:
             assert (rows[0] == np.arange(18)).all()
-    moved = np.concatenate([rows for _, rows in within.arrangements(120, 0)])
-    assert {tuple(np.argsort(row[:3])) for row in moved} == set(itertools.permutations(range(3)))
+        moved.append(rows)
+    assert {tuple(np.argsort(row[:3])) for row in np.concatenate(moved)} == set(itertools.permutations(range(3)))
 
 
 def test_repeated_scans_taken_for_independent_find_what_is_not_there_and_blocks_do_not() -> None:
@@ -308,10 +311,7 @@ def test_maps_are_those_of_a_plain_test_at_each_vertex(monkeypatch: pytest.Monke
     table = people(25)
     shapes = cohort(table)
     found = compare(shapes, "~ age + sex", CompareOptions(permutations=60)).effects[1]
-    from shapespace.statistics.compare_formula import design_of
-    from shapespace.statistics.compare_strata import strata_of
-
-    stratum = strata_of(shapes.coefficients, design_of("~ age + sex", shapes.table), None, "")[0]
+    stratum = strata_of(shapes.coefficients, design_of("~ age + sex", shapes.table), None, "").every[0]
     every = np.stack([shapes.vertices(k) for k in range(25)])
     normals = vertex_normals(Mesh(every.mean(axis=0), shapes.faces))
     columns = pieces(table, [("age",), ("sex",)])
@@ -329,7 +329,7 @@ def test_maps_are_those_of_a_plain_test_at_each_vertex(monkeypatch: pytest.Monke
     ):
         fit = x0 @ np.linalg.lstsq(x0, y, rcond=None)[0]
         # Rows of the design are permuted, which is the inverse permutation of the residuals.
-        orders = [np.argsort(row) for _, rows in stratum.arrangements(60, 0) for row in rows]
+        orders = [np.argsort(row) for _, rows, _ in stratum.arrangements(60, 0) for row in rows]
         drawn = np.stack([f(fit + (y - fit)[order]) for order in orders])
         assert test is not None
         np.testing.assert_allclose(test.f, drawn[0], rtol=1e-8)

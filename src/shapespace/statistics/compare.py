@@ -9,8 +9,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -20,9 +20,17 @@ from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.late import late
 from shapespace.statistics.answer import Answer
-from shapespace.statistics.compare_formula import Design, Term, Variable, columns_of, design_of
+from shapespace.statistics.compare_formula import (
+    Design,
+    Term,
+    Variable,
+    columns_of,
+    design_of,
+    random_effects_of,
+)
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
-from shapespace.statistics.compare_strata import Stratum, less, strata_of
+from shapespace.statistics.compare_strata import Stratum, less
+from shapespace.statistics.compare_within import Strata, Within, strata_of
 from shapespace.types import FloatArray, read_only
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -41,7 +49,10 @@ class CompareOptions:
 
     Args:
         squares: one of `TYPES`.
-        blocks: column that says whose scans are repeated ones; None takes all shapes for independent.
+        blocks: column with the subject of each scan, whose responses to all conditions within subjects may differ; None
+            takes all shapes for independent.
+        random: the effects within subjects that differ between subjects, such as `1 + time | subject`, instead of
+            `blocks`; all others are assumed to be the same in all subjects. None for all effects.
         permutations: arrangements, the observed one among them.
         seed: of the arrangements.
         maps: whether to test each vertex.
@@ -53,6 +64,7 @@ class CompareOptions:
 
     squares: SquaresType = "II"
     blocks: str | None = None
+    random: str | None = None
     permutations: int = 1000
     seed: int = 0
     maps: bool = True
@@ -175,6 +187,7 @@ class Comparison:
         angles: between effects.
         warnings: what makes the numbers less than they look, a sentence each.
         subjects: number of subjects; that of shapes where all are independent.
+        notes: how repeated shapes of subjects were tested, a sentence each.
     """
 
     cohort: Cohort
@@ -186,6 +199,7 @@ class Comparison:
     angles: tuple[Angle, ...]
     warnings: tuple[str, ...]
     subjects: int
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -228,12 +242,14 @@ def compare(
 
     Raises:
         InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
-            covariate, terms that follow from others, or more columns than shapes.
+            covariate, terms that follow from others, more columns than shapes, or an effect within subjects that too
+            few subjects show.
         ShapespaceError: the extra `statistics` is not installed.
     """
     options = options or CompareOptions()
     own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)
+    random, options = _random(options, cohort)
     named = columns_of(formula, cohort.table)
     unknown = int(np.isnan(cohort.sizes_mm).sum())
     if unknown and not options.drop_missing and {"size", "log_size"} & set(named) - set(own):
@@ -245,12 +261,18 @@ def compare(
     design = design_of(formula, cohort.table)
     subjects = None if options.blocks is None else cohort.table.texts(options.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
-    strata = strata_of(cohort.coefficients, design, subjects if repeated else None, options.blocks or "")
-    families = [family for stratum in strata for family in _families(design, stratum)]
+    made = strata_of(
+        cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.squares, random
+    )
+    strata = made.every
+    families = list(_families(design, made))
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
     tests = tuple(test for stratum in strata for test in _tests(stratum, options, step))
     effects = tuple(e for family in families for e in _effects(cohort, family, options, step))
+    warnings = (
+        *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design)
+    )  # fmt: skip
     return Comparison(
         cohort=cohort,
         design=design,
@@ -258,10 +280,21 @@ def compare(
         tests=tests,
         remainders=tuple(_remainder(stratum) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, strata, options), *_between(effects)),
-        warnings=(*_warnings(cohort, strata, options, subjects), *_uncentred(design, options), *_left_out(design)),
+        angles=(*_parallel(design, made, options), *_between(effects)),
+        warnings=warnings,
         subjects=len(set(subjects)) if subjects is not None else len(cohort),
+        notes=made.notes,
     )
+
+
+def _random(options: CompareOptions, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareOptions]:
+    """Return the random effects, None for all, and the options with the column of subjects as their blocks."""
+    if options.random is None:
+        return None, options
+    effects, column = random_effects_of(options.random, cohort.table)
+    if options.blocks not in (None, column):
+        raise InputError(f"Blocks of {options.blocks!r} and random terms of {column!r} differ; give one of the two.")
+    return effects, replace(options, blocks=column)
 
 
 class _Steps:
@@ -281,12 +314,14 @@ def _with_sizes(cohort: Cohort) -> Cohort:
 
 def _tests(stratum: Stratum, options: CompareOptions, step: Callable[[], None]) -> Iterator[TermTest]:
     total = float((stratum.shapes**2).sum())
-    for at, term in enumerate(stratum.terms):
-        reduced = _reduced(term, at, stratum.terms, options.squares)
+    for term in stratum.terms:
+        reduced = stratum.reduced(term, options.squares)
         residual = stratum.residual(reduced)
         own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        products = stratum.products(np.hstack([own, rest]), residual, options.permutations, options.seed)
+        products = stratum.products(
+            np.hstack([own, rest]), residual, options.permutations, options.seed, flips=stratum.flips(reduced)
+        )
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)
@@ -296,14 +331,6 @@ def _tests(stratum: Stratum, options: CompareOptions, step: Callable[[], None]) 
             _share(f), read_only(f),
         )  # fmt: skip
         step()
-
-
-def _reduced(term: Term, at: int, terms: Sequence[Term], squares: SquaresType) -> list[Term]:
-    """Return the terms that a term is tested beside."""
-    if squares == "I":
-        return list(terms[:at])
-    others = [other for other in terms if other is not term]
-    return others if squares == "III" else [other for other in others if not term.factors < other.factors]
 
 
 def _remainder(stratum: Stratum) -> Remainder:
@@ -316,40 +343,78 @@ def _remainder(stratum: Stratum) -> Remainder:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
+    """A contrast of a stratum, in whose reduced model some terms are."""
+
     low: str
     high: str
+    stratum: Stratum
+    beside: tuple[Term, ...]
     contrast: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Family:
-    """Contrasts that are tested beside the same other terms."""
+    """Contrasts of one variable, or of two that interact."""
 
     name: str
-    stratum: Stratum
-    beside: tuple[Term, ...]
     ends: tuple[_Ends, ...]
 
 
-def _families(design: Design, stratum: Stratum) -> Iterator[_Family]:
+def _families(design: Design, strata: Strata) -> Iterator[_Family]:
+    within = strata.within
     for one in design.variables:
         alone = [term for term in design.terms if term.variables == frozenset({one.column})]
         wanted = alone or [term for term in design.terms if one.column in term.variables]
-        if any(term in stratum.terms for term in wanted):
-            beside = tuple(term for term in stratum.terms if one.column not in term.variables)
-            ends = [
-                _Ends(one.told(low), one.told(high), design.contrast(one.column, low, high))
-                for low, high in _pairs(one)
-            ]
-            yield _Family(one.name, stratum, beside, tuple(ends))
-    for one, other in _interacting(design, stratum):
+        both = frozenset({one.column})
+        if within is not None and within.holds(both):
+            ends = [_within_ends(within, one, low, high) for low, high in _pairs(one)]
+            yield _Family(one.name, tuple(ends))
+            continue
+        for stratum in strata.every:
+            if any(term in stratum.terms for term in wanted):
+                beside = tuple(stratum.without(both))
+                ends = [
+                    _Ends(one.told(low), one.told(high), stratum, beside, design.contrast(one.column, low, high))
+                    for low, high in _pairs(one)
+                ]
+                yield _Family(one.name, tuple(ends))
+    for one, other in _interacting(design):
+        both = frozenset({one.column, other.column})
         (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
+        what, name = _told(one, low, high), f"{one.name}:{other.name}"
+        words = f"{what} at {other.told(first)}", f"the same at {other.told(second)}"
+        if within is not None and within.holds(both):
+            yield _Family(name, (_within_interaction(within, one, other, words),))
+            continue
         change = [design.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
-        both = {one.column, other.column}
-        beside = tuple(term for term in stratum.terms if not both <= term.variables)
-        what = _told(one, low, high)
-        ends = _Ends(f"{what} at {other.told(first)}", f"the same at {other.told(second)}", change[1] - change[0])
-        yield _Family(f"{one.name}:{other.name}", stratum, beside, (ends,))
+        for stratum in strata.every:
+            if any(both <= term.variables for term in stratum.terms):
+                yield _Family(name, (_Ends(*words, stratum, tuple(stratum.without(both)), change[1] - change[0]),))
+
+
+def _within_ends(within: Within, one: Variable, low: str | float, high: str | float) -> _Ends:
+    """Return the change of a variable within subjects, at the average of the variables between them."""
+    own = frozenset({one.column})
+    stratum, between = within.contrast_stratum(
+        within.effects.contrast(one.column, low, high), own, _told(one, low, high)
+    )
+    return _Ends(one.told(low), one.told(high), stratum, tuple(stratum.without(own)), between.average({}))
+
+
+def _within_interaction(within: Within, one: Variable, other: Variable, words: tuple[str, str]) -> _Ends:
+    """Return the contrast of two variables of which one or both differ within subjects."""
+    both = frozenset({one.column, other.column})
+    (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
+    name = f"{one.name}:{other.name}"
+    if both <= within.variables:
+        change = [within.effects.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
+        stratum, between = within.contrast_stratum(change[1] - change[0], both, name)
+        return _Ends(*words, stratum, tuple(stratum.without(both)), between.average({}))
+    inner, outer = (one, other) if one.column in within.variables else (other, one)
+    (low, high), (first, second) = _pairs(inner)[0], _pairs(outer)[0]
+    contrast = within.effects.contrast(inner.column, low, high)
+    stratum, between = within.contrast_stratum(contrast, frozenset({inner.column}), name)
+    return _Ends(*words, stratum, tuple(stratum.without(both)), between.contrast(outer.column, first, second))
 
 
 def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, float]]:
@@ -363,79 +428,129 @@ def _told(one: Variable, low: str | float, high: str | float) -> str:
     return f"{one.told(low)} to {one.told(high).removeprefix(f'{one.name} ')}"
 
 
-def _interacting(design: Design, stratum: Stratum) -> Iterator[tuple[Variable, Variable]]:
-    """Yield pairs of variables with one change each that share a term of this stratum."""
+def _interacting(design: Design) -> Iterator[tuple[Variable, Variable]]:
+    """Yield pairs of variables with one change each that share a term."""
     for one, other in itertools.combinations(design.variables, 2):
-        together = any({one.column, other.column} <= term.variables for term in stratum.terms)
+        together = any({one.column, other.column} <= term.variables for term in design.terms)
         if together and len(one.levels) <= 2 and len(other.levels) <= 2:
             yield one, other
 
 
 def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Callable[[], None]) -> Iterator[Effect]:
-    stratum = family.stratum
-    residual = stratum.residual(family.beside)
-    directions = np.stack([stratum.direction(ends.contrast) for ends in family.ends])
+    parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
+    made = [_tested_together(cohort, own, options) for own in parts]
+    largest = np.max([f for f, _, _ in made for f in f], axis=0)
+    mean = cohort.coefficients.mean(axis=0)
+    step()
+    if options.maps:
+        step()
+    for own, (statistics, changes, maps) in zip(parts, made, strict=True):
+        for ends, f, change, shown in zip(own, statistics, changes, maps, strict=True):
+            distance = float(np.linalg.norm(change))
+            yield Effect(
+                name=family.name,
+                low=ends.low,
+                high=ends.high,
+                stratum=ends.stratum.name,
+                change=read_only(change),
+                at_low=read_only(mean - change / 2),
+                at_high=read_only(mean + change / 2),
+                distance_mm=distance,
+                rms_mm=distance / math.sqrt(cohort.n_vertices),
+                f=float(f[0]),
+                z=effect_size(f),
+                p=_share(f),
+                p_family=float((largest >= f[0] * (1 - _TIE)).mean()),
+                map=shown,
+            )
+
+
+def _tested_together(
+    cohort: Cohort, family: Sequence[_Ends], options: CompareOptions
+) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
+    """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum."""
+    stratum, beside = family[0].stratum, family[0].beside
+    residual, flips = stratum.residual(beside), stratum.flips(beside)
+    directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
     along = (directions / lengths[:, None]) @ stratum.basis
-    products = stratum.products(stratum.basis, residual, options.permutations, options.seed)
+    products = stratum.products(stratum.basis, residual, options.permutations, options.seed, flips=flips)
     error = ((residual**2).sum() - (products**2).sum(axis=(1, 2))) / stratum.df_error
     f = np.stack([_ratio((np.einsum("m,pmk->pk", a, products) ** 2).sum(axis=1), error) for a in along])
-    largest = f.max(axis=0)
     changes = directions @ stratum.shapes
-    step()
-    maps: Iterable[EffectMap | None] = itertools.repeat(None)
-    if options.maps:
-        maps = effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
-        step()
-    mean = cohort.coefficients.mean(axis=0)
-    for at, (ends, made) in enumerate(zip(family.ends, maps, strict=False)):
-        distance = float(np.linalg.norm(changes[at]))
-        yield Effect(
-            name=family.name,
-            low=ends.low,
-            high=ends.high,
-            stratum=stratum.name,
-            change=read_only(changes[at]),
-            at_low=read_only(mean - changes[at] / 2),
-            at_high=read_only(mean + changes[at] / 2),
-            distance_mm=distance,
-            rms_mm=distance / math.sqrt(cohort.n_vertices),
-            f=float(f[at, 0]),
-            z=effect_size(f[at]),
-            p=_share(f[at]),
-            p_family=float((largest >= f[at, 0] * (1 - _TIE)).mean()),
-            map=made,
-        )
+    if not options.maps:
+        return f, changes, [None] * len(family)
+    return f, changes, effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm)
 
 
-def _parallel(design: Design, strata: Sequence[Stratum], options: CompareOptions) -> Iterator[Angle]:
+def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterator[Angle]:
     """Yield angles between what a variable changes in one class of another and in the next, where they interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
     """
-    for stratum, one, other in _changes_by_class(design, strata):
-        low, high = _pairs(one)[0]
-        beside = [term for term in stratum.terms if not {one.column, other.column} <= term.variables]
-        residual = stratum.residual(beside)
-        products = stratum.products(stratum.basis, residual, options.permutations, options.seed)
-        products += stratum.basis.T @ (stratum.shapes - residual)
-        drawn: list[FloatArray] = []
-        for level in other.levels[:_MOST_LEVELS]:
-            contrast = design.contrast(one.column, low, high, {other.column: level})
-            drawn.append(np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(contrast), products))
-        for first, second in itertools.combinations(range(len(drawn)), 2):
-            angles = _angles(drawn[first], drawn[second])
-            names = [f"{_told(one, low, high)}, {other.told(other.levels[at])}" for at in (first, second)]
-            yield Angle(names[0], names[1], float(angles[0]), float((angles >= angles[0] - _TIE).mean()))
+    for one, other in itertools.permutations(design.variables, 2):
+        both = frozenset({one.column, other.column})
+        together = [term for term in design.terms if term.variables == both]
+        main = [term for term in design.terms if term.variables == frozenset({one.column})]
+        if not together or not main or len(one.levels) > 2 or not other.levels:
+            continue
+        levels = other.levels[:_MOST_LEVELS]
+        words = [f"{_told(one, *_pairs(one)[0])}, {other.told(level)}" for level in levels]
+        for first, second in itertools.combinations(range(len(levels)), 2):
+            drawn = _changes_in_two(design, strata, one, other, (levels[first], levels[second]), options)
+            if drawn is None:
+                break
+            angles = _angles(*drawn)
+            yield Angle(words[first], words[second], float(angles[0]), float((angles >= angles[0] - _TIE).mean()))
 
 
-def _changes_by_class(design: Design, strata: Sequence[Stratum]) -> Iterator[tuple[Stratum, Variable, Variable]]:
-    for stratum in strata:
-        for one, other in itertools.permutations(design.variables, 2):
-            together = any(term.variables == frozenset({one.column, other.column}) for term in stratum.terms)
-            main = any(term.variables == frozenset({one.column}) for term in stratum.terms)
-            if together and main and len(one.levels) <= 2 and other.levels:
-                yield stratum, one, other
+def _changes_in_two(
+    design: Design, strata: Strata, one: Variable, other: Variable, classes: tuple[str, str], options: CompareOptions
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return what a variable changes (P, K) in each of two classes of another, in each arrangement.
+
+    None where the two changes are not of one stratum.
+    """
+    both = frozenset({one.column, other.column})
+    low, high = _pairs(one)[0]
+    within = strata.within
+    if within is None or not within.holds(both):
+        stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
+        if stratum is None or not any(term.variables == frozenset({one.column}) for term in stratum.terms):
+            return None
+        contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in classes]
+        return _changes_of(stratum, both, contrasts, options)
+    if one.column not in within.variables:
+        return None
+    if other.column not in within.variables:
+        contrast = within.effects.contrast(one.column, low, high)
+        stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
+        return _changes_of(stratum, both, [between.average({other.column: level}) for level in classes], options)
+    # Both within subjects: in each arrangement some subjects change their two changes for each other.
+    first, second = (within.effects.contrast(one.column, low, high, {other.column: level}) for level in classes)
+    name = f"{one.name}:{other.name}"
+    half, between = within.contrast_stratum((first - second) / 2, both, name)
+    middle = within.contrast_stratum((first + second) / 2, frozenset({one.column}), name)
+    mean = middle[0].direction(middle[1].average({})) @ middle[0].shapes
+    differ = half.direction(between.average({}))
+    flipped = half.products(differ[:, None], half.shapes, options.permutations, options.seed, flips=True)[:, 0]
+    return mean + flipped, mean - flipped
+
+
+def _changes_of(
+    stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], options: CompareOptions
+) -> tuple[FloatArray, FloatArray]:
+    """Return two contrasts (P, K) in each arrangement of the model without the terms of some variables."""
+    beside = stratum.without(variables)
+    residual = stratum.residual(beside)
+    products = stratum.products(
+        stratum.basis, residual, options.permutations, options.seed, flips=stratum.flips(beside)
+    )
+    products += stratum.basis.T @ (stratum.shapes - residual)
+    first, second = (
+        np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(contrast), products) for contrast in contrasts
+    )
+    return first, second
 
 
 def _between(effects: Sequence[Effect]) -> Iterator[Angle]:
@@ -471,9 +586,9 @@ def _warnings(
                 "once, by its mean, and p is approximate where means of few scans are noisier."
             )
     for stratum in strata:
-        if stratum.log_arrangements < math.log(_FEWEST):
+        if stratum.fewest_log_arrangements < math.log(_FEWEST):
             yield (
-                f"There are only {round(math.exp(stratum.log_arrangements))} arrangements"
+                f"There are only {round(math.exp(stratum.fewest_log_arrangements))} arrangements"
                 f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
             )
 

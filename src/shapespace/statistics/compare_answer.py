@@ -52,11 +52,12 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         tables=_tables(comparison),
         arrays={f"effect_{at}.npz": _arrays(comparison, effect) for at, effect in enumerate(effects, 1)},
         meshes=dict(_meshes(comparison)),
-        notes=comparison.cohort.notes,
+        notes=(*comparison.cohort.notes, *comparison.notes),
         settings={
             "formula": comparison.design.formula,
             "squares": comparison.options.squares,
             "blocks": comparison.options.blocks,
+            "random": comparison.options.random,
             "permutations": comparison.options.permutations,
             "seed": comparison.options.seed,
             "bump_width_mm": comparison.options.bump_width_mm,

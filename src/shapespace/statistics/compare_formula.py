@@ -10,7 +10,7 @@ import ast
 import itertools
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -93,6 +93,7 @@ class Design:
         terms: of it, those of fewer variables first.
         variables: that it names.
         values: N of each variable, by its name inside.
+        factors: the variable, by its name inside, of each factor of the terms, in the order of the formula.
     """
 
     formula: str
@@ -100,17 +101,37 @@ class Design:
     terms: tuple[Term, ...]
     variables: tuple[Variable, ...]
     values: Mapping[str, Sequence[str | float]]
+    factors: Mapping[str, str]
+    _codes: Mapping[str, str] = field(repr=False)
     _spec: Any = field(repr=False)
+    _skipped: int = field(default=1, repr=False)
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
         """Return the (n, p) columns where each variable, by its name inside, has these n values."""
-        pandas = other_package("pandas", "A formula", INSTALL)
-        frame: dict[str, Any] = {}
-        for one in self.variables:
-            own = list(values[one.column])
-            frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
-        made = self._spec.get_model_matrix(pandas.DataFrame(frame), context=_CONTEXT)
-        return np.asarray(made, dtype=np.float64)[:, 1:]
+        made = self._spec.get_model_matrix(self._frame(values), context=_CONTEXT)
+        return np.asarray(made, dtype=np.float64)[:, self._skipped :]
+
+    def part(self, products: Sequence[frozenset[str]]) -> Design:
+        """Return the columns of other products of the same factors, for the same rows.
+
+        Args:
+            products: factors of each, as in `Term.factors`; the empty product is the constant and comes first.
+        """
+        formulaic = other_package("formulaic", "A formula", INSTALL)
+        ordered = [[factor for factor in self.factors if factor in product] for product in products]
+        written = [":".join(self._codes[factor] for factor in product) or "1" for product in ordered]
+        with np.errstate(all="ignore"):
+            made = formulaic.Formula(written, _ordering="none").get_model_matrix(
+                self._frame(self.values), context=_CONTEXT, na_action="ignore"
+            )
+        spec = made.model_spec
+        slices = [tuple(int(at) for at in indices) for indices in spec.term_indices.values()]
+        terms = tuple(
+            Term(":".join(product) or "1", frozenset(product), frozenset(self.factors[one] for one in product), own)
+            for product, own in zip(ordered, slices, strict=True)
+        )
+        matrix = read_only(np.asarray(made, dtype=np.float64))
+        return replace(self, matrix=matrix, terms=terms, _spec=spec, _skipped=0)
 
     def with_held(self, held: Collection[str]) -> FloatArray:
         """Return `matrix` as it were if some variables, by their names inside, were the same in all rows.
@@ -124,6 +145,34 @@ class Design:
             same = {one.column: [value] * len(total) for one, value in zip(own, cell, strict=True)}
             total += self.rows({**self.values, **same})
         return total / len(cells)
+
+    def _frame(self, values: Mapping[str, Sequence[str | float]]) -> Any:
+        pandas = other_package("pandas", "A formula", INSTALL)
+        frame: dict[str, Any] = {}
+        for one in self.variables:
+            own = list(values[one.column])
+            frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
+        return pandas.DataFrame(frame)
+
+    def average(self, fixed: Mapping[str, str | float]) -> FloatArray:
+        """Return the (p,) columns, averaged over the classes of variables in the terms, with numbers at their mean.
+
+        Args:
+            fixed: values of variables that are not averaged, by their names inside.
+        """
+        used = {name for term in self.terms for name in term.variables}
+        choices: list[Sequence[str | float]] = []
+        for one in self.variables:
+            if one.column in fixed:
+                choices.append((fixed[one.column],))
+            elif one.levels:
+                choices.append(one.levels if one.column in used else one.levels[:1])
+            else:
+                choices.append((one.middle,))
+        cells = _cells(choices, self.formula)
+        return read_only(
+            self.rows({one.column: [cell[at] for cell in cells] for at, one in enumerate(self.variables)}).mean(axis=0)
+        )
 
     def contrast(
         self, column: str, low: str | float, high: str | float, fixed: Mapping[str, str | float] | None = None
@@ -173,6 +222,31 @@ def columns_of(formula: str, table: Table) -> tuple[str, ...]:
     return tuple(dict.fromkeys(factor.name for term in _parsed(formula, table) for factor in term))
 
 
+def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], ...], str]:
+    """Return the effects that vary by subject, as products of factors, and the column that names the subject.
+
+    Args:
+        random: such as `1 + time | subject`; the 1, the mean of each subject, is always one of them.
+        table: whose columns it names.
+
+    Raises:
+        InputError: it cannot be read, leaves out the 1, or names something that is no column.
+        ShapespaceError: the extra `statistics` is not installed.
+    """
+    effects, bar, column = (part.strip() for part in random.partition("|"))
+    column = column.strip("`")
+    if not bar or not effects or not column:
+        raise InputError(f"The random terms {random[:80]!r} cannot be read; write them as '1 + time | subject'.")
+    if column not in table.columns:
+        raise InputError(
+            f"The random terms {random[:80]!r} name {column[:60]!r}, which is no column; there is "
+            f"{', '.join(table.columns)}."
+        )
+    if effects == "1":
+        return (), column
+    return tuple(frozenset(factor.text for factor in term) for term in _parsed(effects, table)), column
+
+
 def design_of(formula: str, table: Table) -> Design:
     """Return the columns of a linear model of the rows of a table, in which nothing that is named is missing.
 
@@ -197,12 +271,14 @@ def design_of(formula: str, table: Table) -> Design:
                 pandas.Categorical(values, categories=variable.levels) if classes else np.asarray(values)
             )
     written, labels = ["1"], list[str]()
+    variable_of, codes = dict[str, str](), dict[str, str]()
     factors, members = list[frozenset[str]](), list[frozenset[str]]()
     for term in parsed:
         own = [inside[factor.name, factor.holds_classes(table)] for factor in term]
-        written.append(
-            ":".join(f.written(one.column, classes=bool(one.levels)) for f, one in zip(term, own, strict=True))
-        )
+        for factor, one in zip(term, own, strict=True):
+            variable_of[factor.text] = one.column
+            codes[factor.text] = factor.written(one.column, classes=bool(one.levels))
+        written.append(":".join(codes[factor.text] for factor in term))
         labels.append(":".join(factor.text for factor in term))
         factors.append(frozenset(factor.text for factor in term))
         members.append(frozenset(one.column for one in own))
@@ -221,7 +297,9 @@ def design_of(formula: str, table: Table) -> Design:
     for term in terms:
         if not np.isfinite(matrix[:, [at + 1 for at in term.columns]]).all():
             raise InputError(f"{table.where}: {term.label} is not finite in all rows, as a logarithm of 0 would be.")
-    return Design(formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, spec)
+    return Design(
+        formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, variable_of, codes, spec
+    )
 
 
 @dataclass(frozen=True)

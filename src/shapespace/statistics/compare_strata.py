@@ -1,8 +1,10 @@
-"""What may be exchanged for what: strata of a linear model of shapes, and their arrangements.
+"""Strata of a linear model of shapes, and the arrangements under which their rows are exchangeable.
 
-Without blocks all shapes are exchangeable. Scans of one subject are not exchangeable with those of another, so with
-blocks a model falls into two strata, as in the analysis of a split plot: means of subjects, which are permuted as
-wholes, and differences from them, which are permuted within subjects (Winkler et al., NeuroImage 123, 2015).
+Without blocks all shapes are exchangeable. Scans of one subject are not independent, so with blocks a model has several
+strata, as in the analysis of variance of repeated measures: means of subjects, which are permuted as wholes, and for
+each effect within subjects the contrasts or slopes of the subjects (`compare_within`), whose signs are flipped or which
+are permuted between subjects. An effect that is assumed to be the same in all subjects is tested on the differences of
+cells from the subject's mean, which are permuted within subjects (Winkler et al., NeuroImage 123, 2015).
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,8 @@ from shapespace.statistics.compare_formula import Design, Term
 from shapespace.types import FloatArray
 
 Rows: TypeAlias = npt.NDArray[np.intp]
+Scheme: TypeAlias = Literal["permute", "flip", "subjects"]
+"""Rows are permuted, or their signs are flipped; of subjects, the one or the other, depending on the reduced model."""
 
 _ALIASED = 1e-8
 _CONSTANT = 1e-9
@@ -38,9 +42,15 @@ class Stratum:
         matrix: (n, p) of these terms, less the same means.
         columns: (p,) of the design.
         terms: tested here.
-        groups: (n,) rows of one number are exchangeable.
+        groups: (n / width,) units of one number are exchangeable.
         removed: number of means removed.
         number: of the stratum, for its seed.
+        nuisance: terms that are in the model but not tested here.
+        scheme: how units are arranged.
+        width: consecutive rows of one unit, which stay together.
+        units: (n / width,) of all units for which arrangements are drawn; None where each is one of them.
+        n_units: number of these.
+        constant: (n,) the row of the constant in the first row of each unit; None where means are removed.
     """
 
     name: str
@@ -51,6 +61,12 @@ class Stratum:
     groups: Rows
     removed: int
     number: int
+    nuisance: tuple[Term, ...] = ()
+    scheme: Scheme = "permute"
+    width: int = 1
+    units: Rows | None = None
+    n_units: int = 0
+    constant: FloatArray | None = None
 
     @property
     def df_error(self) -> int:
@@ -63,9 +79,16 @@ class Stratum:
         return np.linalg.qr(self.matrix)[0]
 
     @cached_property
-    def log_arrangements(self) -> float:
-        """Logarithm of how many arrangements there are that differ; rows with the same covariates do not."""
-        matrix = np.asarray(np.round(self.matrix / np.abs(self.matrix).max(axis=0), 9), dtype=np.float64)
+    def fewest_log_arrangements(self) -> float:
+        """Logarithm of how many arrangements of a term differ, of the term that has fewest."""
+        return min(self.log_arrangements(flips=self.flips(self.reduced(term, "III"))) for term in self.terms)
+
+    def log_arrangements(self, *, flips: bool = False) -> float:
+        """Return the logarithm of how many arrangements differ; of equal covariates, or of all signs, there is one."""
+        if flips:
+            return (len(self.groups) - 1) * math.log(2)
+        matrix = self.matrix[:: self.width]
+        matrix = np.asarray(np.round(matrix / np.maximum(np.abs(matrix).max(axis=0), 1e-300), 9), dtype=np.float64)
         rows = np.column_stack([self.groups.astype(np.float64), matrix])
         alike = np.unique(rows, axis=0, return_counts=True)[1]
         every = np.bincount(self.groups)
@@ -76,90 +99,82 @@ class Stratum:
         wanted = [column for term in terms for column in term.columns]
         return np.flatnonzero(np.isin(self.columns, wanted))
 
+    def reduced(self, term: Term, squares: str) -> list[Term]:
+        """Return the terms of the reduced model of a term, for a type of sums of squares: `I`, `II` or `III`."""
+        if squares == "I":
+            return [*self.nuisance, *self.terms[: self.terms.index(term)]]
+        others = [other for other in (*self.nuisance, *self.terms) if other is not term]
+        return others if squares == "III" else [other for other in others if not term.factors < other.factors]
+
+    def without(self, variables: frozenset[str]) -> list[Term]:
+        """Return the terms that do not contain all of some variables, by their names inside."""
+        return [term for term in (*self.nuisance, *self.terms) if not variables <= term.variables]
+
     def residual(self, terms: Sequence[Term]) -> FloatArray:
         """Return the (n, K) residuals of the model of some of the terms."""
         return less(self.shapes, self.matrix[:, self.at(terms)])
 
     def direction(self, contrast: FloatArray) -> FloatArray:
         """Return (n,) what gives the estimate of a contrast (P,) of the design when multiplied by the shapes."""
-        return np.linalg.pinv(self.matrix).T @ contrast[self.columns]
+        own = np.zeros(len(self.columns))
+        tested = self.at(self.terms)
+        own[tested] = contrast[self.columns[tested]]
+        return np.linalg.pinv(self.matrix).T @ own
 
-    def products(self, basis: FloatArray, residual: FloatArray, permutations: int, seed: int) -> FloatArray:
+    def flips(self, reduced: Sequence[Term]) -> bool:
+        """Return whether the arrangements of the residuals of a reduced model are flips of signs.
+
+        Contrasts of subjects are exchangeable between subjects where the reduced model contains their mean. Where their
+        mean is itself tested, each is as likely with the other sign.
+        """
+        if self.scheme != "subjects" or self.constant is None:
+            return self.scheme == "flip"
+        left = less(self.constant[:, None], self.matrix[:, self.at(reduced)])
+        return bool(np.linalg.norm(left) > _ALIASED * np.linalg.norm(self.constant))
+
+    def products(
+        self, basis: FloatArray, residual: FloatArray, permutations: int, seed: int, *, flips: bool = False
+    ) -> FloatArray:
         """Return the (permutations, m, K) products of `basis` (n, m) with `residual` (n, K) in each arrangement.
 
         The first is as observed.
         """
         out = np.empty((permutations, basis.shape[1], residual.shape[1]))
-        for start, rows in self.arrangements(permutations, seed):
-            placed = basis[rows].transpose(0, 2, 1).reshape(-1, len(residual))
-            out[start : start + len(rows)] = (placed @ residual).reshape(len(rows), basis.shape[1], -1)
+        for start, rows, signs in self.arrangements(permutations, seed, flips=flips):
+            placed = basis[rows] if signs is None else basis * signs[:, :, None]
+            made = placed.transpose(0, 2, 1).reshape(-1, len(residual)) @ residual
+            out[start : start + len(rows)] = made.reshape(len(rows), basis.shape[1], -1)
         return out
 
-    def arrangements(self, permutations: int, seed: int) -> Iterator[tuple[int, Rows]]:
-        """Yield (start, rows (b, n)) of arrangements, the same ones whenever it is asked; the first is as observed."""
+    def arrangements(
+        self, permutations: int, seed: int, *, flips: bool = False
+    ) -> Iterator[tuple[int, Rows, FloatArray | None]]:
+        """Yield (start, rows (b, n), signs (b, n)) of arrangements; the first is as observed.
+
+        They are the same on each call. Signs are None where rows are permuted, and rows stay in order where signs are
+        flipped. Strata of the same units arrange them alike.
+        """
+        n = len(self.groups)
+        own = np.arange(n) if self.units is None else self.units
         places = np.argsort(self.groups, kind="stable")
         groups = np.sort(self.groups)
+        within = np.arange(self.width)
         for start in range(0, permutations, _BATCH):
             count = min(_BATCH, permutations - start)
-            keys = np.random.default_rng([seed, self.number, start]).random((_BATCH, len(places)))[:count]
-            rows = np.empty(keys.shape, dtype=np.intp)
-            rows[:, places] = places[np.lexsort((keys, np.broadcast_to(groups, keys.shape)), axis=-1)]
-            if start == 0:
-                rows[0] = np.arange(len(places))
-            yield start, rows
-
-
-def strata_of(shapes: FloatArray, design: Design, subjects: Sequence[str] | None, blocks: str) -> tuple[Stratum, ...]:
-    """Return the strata of a linear model of shapes.
-
-    Args:
-        shapes: (N, K) mm.
-        design: of N rows.
-        subjects: N, whose scans the rows are; None where all rows are exchangeable.
-        blocks: what a subject is called, in messages.
-
-    Raises:
-        InputError: one subject; more columns than rows; or a term that follows from the others.
-    """
-    n = len(shapes)
-    _refuse_few(n - 1, design, "", n, "shapes")
-    everything = design.matrix - design.matrix.mean(axis=0)
-    _refuse_aliased(everything, design.terms, design)
-    columns = np.arange(design.matrix.shape[1], dtype=np.intp)
-    if subjects is None:
-        rows = np.zeros(n, dtype=np.intp)
-        return (Stratum("", shapes - shapes.mean(axis=0), everything, columns, design.terms, rows, 1, 0),)
-    names, at = np.unique(np.asarray(subjects), return_inverse=True)
-    if len(names) == 1:
-        raise InputError(f"All {n} shapes are of one {blocks}, {names[0]}; a comparison needs several.")
-    inner = design.matrix - _means(design.matrix, at)[at]
-    varies = np.abs(inner).max(axis=0) > _CONSTANT * np.abs(everything).max(axis=0)
-    within = tuple(term for term in design.terms if varies[list(term.columns)].any())
-    between = tuple(term for term in design.terms if term not in within)
-    strata: list[Stratum] = []
-    adjusted = shapes
-    if within:
-        own = _columns(within)
-        stratum = Stratum(
-            f"within {blocks}", shapes - _means(shapes, at)[at], inner[:, own], own, within, at, len(names), 2
-        )
-        _refuse_few(n - len(names), design, stratum.name, n, f"shapes in {len(names)} blocks", own=len(own))
-        _refuse_aliased(stratum.matrix, within, design, stratum.name)
-        # Subjects are compared as if all had the same scans: one without smiles would else seem to differ by them.
-        slopes = np.linalg.lstsq(stratum.matrix, stratum.shapes)[0]
-        same = design.with_held([one.column for one in design.variables if _varies(design.values[one.column], at)])
-        adjusted = shapes - (design.matrix - same)[:, own] @ slopes
-        strata.append(stratum)
-    if between:
-        own = _columns(between)
-        means, covariates = _means(adjusted, at), _means(design.matrix[:, own], at)
-        _refuse_few(len(names) - 1, design, f"between {blocks}", len(names), "blocks", own=len(own))
-        covariates = covariates - covariates.mean(axis=0)
-        _refuse_aliased(covariates, between, design, f"between {blocks}")
-        rows = np.zeros(len(names), dtype=np.intp)
-        first = Stratum(f"between {blocks}", means - means.mean(axis=0), covariates, own, between, rows, 1, 1)
-        strata.insert(0, first)
-    return tuple(strata)
+            every = np.random.default_rng([seed, self.number, start]).random((_BATCH, self.n_units or n))
+            keys = every[:count, own]
+            rows = np.tile(np.arange(n), (count, 1))
+            signs = None
+            if flips:
+                signs = np.where(keys < 0.5, -1.0, 1.0)
+                if start == 0:
+                    signs[0] = 1.0
+                signs = np.repeat(signs, self.width, axis=1)
+            else:
+                rows[:, places] = places[np.lexsort((keys, np.broadcast_to(groups, keys.shape)), axis=-1)]
+                if start == 0:
+                    rows[0] = np.arange(n)
+            yield start, (rows[:, :, None] * self.width + within).reshape(count, -1), signs
 
 
 def less(shapes: FloatArray, columns: FloatArray) -> FloatArray:
@@ -170,24 +185,158 @@ def less(shapes: FloatArray, columns: FloatArray) -> FloatArray:
     return shapes - q @ (q.T @ shapes)
 
 
-def _columns(terms: Sequence[Term]) -> Rows:
+def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
+    """Return the stratum of shapes (N, K) that are all exchangeable.
+
+    Raises:
+        InputError: more columns than rows, or a term that follows from the others.
+    """
+    n = len(shapes)
+    refuse_few(n - 1, design, "", n, "shapes", design.matrix.shape[1])
+    everything = design.matrix - design.matrix.mean(axis=0)
+    columns = np.arange(design.matrix.shape[1], dtype=np.intp)
+    refuse_aliased(everything, columns, design.terms, design)
+    rows = np.zeros(n, dtype=np.intp)
+    return Stratum("", shapes - shapes.mean(axis=0), everything, columns, design.terms, rows, 1, 0)
+
+
+def between_stratum(
+    shapes: FloatArray, matrix: FloatArray, conditions: FloatArray, at: Rows, design: Design,
+    terms: Sequence[Term], nuisance: Sequence[Term], blocks: str,
+) -> Stratum:  # fmt: skip
+    """Return the stratum of means of subjects.
+
+    Subjects whose scans are of other conditions than those of the rest also differ by these. The subjects' means of the
+    columns of the conditions are covariates of the same model, so that its F contains the uncertainty of their slopes.
+
+    Args:
+        shapes: (C, K) mm, of the cells of subjects.
+        matrix: (C, P) of the design.
+        conditions: (C, P) the same less those of an average condition, which are zero for terms between subjects.
+        at: (C,) subject of each cell, from 0.
+        design: of the model.
+        terms: that are the same in all cells of a subject.
+        nuisance: all other terms.
+        blocks: what a subject is called, in messages.
+
+    Raises:
+        InputError: more columns than subjects, or a term that follows from the others or from the conditions.
+    """
+    where = f"between {blocks}"
+    own = columns_of_terms(terms)
+    means, covariates = means_of(shapes, at), means_of(matrix[:, own], at)
+    covariates = covariates - covariates.mean(axis=0)
+    n = len(means)
+    refuse_few(n - 1, design, where, n, "blocks", len(own))
+    refuse_aliased(covariates, own, terms, design, where)
+    # A condition that is the same for all subjects, or follows from others, adds nothing.
+    scale = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
+    seen = means_of(conditions, at)
+    seen = (seen - seen.mean(axis=0)) / scale
+    kept: list[int] = []
+    known = np.empty((n, 0))
+    for column in columns_of_terms(nuisance):
+        rest = less(seen[:, [column]], known)[:, 0]
+        if np.linalg.norm(rest) > _ALIASED * math.sqrt(n):
+            kept.append(int(column))
+            known = np.column_stack([known, rest / np.linalg.norm(rest)])
+    if kept:
+        labels = ", ".join(term.label for term in nuisance if set(term.columns) & set(kept))
+        if n - 1 - len(own) - len(kept) < 1:
+            raise InputError(
+                f"{design.formula!r} has {len(own)} columns {where} and {len(kept)} for unequal {labels} of the {n} "
+                f"blocks, too many; leave out terms, or shapes so that each {blocks} has the same conditions."
+            )
+        for term in terms:
+            values = covariates[:, np.isin(own, term.columns)]
+            lengths = np.linalg.norm(values, axis=0)
+            if (np.linalg.norm(less(values, known), axis=0) <= _ALIASED * lengths).any():
+                raise InputError(
+                    f"In {design.formula!r} {term.label} follows from {labels} {where}: groups and conditions cannot "
+                    "be told apart; leave out one of them."
+                )
+    columns = np.array(sorted([*own, *kept]), dtype=np.intp)
+    model = seen * scale
+    model[:, own] = covariates
+    refuse_aliased(
+        model[:, columns], columns, (*_cut(nuisance, kept), *terms), design, where
+    )  # fmt: skip
+    rows = np.zeros(n, dtype=np.intp)
+    return Stratum(
+        where, means - means.mean(axis=0), model[:, columns], columns, tuple(terms), rows, 1, 1,
+        nuisance=tuple(_cut(nuisance, kept)),
+    )  # fmt: skip
+
+
+def common_stratum(
+    shapes: FloatArray, matrix: FloatArray, own_columns: FloatArray, at: Rows, design: Design,
+    terms: Sequence[Term], blocks: str,
+) -> Stratum:  # fmt: skip
+    """Return the stratum of cells within subjects, for effects that are assumed to be the same in all subjects.
+
+    Args:
+        shapes: (C, K) mm, of the cells of subjects.
+        matrix: (C, P) of the design.
+        own_columns: (C, q) columns whose slopes each subject has of its own, beside its mean.
+        at: (C,) subject of each cell, from 0.
+        design: of the model.
+        terms: of these effects.
+        blocks: what a subject is called, in messages.
+
+    Raises:
+        InputError: more columns than rows, or a term that follows from the others.
+    """
+    columns = columns_of_terms(terms)
+    values = matrix[:, columns]
+    n = len(shapes)
+    where = f"within {blocks}"
+    if not own_columns.shape[1]:
+        subjects = int(at.max()) + 1
+        refuse_few(n - subjects, design, where, n, f"shapes in {subjects} blocks", len(columns))
+        inner = values - means_of(values, at)[at]
+        refuse_aliased(inner, columns, terms, design, where)
+        return Stratum(where, shapes - means_of(shapes, at)[at], inner, columns, tuple(terms), at, subjects, 2)
+    # Residuals of each subject's own model in orthonormal coordinates, where they are uncorrelated (Huh, Jhun 2001).
+    rows, inner = list[FloatArray](), list[FloatArray]()
+    for subject in range(int(at.max()) + 1):
+        cells = np.flatnonzero(at == subject)
+        u, s, _ = np.linalg.svd(np.column_stack([np.ones(len(cells)), own_columns[cells]]))
+        free = u[:, int((s > _ALIASED * s.max()).sum()) :].T
+        rows.append(free @ shapes[cells])
+        inner.append(free @ values[cells])
+    rest, model = np.concatenate(rows), np.concatenate(inner)
+    refuse_few(len(rest), design, where, len(rest), f"differences of shapes of one {blocks}", len(columns))
+    refuse_aliased(model, columns, terms, design, where, np.abs(values).max(axis=0))
+    groups = np.zeros(len(rest), dtype=np.intp)
+    return Stratum(where, rest, model, columns, tuple(terms), groups, 0, 2, scheme="flip")
+
+
+def _cut(terms: Sequence[Term], kept: Sequence[int]) -> list[Term]:
+    """Return terms with those of their columns that are kept, if any."""
+    from dataclasses import replace
+
+    cut = [replace(term, columns=tuple(column for column in term.columns if column in kept)) for term in terms]
+    return [term for term in cut if term.columns]
+
+
+def columns_of_terms(terms: Sequence[Term]) -> Rows:
+    """Return the columns of the design that terms have, in order."""
     return np.array(sorted(column for term in terms for column in term.columns), dtype=np.intp)
 
 
-def _varies(values: Sequence[str | float], at: Rows) -> bool:
-    """Return whether a variable differs within a group."""
-    return len(set(zip(at.tolist(), values, strict=True))) > int(at.max()) + 1
-
-
-def _means(rows: FloatArray, at: Rows) -> FloatArray:
-    """Return the mean of the rows of each group."""
+def means_of(rows: FloatArray, at: Rows) -> FloatArray:
+    """Return the mean of the rows of each group, whose numbers `at` (n,) count from 0."""
     out = np.zeros((int(at.max()) + 1, rows.shape[1]))
     np.add.at(out, at, rows)
     return out / np.bincount(at)[:, None]
 
 
-def _refuse_few(free: int, design: Design, where: str, count: int, what: str, own: int | None = None) -> None:
-    columns = design.matrix.shape[1] if own is None else own
+def refuse_few(free: int, design: Design, where: str, count: int, what: str, columns: int) -> None:
+    """Check that a model leaves degrees of freedom for its error.
+
+    Raises:
+        InputError: it has as many columns as rows that are free, or more.
+    """
     if free - columns < 1:
         place = f" {where}" if where else ""
         raise InputError(
@@ -195,14 +344,29 @@ def _refuse_few(free: int, design: Design, where: str, count: int, what: str, ow
         )
 
 
-def _refuse_aliased(matrix: FloatArray, terms: Sequence[Term], design: Design, where: str = "") -> None:
-    """Check that no column follows from those before it, in the order of `terms`."""
-    own = _columns(terms)
+def refuse_aliased(
+    matrix: FloatArray, columns: Rows, terms: Sequence[Term], design: Design, where: str = "",
+    scale: FloatArray | None = None,
+) -> None:  # fmt: skip
+    """Check that no column follows from those before it, in the order of `terms`.
+
+    Args:
+        matrix: (n, p).
+        columns: (p,) of the design.
+        terms: whose columns they are.
+        design: of the model.
+        where: the stratum, in messages.
+        scale: (p,) values that count as zero if they are far below; None takes those of the columns.
+
+    Raises:
+        InputError: one does.
+    """
     known = np.empty((len(matrix), 0))
     for term in terms:
         for column in term.columns:
-            values = matrix[:, np.searchsorted(own, column)]
-            length = float(np.linalg.norm(values))
+            at = int(np.searchsorted(columns, column))
+            values = matrix[:, at]
+            length = float(np.linalg.norm(values) if scale is None else scale[at])
             rest = values - known @ (known.T @ values)
             rest -= known @ (known.T @ rest)
             if np.linalg.norm(rest) <= _ALIASED * length or length == 0:

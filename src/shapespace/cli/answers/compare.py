@@ -13,6 +13,9 @@ def add(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--formula", required=True, metavar="FORMULA",
                      help="what explains shape, such as '~ sex + age'; size and log_size are known too")  # fmt: skip
     sub.add_argument("--blocks", metavar="COLUMN", help="says whose scans are repeated ones, such as subject")
+    sub.add_argument("--random", metavar="TERMS",
+                     help="which effects within subjects differ between subjects, such as '1 + time | subject'; with "
+                     "--blocks all of them do")  # fmt: skip
     sub.add_argument("--type", choices=("I", "II", "III"), default="II", dest="squares",
                      help="of sums of squares (default II: after all terms that do not contain it)")  # fmt: skip
     sub.add_argument("--permutations", type=int, default=1000, metavar="N",
@@ -34,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = CompareOptions(
         squares=arguments.squares,
         blocks=arguments.blocks,
+        random=arguments.random,
         permutations=arguments.permutations,
         seed=arguments.seed,
         maps=not arguments.no_maps,

@@ -1,0 +1,388 @@
+"""Effects within subjects, tested on one contrast or slope per subject.
+
+A subject's scans are not independent observations of a condition: subjects respond differently, and the difference of
+two conditions is known no better than the responses of the subjects vary. So each subject's response is estimated from
+its own scans first, and the responses are the observations of the test, as in the analysis of variance of repeated
+measures with the error of subject by condition, and in the two-stage analysis of slopes (Laird and Ware, Biometrics 38,
+1982; Holmes and Friston, NeuroImage 7, 1998).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.statistics.compare_formula import Design, Term
+from shapespace.statistics.compare_strata import (
+    Rows,
+    Stratum,
+    between_stratum,
+    columns_of_terms,
+    common_stratum,
+    independent_stratum,
+    means_of,
+    refuse_aliased,
+)
+from shapespace.types import FloatArray
+
+_ESTIMABLE = 1e-6
+"""Share of a column's standard deviation below which a subject's own variation of it is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """An effect within subjects, estimated for each subject that shows it.
+
+    Args:
+        subjects: (s,) which subjects these are.
+        values: (s, d, K) mm; d orthonormal contrasts.
+        weights: (s,) roots of the weights of subjects, 1 for all where they have the same conditions.
+    """
+
+    subjects: Rows
+    values: FloatArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """The cells of subjects, and the effects that differ within subjects.
+
+    Args:
+        design: of the whole model.
+        blocks: what a subject is called, in messages.
+        effects: columns of these effects, one term each, after the constant; for the rows of the table.
+        terms: of the whole model that contain an effect, by the number of the effect among the terms of `effects`.
+        random: numbers of the effects that differ between subjects.
+        shapes: (C, K) mm, means of the shapes of each cell.
+        rows: (C,) a row of the table in each cell.
+        at: (C,) subject of each cell, from 0.
+    """
+
+    design: Design
+    blocks: str
+    effects: Design
+    terms: Mapping[int, tuple[Term, ...]]
+    random: tuple[int, ...]
+    shapes: FloatArray
+    rows: Rows
+    at: Rows
+
+    @property
+    def count(self) -> int:
+        """Number of subjects."""
+        return int(self.at.max()) + 1
+
+    def label(self, effect: int) -> str:
+        """Return an effect as it stands in the formula."""
+        return self.effects.terms[effect].label
+
+    def strata(self, squares: str) -> tuple[Stratum, ...]:
+        """Return the strata within subjects: of each effect that differs between subjects, and of all others together.
+
+        Raises:
+            InputError: an effect that too few subjects show, or terms that follow from others.
+        """
+        strata: list[Stratum] = []
+        for effect in self.random:
+            columns = self.effects.terms[effect].columns
+            others = _reduced_effects(self.effects.terms, effect, squares)
+            target = np.zeros((self.effects.matrix.shape[1], len(columns)))
+            target[list(columns), range(len(columns))] = 1.0
+            where = f"within {self.blocks}: {self.label(effect)}"
+            strata.append(self._stratum(self._responses(target, [effect, *others]), (effect,), where)[0])
+        fixed = [term for effect, own in self.terms.items() if effect not in self.random for term in own]
+        if fixed:
+            own = columns_of_terms([self.effects.terms[effect] for effect in self.random])
+            strata.append(
+                common_stratum(
+                    self.shapes, self.design.matrix[self.rows], self.effects.matrix[self.rows][:, own], self.at,
+                    self.design, [term for term in self.design.terms if term in fixed], self.blocks,
+                )
+            )  # fmt: skip
+        return tuple(strata)
+
+    def holds(self, variables: frozenset[str]) -> bool:
+        """Return whether the joint effect of variables, by their names inside, may differ between subjects."""
+        own = variables & self.variables
+        return bool(own) and any(own <= self.effects.terms[effect].variables for effect in self.random)
+
+    @property
+    def variables(self) -> frozenset[str]:
+        """Names inside of the variables that differ within subjects."""
+        return frozenset(name for term in self.effects.terms for name in term.variables)
+
+    def notes(self) -> list[str]:
+        """Return how the effects within subjects are tested, a sentence each."""
+        out: list[str] = []
+        if self.random:
+            labels = ", ".join(self.label(effect) for effect in self.random)
+            out.append(
+                f"Each {self.blocks} may respond differently to {labels}: each of these effects is tested on one "
+                f"estimate per {self.blocks}; the signs of the estimates are flipped, or the estimates are permuted "
+                f"between {self.blocks}s."
+            )
+        return out
+
+    def warnings(self, strata: Sequence[Stratum]) -> list[str]:
+        """Return what makes the tests within subjects less than they look, a sentence each."""
+        out: list[str] = []
+        fixed = [self.label(effect) for effect in self.terms if effect not in self.random]
+        if fixed:
+            out.append(
+                f"All {self.blocks}s are assumed to respond alike to {', '.join(fixed)}; where they do not, p within "
+                f"{self.blocks}s is too small. Without --random each {self.blocks} has a response of its own."
+            )
+        for stratum in strata:
+            if stratum.scheme == "subjects" and len(stratum.groups) < self.count:
+                label = stratum.name.removeprefix(f"within {self.blocks}: ")
+                out.append(
+                    f"{self.count - len(stratum.groups)} of {self.count} {self.blocks}s lack conditions from which "
+                    f"{label} can be estimated, and are left out of its test."
+                )
+        return out
+
+    def contrast_stratum(self, contrast: FloatArray, variables: frozenset[str], name: str) -> tuple[Stratum, Design]:
+        """Return the stratum of one contrast of the conditions within subjects, and its columns between subjects.
+
+        Args:
+            contrast: (D,) of the columns of `effects`.
+            variables: names inside of the variables within subjects of which it is.
+            name: of what it is, in messages.
+
+        Raises:
+            InputError: too few subjects show it.
+        """
+        every = range(1, len(self.effects.terms))
+        chosen = tuple(effect for effect in every if variables <= self.effects.terms[effect].variables)
+        responses = self._responses(contrast[:, None], list(every), in_mm=True)
+        return self._stratum(responses, chosen, f"within {self.blocks}: {name}")
+
+    def _stratum(self, responses: Responses, effects: Sequence[int], where: str) -> tuple[Stratum, Design]:
+        """Return the stratum of responses to some effects, and its columns between subjects."""
+        s, d = len(responses.subjects), int(responses.values.shape[1])
+        label = where.removeprefix(f"within {self.blocks}: ")
+        if not s:
+            raise InputError(
+                f"In {self.design.formula!r} no {self.blocks} has shapes in all conditions that {label} needs; leave "
+                "it out, or classes that few have."
+            )
+        terms, between = self._between(effects)
+        first = np.array([np.flatnonzero(self.at == one)[0] for one in responses.subjects])
+        matrix = between.matrix[self.rows[first]]
+        if s - matrix.shape[1] < 1:
+            raise InputError(
+                f"In {self.design.formula!r} only {s} of {self.count} blocks have shapes in the conditions that "
+                f"{label} needs, too few for {matrix.shape[1]} columns between them; leave it out, or classes that few "
+                "have."
+            )
+        columns = np.arange(matrix.shape[1], dtype=np.intp)
+        refuse_aliased(matrix, columns, terms, self.design, where)
+        weighted = responses.weights[:, None] * matrix
+        whole: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
+        constant = np.zeros((s, d))
+        constant[:, 0] = responses.weights
+        stratum = Stratum(
+            where, (responses.weights[:, None, None] * responses.values).reshape(s * d, -1), whole,
+            np.repeat(columns, d), terms, np.zeros(s, dtype=np.intp), 0, 2, scheme="subjects", width=d,
+            units=responses.subjects, n_units=self.count, constant=constant.ravel(),
+        )  # fmt: skip
+        return stratum, between
+
+    def _between(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
+        """Return the terms that contain some effects, and the design of their parts between subjects."""
+        chosen = [term for effect in effects for term in self.terms[effect]]
+        chosen.sort(key=self.design.terms.index)
+        inside = {factor for term in self.effects.terms for factor in term.factors}
+        parts = list(dict.fromkeys(term.factors - inside for term in chosen))
+        parts.sort(key=len)
+        made = self.design.part(parts)
+        # Terms of several effects with the same part between subjects share its columns.
+        terms = [replace(term, columns=made.terms[parts.index(term.factors - inside)].columns) for term in chosen]
+        return tuple({term.columns: term for term in terms}.values()), made
+
+    def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> Responses:
+        """Return contrasts `target` (D, d) of the columns of the effects, each subject's in its model of some effects.
+
+        They are in the metric in which squares are those of the cells of the average subject, or as they are (`in_mm`).
+        """
+        columns = columns_of_terms([self.effects.terms[effect] for effect in sorted(model)])
+        values = self.effects.matrix[self.rows][:, columns]
+        scale = values.std(axis=0)
+        values = values / scale
+        wanted = target[columns] / scale[:, None]
+        chosen, estimates, covariances = list[int](), list[FloatArray](), list[FloatArray]()
+        for subject in range(self.count):
+            cells = np.flatnonzero(self.at == subject)
+            weights, covariance = _estimate(values[cells] - values[cells].mean(axis=0), wanted)
+            if weights is None or covariance is None:
+                continue
+            chosen.append(subject)
+            estimates.append(weights @ self.shapes[cells])
+            covariances.append(covariance)
+        if not chosen:
+            return Responses(np.zeros(0, dtype=np.intp), np.zeros((0, target.shape[1], 0)), np.zeros(0))
+        information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
+        metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
+        own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
+        weight = 2.0 / (1.0 + own / np.median(own))
+        shown = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
+        return Responses(np.array(chosen, dtype=np.intp), shown, np.sqrt(weight))
+
+
+def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return the weights (d, c) of centred cells (c, D) that estimate contrasts (D, d), and their products (d, d).
+
+    None where the cells do not determine all of the contrasts.
+    """
+    u, s, vt = np.linalg.svd(values, full_matrices=False)
+    seen = s > _ESTIMABLE * np.sqrt(len(values))
+    u, s, vt = u[:, seen], s[seen], vt[seen]
+    inside = vt @ wanted
+    if np.linalg.norm(wanted - vt.T @ inside) > _ESTIMABLE * np.linalg.norm(wanted):
+        return None, None
+    weights = (inside / s[:, None]).T @ u.T
+    return weights, weights @ weights.T
+
+
+def _reduced_effects(effects: Sequence[Term], effect: int, squares: str) -> list[int]:
+    """Return the effects beside which one is estimated, for a type of sums of squares."""
+    others = range(1, effect) if squares == "I" else [one for one in range(1, len(effects)) if one != effect]
+    return [one for one in others if squares != "II" or not effects[effect].factors < effects[one].factors]
+
+
+@dataclass(frozen=True, eq=False)
+class Strata:
+    """The strata of a model.
+
+    Args:
+        every: with the terms that are tested in each.
+        within: the effects within subjects; None where there are none.
+        notes: what was done, a sentence each.
+        warnings: what makes the tests less than they look, a sentence each.
+    """
+
+    every: tuple[Stratum, ...]
+    within: Within | None = None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def strata_of(
+    shapes: FloatArray, design: Design, subjects: Sequence[str] | None, blocks: str, squares: str = "II",
+    random: Sequence[frozenset[str]] | None = None,
+) -> Strata:  # fmt: skip
+    """Return the strata of a linear model of shapes.
+
+    Args:
+        shapes: (N, K) mm.
+        design: of N rows.
+        subjects: N, whose scans the rows are; None where all rows are exchangeable.
+        blocks: what a subject is called, in messages.
+        squares: type of sums of squares.
+        random: effects within subjects that differ between subjects, as products of factors; None for all.
+
+    Raises:
+        InputError: one subject, more columns than rows, a term that follows from the others, an effect that too few
+            subjects show, or random effects that are none of the model.
+    """
+    if subjects is None:
+        return Strata((independent_stratum(shapes, design),))
+    n = len(shapes)
+    refuse_aliased(
+        design.matrix - design.matrix.mean(axis=0), np.arange(design.matrix.shape[1], dtype=np.intp), design.terms,
+        design,
+    )  # fmt: skip
+    names, who = np.unique(np.asarray(subjects), return_inverse=True)
+    if len(names) == 1:
+        raise InputError(f"All {n} shapes are of one {blocks}, {names[0]}; a comparison needs several.")
+    varying = {one.column for one in design.variables if _varies(design.values[one.column], who)}
+    rows, cell = _cells(design, who, varying)
+    at = who[rows]
+    means = means_of(shapes, cell)
+    inner = [term for term in design.terms if term.variables & varying]
+    outer = [term for term in design.terms if not term.variables & varying]
+    strata: list[Stratum] = []
+    within = None
+    if inner:
+        within = _within(design, inner, varying, blocks, random, means, rows, at)
+        strata += within.strata(squares)
+    elif random:
+        raise _no_effect(random[0], design)
+    if outer:
+        own = np.array([term in inner for term in design.terms for _ in term.columns])
+        conditions = np.where(own, design.matrix - design.with_held(varying), 0.0) if inner else 0.0 * design.matrix
+        strata.insert(
+            0, between_stratum(means, design.matrix[rows], conditions[rows], at, design, outer, inner, blocks)
+        )
+    notes, warnings = list[str](), list[str]()
+    if len(rows) < n:
+        notes.append(
+            f"{n} shapes are averaged to {len(rows)} cells of one {blocks} and condition; repeated shapes of a cell do "
+            "not count as further observations."
+        )
+    if within is not None:
+        notes += within.notes()
+        warnings += within.warnings(strata)
+    if outer and strata[0].nuisance:
+        labels = ", ".join(term.label for term in strata[0].nuisance)
+        notes.append(
+            f"The shapes of each {blocks} are not of the same conditions: the means of {labels} per {blocks} are "
+            f"covariates of the model between {blocks}s, so that its F contains the uncertainty of this adjustment."
+        )
+    return Strata(tuple(strata), within, tuple(notes), tuple(warnings))
+
+
+def _within(
+    design: Design, inner: Sequence[Term], varying: set[str], blocks: str, random: Sequence[frozenset[str]] | None,
+    shapes: FloatArray, rows: Rows, at: Rows,
+) -> Within:  # fmt: skip
+    factors = {name for name, variable in design.factors.items() if variable in varying}
+    effects = list(dict.fromkeys(term.factors & factors for term in inner))
+    # Subjects of different classes may differ in their mean, which belongs between them.
+    for term in inner:
+        between = term.factors - factors
+        if between and not any(other.factors == between for other in design.terms):
+            raise InputError(
+                f"In {design.formula!r} {term.label} contains {':'.join(sorted(between))}, which is not a term of its "
+                "own; add it to the formula."
+            )
+    chosen = list(range(1, len(effects) + 1))
+    if random is not None:
+        for one in random:
+            if one not in effects:
+                raise _no_effect(one, design)
+        chosen = [1 + effects.index(one) for one in effects if one in random]
+    terms = {
+        number: tuple(term for term in inner if term.factors & factors == effect)
+        for number, effect in enumerate(effects, 1)
+    }
+    return Within(design, blocks, design.part([frozenset(), *effects]), terms, tuple(chosen), shapes, rows, at)
+
+
+def _no_effect(effect: frozenset[str], design: Design) -> InputError:
+    return InputError(
+        f"The random term {':'.join(sorted(effect))} is no effect within subjects of {design.formula!r}; write terms "
+        "of the formula that differ within subjects."
+    )
+
+
+def _cells(design: Design, who: Rows, varying: set[str]) -> tuple[Rows, Rows]:
+    """Return a row of each cell, in the order of the table, and the (N,) cell of each row."""
+    values = [design.values[name] for name in sorted(varying)]
+    numbers: dict[tuple[object, ...], int] = {}
+    rows, cell = list[int](), list[int]()
+    for row, key in enumerate(zip(who.tolist(), *values, strict=True)):
+        if key not in numbers:
+            numbers[key] = len(numbers)
+            rows.append(row)
+        cell.append(numbers[key])
+    return np.array(rows, dtype=np.intp), np.array(cell, dtype=np.intp)
+
+
+def _varies(values: Sequence[str | float], at: Rows) -> bool:
+    """Return whether a variable differs within a group."""
+    return len(set(zip(at.tolist(), values, strict=True))) > int(at.max()) + 1
