@@ -24,6 +24,8 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.compare import Comparison, Effect
+from shapespace.statistics.compare_maps import EffectMap, Tested
+from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHOWN_SHARE = 0.05
@@ -37,11 +39,12 @@ _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 def answer_of_comparison(comparison: Comparison) -> Answer:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects = comparison.effects
-    parts = [
+    parts: list[Part] = [
         *_of_terms(comparison),
         *_of_pairs(comparison),
         *_of_angles(comparison),
         *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
+        *methods_parts(comparison.methods),
     ]
     fitted = comparison.cohort.fitted
     return Answer(
@@ -62,11 +65,14 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
             "seed": comparison.options.seed,
             "bump_width_mm": comparison.options.bump_width_mm,
             "level": comparison.options.level,
+            "unequal_variances": comparison.options.unequal_variances,
+            "effect_size": comparison.options.effect_size,
             "gauge": comparison.cohort.gauge,
             "shapes": len(comparison.cohort),
             "subjects": comparison.subjects,
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        methods=comparison.methods,
     )
 
 
@@ -80,29 +86,72 @@ def _summary(comparison: Comparison) -> Iterator[str]:
         else:
             yield f"No difference of shape with {test.term}{where} is found ({told})."
     for effect in comparison.effects:
-        if effect.map is None:
-            continue
-        held = f"(family-wise {100 * level:g} %)"
-        found = effect.map.shown.p_family <= level
-        if found.any():
-            mm = np.where(found, effect.map.shown_mm, 0.0)
-            at = int(np.abs(mm).argmax())
-            yield (
-                f"{effect.label}: {100 * found.mean():.1f} % of the vertices differ {held}, by up to {mm[at]:+.2f} mm"
-                f"{_near(comparison.cohort, at)}."
-            )
-        else:
-            yield f"{effect.label}: no vertex is found to differ {held}."
-        if effect.map.bump is not None and effect.map.bump_mm is not None:
-            at = int(effect.map.bump.f.argmax())
-            if effect.map.bump.p_family[at] <= level:
-                mm = effect.map.bump_mm[at]
-                yield f"{effect.label}: a bump of {mm:+.2f} mm or more is found{_near(comparison.cohort, at)} {held}."
-            else:
-                yield f"{effect.label}: no bump is found beside how shapes vary {held}."
+        if effect.map is not None:
+            yield _of_map(comparison, effect, effect.map)
+            if effect.map.bump is not None and effect.map.bump_mm is not None:
+                yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
     yield from comparison.warnings
     of = f" of {comparison.subjects} subjects" if comparison.subjects < shapes else ""
     yield f"{shapes} shapes{of}, {comparison.options.permutations} arrangements, the observed one among them."
+    yield multiplicity_sentence(comparison.methods)
+
+
+_EXPLORATORY = "exploratory, since its term is not significant: "
+
+
+def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
+    """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
+    level = comparison.options.level
+    held = f"family-wise error {100 * level:g} % within this map"
+    found = shown.shown.p_family <= level
+    if not found.any():
+        return f"{effect.label}: no vertex differs ({held})."
+    return (
+        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * found.mean():.1f} % of the vertices "
+        f"differ ({held}), the clearest by {_clearest(comparison, shown)}."
+    )
+
+
+def _clearest(comparison: Comparison, shown: EffectMap) -> str:
+    """Return the change at the vertex with the largest F, with its simultaneous interval."""
+    unit, at = _unit(comparison), int(shown.shown.f.argmax())
+    low, high = shown.interval_mm(at)
+    sign = "+" if shown.normal_mm is not None else ""
+    digits = _digits(comparison)
+    number = f"{{:{sign}.{digits}f}}"
+    return (
+        f"{number.format(shown.shown_mm[at])}{unit} (simultaneous {100 * (1 - comparison.options.level):g} % interval "
+        f"{number.format(low)} to {number.format(high)}{unit}){_near(comparison.cohort, at)}"
+    )
+
+
+def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: FloatArray) -> str:
+    level, at = comparison.options.level, int(bump.f.argmax())
+    held = f"family-wise error {100 * level:g} % within this map"
+    if bump.p_family[at] > level:
+        return f"{effect.label}: no bump is found beyond the variation between shapes ({held})."
+    return (
+        f"{effect.label}: a bump of {bump_mm[at]:+.{_digits(comparison)}f}{_unit(comparison)} or more is found"
+        f"{_near(comparison.cohort, at)} ({held})."
+    )
+
+
+def _unit(comparison: Comparison) -> str:
+    """Return the unit of lengths with a space before it; nothing for coordinates without a unit."""
+    return f" {comparison.cohort.unit}" if comparison.cohort.unit else ""
+
+
+def _digits(comparison: Comparison) -> int:
+    """Return how many decimals lengths have; those without a unit are shares of the size."""
+    return 2 if comparison.cohort.unit else 4
+
+
+def _squared(comparison: Comparison, what: str) -> str:
+    return f"{what}, mm²" if comparison.cohort.unit else what
+
+
+def _length(comparison: Comparison, name: str) -> TableColumn:
+    return _column(name, "mm" if comparison.cohort.unit else "number")
 
 
 def _p(p: float) -> str:
@@ -132,16 +181,17 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         rows.append(("residual", left.stratum, left.df, left.squares, left.squares / left.df, share, *[None] * 3))
         rows.append(("total", left.stratum, left.df_total, left.squares_total, None, None, *[None] * 3))
     columns = (
-        _column("term"), _column("tested"), _column("df", "count"), _column("sum of squares, mm²", "number"),
-        _column("mean square, mm²", "number"), _column("R²", "percent"), _column("F", "number"),
+        _column("term"), _column("tested"), _column("df", "count"),
+        _column(_squared(comparison, "sum of squares"), "number"),
+        _column(_squared(comparison, "mean square"), "number"), _column("R²", "percent"), _column("F", "number"),
         _column("Z", "number"), _column("p", "p"),
     )  # fmt: skip
     if not strata:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
     note = (
-        f"Type {comparison.options.squares} sums of squares of Procrustes distances, by permutation of residuals. Z is "
-        "by how many standard deviations log F lies above those of the arrangements."
+        f"Type {comparison.options.squares} sums of squares of Procrustes distances. {_of_f(comparison)} "
+        f"{effect_size_sentence(comparison.options.effect_size)} R² is the share of the total of its stratum."
     )
     yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
     for test in comparison.tests:
@@ -165,7 +215,8 @@ def _of_pairs(comparison: Comparison) -> Iterator[Part]:
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
         columns=(
-            _column("variable"), _column("from, to"), _column("Procrustes distance", "mm"), _column("RMS", "mm"),
+            _column("variable"), _column("from, to"), _length(comparison, "Procrustes distance"),
+            _length(comparison, "RMS"),
             _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
         ),
         rows=rows,
@@ -187,9 +238,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     yield TextPart(
         title=effect.label,
         level=2,
-        text=f"The largest change is {_largest(comparison, effect)}."
-        if effect.map is not None
-        else f"The change is {effect.rms_mm:.2f} mm (RMS over vertices).",
+        text=_of_size(comparison, effect),
     )
     if effect.map is not None:
         kept = _arrays(comparison, effect)
@@ -201,7 +250,13 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
         ):
             if values in kept:
                 yield SurfaceMapPart(
-                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=_PALE
+                    title=title,
+                    arrays=file,
+                    values=values,
+                    mask=mask,
+                    signed=values != "length_mm",
+                    unit=comparison.cohort.unit or "units of the coordinates",
+                    note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {_PALE}" if effect.exploratory else _PALE,
                 )
     if comparison.cohort.faces is not None:
         times = _times(comparison, effect)
@@ -216,12 +271,23 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     yield from _of_scores(comparison, effect)
 
 
-def _largest(comparison: Comparison, effect: Effect) -> str:
-    assert effect.map is not None
-    mm = effect.map.shown_mm
-    at = int(np.abs(mm).argmax())
-    way = "" if effect.map.normal_mm is None else ", outwards" if mm[at] > 0 else ", inwards"
-    return f"{abs(mm[at]):.2f} mm{way}{_near(comparison.cohort, at)}"
+def _of_size(comparison: Comparison, effect: Effect) -> str:
+    """Return how large a change is: over all vertices, and where it is clearest."""
+    whole = f"The change is {effect.rms_mm:.{_digits(comparison)}f}{_unit(comparison)} (RMS over vertices)."
+    if effect.map is None:
+        return whole
+    way = "" if effect.map.normal_mm is None else ", outwards positive"
+    label = " The map is exploratory, since no term of this effect is significant." if effect.exploratory else ""
+    return f"{whole} It is clearest by {_clearest(comparison, effect.map)}{way}.{label}"
+
+
+def _of_f(comparison: Comparison) -> str:
+    if comparison.options.unequal_variances:
+        return (
+            "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
+            "squared Welch t), compared with sign flips of residuals."
+        )
+    return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
 
 
 def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
@@ -238,7 +304,7 @@ def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
         title=f"Regression score of {one.name}",
         note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
         x=one.name,
-        y="score, mm",
+        y=f"score, {comparison.cohort.unit}" if comparison.cohort.unit else "score",
         series=(
             Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
             Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
@@ -297,10 +363,23 @@ def _tables(comparison: Comparison) -> Mapping[str, Rows]:
         share = left.squares / left.squares_total
         terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
         terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
+    mm = "_mm" if comparison.cohort.unit else ""
     tables: dict[str, Rows] = {
-        "terms.csv": (("term", "stratum", "df", "squares_mm2", "r2", "f", "z", "p"), terms),
+        "terms.csv": (("term", "stratum", "df", "squares_mm2" if mm else "squares", "r2", "f", "z", "p"), terms),
         "effects.csv": (
-            ("number", "variable", "from", "to", "stratum", "distance_mm", "rms_mm", "f", "z", "p", "p_of_all_pairs"),
+            (
+                "number",
+                "variable",
+                "from",
+                "to",
+                "stratum",
+                f"distance{mm}",
+                f"rms{mm}",
+                "f",
+                "z",
+                "p",
+                "p_of_all_pairs",
+            ),
             [
                 (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
                 for at, e in enumerate(comparison.effects, 1)
