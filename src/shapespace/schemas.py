@@ -803,7 +803,7 @@ class TestScheme(Struct, frozen=True, kw_only=True):
         tested: terms, or other quantities.
         stratum: in which they are tested; empty where there is one.
         statistic: such as `F`, `Welch t` or `R2`; empty for p values of a distribution.
-        resampling: permutations of rows, sign flips of rows, bootstrap draws, or none.
+        resampling: permutations of rows, sign flips of rows, bootstrap draws, leaving out each unit, or none.
         unit: what is permuted or flipped, such as `subject`.
         reduced_model: terms of the model whose residuals are resampled; empty for the mean; None where values
             themselves are.
@@ -817,7 +817,7 @@ class TestScheme(Struct, frozen=True, kw_only=True):
     tested: tuple[str, ...]
     statistic: str = "F"
     stratum: str = ""
-    resampling: Literal["permutation", "sign flips", "bootstrap", "none"] = "permutation"
+    resampling: Literal["permutation", "sign flips", "bootstrap", "leave-one-out", "none"] = "permutation"
     unit: str = "subject"
     reduced_model: tuple[str, ...] | None = ()
     arrangements: int = 0

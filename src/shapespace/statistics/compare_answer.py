@@ -22,7 +22,7 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.compare import Comparison, Effect
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
@@ -114,14 +114,12 @@ def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
 
 def _clearest(comparison: Comparison, shown: EffectMap) -> str:
     """Return the change at the vertex with the largest F, with its simultaneous interval."""
-    unit, at = _unit(comparison), int(shown.shown.f.argmax())
+    lengths, at = _lengths(comparison), int(shown.shown.f.argmax())
     low, high = shown.interval_mm(at)
-    sign = "+" if shown.normal_mm is not None else ""
-    digits = _digits(comparison)
-    number = f"{{:{sign}.{digits}f}}"
+    sign = "" if shown.normal_mm is None else "+"
     return (
-        f"{number.format(shown.shown_mm[at])}{unit} (simultaneous {100 * (1 - comparison.options.level):g} % interval "
-        f"{number.format(low)} to {number.format(high)}{unit}){_near(comparison.cohort, at)}"
+        f"{lengths.text(shown.shown_mm[at], sign)} (simultaneous {100 * (1 - comparison.options.level):g} % interval "
+        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near(comparison.cohort, at)}"
     )
 
 
@@ -131,27 +129,13 @@ def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: Flo
     if bump.p_family[at] > level:
         return f"{effect.label}: no bump is found beyond the variation between shapes ({held})."
     return (
-        f"{effect.label}: a bump of {bump_mm[at]:+.{_digits(comparison)}f}{_unit(comparison)} or more is found"
+        f"{effect.label}: a bump of {_lengths(comparison).text(bump_mm[at], '+')} or more is found"
         f"{_near(comparison.cohort, at)} ({held})."
     )
 
 
-def _unit(comparison: Comparison) -> str:
-    """Return the unit of lengths with a space before it; nothing for coordinates without a unit."""
-    return f" {comparison.cohort.unit}" if comparison.cohort.unit else ""
-
-
-def _digits(comparison: Comparison) -> int:
-    """Return how many decimals lengths have; those without a unit are shares of the size."""
-    return 2 if comparison.cohort.unit else 4
-
-
-def _squared(comparison: Comparison, what: str) -> str:
-    return f"{what}, mm²" if comparison.cohort.unit else what
-
-
-def _length(comparison: Comparison, name: str) -> TableColumn:
-    return _column(name, "mm" if comparison.cohort.unit else "number")
+def _lengths(comparison: Comparison) -> Lengths:
+    return Lengths(comparison.cohort.unit)
 
 
 def _p(p: float) -> str:
@@ -172,7 +156,7 @@ def _column(name: str, kind: Any = "text") -> TableColumn:
 
 
 def _of_terms(comparison: Comparison) -> Iterator[Part]:
-    strata = any(test.stratum for test in comparison.tests)
+    strata, lengths = any(test.stratum for test in comparison.tests), _lengths(comparison)
     rows: list[tuple[Any, ...]] = []
     for left in comparison.remainders:
         own = [test for test in comparison.tests if test.stratum == left.stratum]
@@ -182,8 +166,8 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         rows.append(("total", left.stratum, left.df_total, left.squares_total, None, None, *[None] * 3))
     columns = (
         _column("term"), _column("tested"), _column("df", "count"),
-        _column(_squared(comparison, "sum of squares"), "number"),
-        _column(_squared(comparison, "mean square"), "number"), _column("R²", "percent"), _column("F", "number"),
+        _column(lengths.label("sum of squares", "²"), "number"),
+        _column(lengths.label("mean square", "²"), "number"), _column("R²", "percent"), _column("F", "number"),
         _column("Z", "number"), _column("p", "p"),
     )  # fmt: skip
     if not strata:
@@ -215,8 +199,8 @@ def _of_pairs(comparison: Comparison) -> Iterator[Part]:
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
         columns=(
-            _column("variable"), _column("from, to"), _length(comparison, "Procrustes distance"),
-            _length(comparison, "RMS"),
+            _column("variable"), _column("from, to"), _lengths(comparison).column("Procrustes distance"),
+            _lengths(comparison).column("RMS"),
             _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
         ),
         rows=rows,
@@ -255,7 +239,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
                     values=values,
                     mask=mask,
                     signed=values != "length_mm",
-                    unit=comparison.cohort.unit or "units of the coordinates",
+                    unit=_lengths(comparison).of_map,
                     note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {_PALE}" if effect.exploratory else _PALE,
                 )
     if comparison.cohort.faces is not None:
@@ -273,7 +257,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
 
 def _of_size(comparison: Comparison, effect: Effect) -> str:
     """Return how large a change is: over all vertices, and where it is clearest."""
-    whole = f"The change is {effect.rms_mm:.{_digits(comparison)}f}{_unit(comparison)} (RMS over vertices)."
+    whole = f"The change is {_lengths(comparison).text(effect.rms_mm)} (RMS over vertices)."
     if effect.map is None:
         return whole
     way = "" if effect.map.normal_mm is None else ", outwards positive"
@@ -304,7 +288,7 @@ def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
         title=f"Regression score of {one.name}",
         note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
         x=one.name,
-        y=f"score, {comparison.cohort.unit}" if comparison.cohort.unit else "score",
+        y=_lengths(comparison).label("score"),
         series=(
             Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
             Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
@@ -363,9 +347,9 @@ def _tables(comparison: Comparison) -> Mapping[str, Rows]:
         share = left.squares / left.squares_total
         terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
         terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
-    mm = "_mm" if comparison.cohort.unit else ""
+    field = _lengths(comparison).field
     tables: dict[str, Rows] = {
-        "terms.csv": (("term", "stratum", "df", "squares_mm2" if mm else "squares", "r2", "f", "z", "p"), terms),
+        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p"), terms),
         "effects.csv": (
             (
                 "number",
@@ -373,8 +357,8 @@ def _tables(comparison: Comparison) -> Mapping[str, Rows]:
                 "from",
                 "to",
                 "stratum",
-                f"distance{mm}",
-                f"rms{mm}",
+                field("distance"),
+                field("rms"),
                 "f",
                 "z",
                 "p",

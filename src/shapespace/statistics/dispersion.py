@@ -113,10 +113,9 @@ def dispersion_test(
     squares = (residual[rows] ** 2).sum(axis=1) / (1.0 - leverage[rows])
     variances = np.bincount(own, weights=squares) / np.bincount(own)
     distances = np.sqrt(squares)
-    rng = np.random.default_rng([seed, 3])
-    f = np.array([_f_of_means(distances, own)] + [
-        _f_of_means(distances[rng.permutation(len(distances))], own) for _ in range(permutations - 1)
-    ])  # fmt: skip
+    f = np.concatenate(
+        [_f_of_means(distances[rows], own) for rows in _permutations(len(distances), permutations, seed)]
+    )
     return DispersionTest(
         variable, stratum, tuple(groups[k] for k in used), tuple(int(counts[k]) for k in used),
         tuple(float(v) for v in np.sqrt(variances / n_vertices)), float(f[0]),
@@ -124,12 +123,24 @@ def dispersion_test(
     )  # fmt: skip
 
 
-def _f_of_means(values: FloatArray, codes: Codes) -> float:
+def _permutations(n: int, permutations: int, seed: int) -> Iterator[Codes]:
+    """Yield orders (b, n) of n values; the first is as observed."""
+    for start in range(0, permutations, _BATCH):
+        rows = np.argsort(np.random.default_rng([seed, 3, start]).random((_BATCH, n)), axis=1)
+        if start == 0:
+            rows[0] = np.arange(n)
+        yield rows[: permutations - start]
+
+
+def _f_of_means(values: FloatArray, codes: Codes) -> FloatArray:
+    """Return F (b,) of the means of groups, of b arrangements of values (b, n)."""
     counts = np.bincount(codes)
-    means = np.bincount(codes, weights=values) / counts
-    between = float((counts * (means - values.mean()) ** 2).sum()) / (len(counts) - 1)
-    within = float(((values - means[codes]) ** 2).sum()) / max(len(values) - len(counts), 1)
-    return between / max(within, 1e-300)
+    sums = values @ np.eye(len(counts))[codes]
+    total = values.sum(axis=1) ** 2 / len(codes)
+    explained = (sums**2 / counts).sum(axis=1)
+    between = (explained - total) / (len(counts) - 1)
+    within = ((values**2).sum(axis=1) - explained) / max(len(codes) - len(counts), 1)
+    return between / np.maximum(within, 1e-300)
 
 
 @dataclass(frozen=True, eq=False)

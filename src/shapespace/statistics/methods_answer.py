@@ -43,10 +43,10 @@ def _parts(methods: Methods) -> Iterator[Part]:
                 TableColumn(name="p by"), TableColumn(name="arrangements", kind="count"),
             ),
             rows=tuple(
-                (", ".join(one.tested), one.stratum or "all", one.statistic, scheme_text(one), one.arrangements)
+                (", ".join(one.tested), one.stratum or "all", one.statistic, scheme_text(one), one.arrangements or None)
                 for one in methods.tests
             ),
-            note="The observed data are one of the arrangements.",
+            note="The observed data are one of the arrangements of a permutation or of sign flips.",
         )  # fmt: skip
     if methods.dispersions:
         unit = f", {methods.unit}" if methods.unit else ""
@@ -127,6 +127,8 @@ def scheme_text(test: TestScheme) -> str:
         return "distribution"
     if test.resampling == "bootstrap":
         return f"bootstrap of {test.unit}s"
+    if test.resampling == "leave-one-out":
+        return f"leaving out each {test.unit} of the reference"
     every = ", all of them" if test.exhaustive else ""
     what = (
         "values"
