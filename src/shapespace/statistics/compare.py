@@ -288,7 +288,13 @@ def compare(
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
     owners = subjects if repeated else None
-    tests = tuple(test for stratum in strata for test in _tests(stratum, design, owners, options, step))
+    tests = tuple(
+        test
+        for stratum in strata
+        for test in term_tests(
+            stratum, options, step, units_of(stratum, design, owners) if options.unequal_variances else None
+        )
+    )
     effects = tuple(
         replace(effect, exploratory=_is_exploratory(effect, design, tests, options))
         for family in families
@@ -405,23 +411,31 @@ def _is_exploratory(effect: Effect, design: Design, tests: Sequence[TermTest], o
     return not any(test.term in own and test.p <= options.level for test in tests)
 
 
-def _tests(
+def term_tests(
     stratum: Stratum,
-    design: Design,
-    subjects: Sequence[str] | None,
     options: CompareOptions,
-    step: Callable[[], None],
+    step: Callable[[], None] = lambda: None,
+    units: Units | None = None,
 ) -> Iterator[TermTest]:
+    """Yield the tests of the terms of a stratum.
+
+    Args:
+        stratum: the stratum.
+        options: of the comparison.
+        step: called after each term.
+        units: of the stratum, to test with unequal variances; None assumes equal ones.
+
+    Raises:
+        InputError: unequal variances, and a unit that the model fits exactly.
+    """
     total = float((stratum.shapes**2).sum())
-    units = units_of(stratum, design, subjects) if options.unequal_variances else None
     for term in stratum.terms:
         reduced = stratum.reduced(term, options.squares)
         residual = stratum.residual(reduced)
         own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        products = stratum.products(
-            np.hstack([own, rest]), residual, options.permutations, options.seed, flips=stratum.flips(reduced)
-        )
+        count = options.permutations if units is None else 1
+        products = stratum.products(np.hstack([own, rest]), residual, count, options.seed, flips=stratum.flips(reduced))
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -105,6 +105,9 @@ class Design:
     _codes: Mapping[str, str] = field(repr=False)
     _spec: Any = field(repr=False)
     _skipped: int = field(default=1, repr=False)
+    _parts: dict[tuple[frozenset[str], ...], Design] = field(
+        default_factory=lambda: dict[tuple[frozenset[str], ...], "Design"](), repr=False
+    )
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
         """Return the (n, p) columns where each variable, by its name inside, has these n values."""
@@ -117,6 +120,9 @@ class Design:
         Args:
             products: factors of each, as in `Term.factors`; the empty product is the constant and comes first.
         """
+        key = tuple(products)
+        if key in self._parts:
+            return self._parts[key]
         formulaic = other_package("formulaic", "A formula", INSTALL)
         ordered = [[factor for factor in self.factors if factor in product] for product in products]
         written = [":".join(self._codes[factor] for factor in product) or "1" for product in ordered]
@@ -131,20 +137,9 @@ class Design:
             for product, own in zip(ordered, slices, strict=True)
         )
         matrix = read_only(np.asarray(made, dtype=np.float64))
-        return replace(self, matrix=matrix, terms=terms, _spec=spec, _skipped=0)
-
-    def with_held(self, held: Collection[str]) -> FloatArray:
-        """Return `matrix` as it were if some variables, by their names inside, were the same in all rows.
-
-        Numbers are held at their mean, of classes it is the average.
-        """
-        own = [one for one in self.variables if one.column in held]
-        cells = _cells([one.levels or (one.middle,) for one in own], self.formula)
-        total = np.zeros(self.matrix.shape)
-        for cell in cells:
-            same = {one.column: [value] * len(total) for one, value in zip(own, cell, strict=True)}
-            total += self.rows({**self.values, **same})
-        return total / len(cells)
+        made = replace(self, matrix=matrix, terms=terms, _spec=spec, _skipped=0, _parts={})
+        self._parts[key] = made
+        return made
 
     def _frame(self, values: Mapping[str, Sequence[str | float]]) -> Any:
         pandas = other_package("pandas", "A formula", INSTALL)

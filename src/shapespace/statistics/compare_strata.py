@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -201,8 +201,8 @@ def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
 
 
 def between_stratum(
-    shapes: FloatArray, matrix: FloatArray, conditions: FloatArray, at: Rows, design: Design,
-    terms: Sequence[Term], nuisance: Sequence[Term], blocks: str,
+    means: FloatArray, matrix: FloatArray, conditions: Sequence[tuple[Term, FloatArray]], design: Design,
+    terms: Sequence[Term], blocks: str,
 ) -> Stratum:  # fmt: skip
     """Return the stratum of means of subjects.
 
@@ -210,13 +210,11 @@ def between_stratum(
     columns of the conditions are covariates of the same model, so that its F contains the uncertainty of their slopes.
 
     Args:
-        shapes: (C, K) mm, of the cells of subjects.
-        matrix: (C, P) of the design.
-        conditions: (C, P) the same less those of an average condition, which are zero for terms between subjects.
-        at: (C,) subject of each cell, from 0.
+        means: (S, K) mm, of the cells of subjects.
+        matrix: (S, P) of the design, in a row of each subject.
+        conditions: terms within subjects, each with its columns (S, m) less those of the usual condition.
         design: of the model.
         terms: that are the same in all cells of a subject.
-        nuisance: all other terms.
         blocks: what a subject is called, in messages.
 
     Raises:
@@ -224,24 +222,25 @@ def between_stratum(
     """
     where = f"between {blocks}"
     own = columns_of_terms(terms)
-    means, covariates = means_of(shapes, at), means_of(matrix[:, own], at)
-    covariates = covariates - covariates.mean(axis=0)
+    covariates = matrix[:, own] - matrix[:, own].mean(axis=0)
     n = len(means)
     refuse_few(n - 1, design, where, n, "blocks", len(own))
     refuse_aliased(covariates, own, terms, design, where)
     # A condition that is the same for all subjects, or follows from others, adds nothing.
-    scale = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
-    seen = means_of(conditions, at)
-    seen = (seen - seen.mean(axis=0)) / scale
-    kept: list[int] = []
     known = np.empty((n, 0))
-    for column in columns_of_terms(nuisance):
-        rest = less(seen[:, [column]], known)[:, 0]
-        if np.linalg.norm(rest) > _ALIASED * math.sqrt(n):
-            kept.append(int(column))
-            known = np.column_stack([known, rest / np.linalg.norm(rest)])
+    nuisance, kept = list[Term](), list[FloatArray]()
+    for term, values in conditions:
+        columns: list[int] = []
+        for column in values.T:
+            rest = less(less((column - column.mean())[:, None], known), known)[:, 0]
+            if np.linalg.norm(rest) > _ALIASED * math.sqrt(n) * max(float(np.abs(column).max()), _CONSTANT):
+                columns.append(matrix.shape[1] + len(kept))
+                kept.append(column - column.mean())
+                known = np.column_stack([known, rest / np.linalg.norm(rest)])
+        if columns:
+            nuisance.append(replace(term, columns=tuple(columns)))
     if kept:
-        labels = ", ".join(term.label for term in nuisance if set(term.columns) & set(kept))
+        labels = ", ".join(term.label for term in nuisance)
         if n - 1 - len(own) - len(kept) < 1:
             raise InputError(
                 f"{design.formula!r} has {len(own)} columns {where} and {len(kept)} for unequal {labels} of the {n} "
@@ -252,19 +251,15 @@ def between_stratum(
             lengths = np.linalg.norm(values, axis=0)
             if (np.linalg.norm(less(values, known), axis=0) <= _ALIASED * lengths).any():
                 raise InputError(
-                    f"In {design.formula!r} {term.label} follows from {labels} {where}: groups and conditions cannot "
+                    f"In {design.formula!r} {term.label} follows from {labels} {where}, so groups and conditions cannot "
                     "be told apart; leave out one of them."
                 )
-    columns = np.array(sorted([*own, *kept]), dtype=np.intp)
-    model = seen * scale
-    model[:, own] = covariates
-    refuse_aliased(
-        model[:, columns], columns, (*_cut(nuisance, kept), *terms), design, where
-    )  # fmt: skip
+    model = np.column_stack([covariates, *kept])
+    ids = np.array([*own, *range(matrix.shape[1], matrix.shape[1] + len(kept))], dtype=np.intp)
+    refuse_aliased(model, ids, (*nuisance, *terms), design, where)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
-        where, means - means.mean(axis=0), model[:, columns], columns, tuple(terms), rows, 1, 1,
-        nuisance=tuple(_cut(nuisance, kept)),
+        where, means - means.mean(axis=0), model, ids, tuple(terms), rows, 1, 1, nuisance=tuple(nuisance)
     )  # fmt: skip
 
 
@@ -309,14 +304,6 @@ def common_stratum(
     refuse_aliased(model, columns, terms, design, where, np.abs(values).max(axis=0))
     groups = np.zeros(len(rest), dtype=np.intp)
     return Stratum(where, rest, model, columns, tuple(terms), groups, 0, 2, scheme="flip")
-
-
-def _cut(terms: Sequence[Term], kept: Sequence[int]) -> list[Term]:
-    """Return terms with those of their columns that are kept, if any."""
-    from dataclasses import replace
-
-    cut = [replace(term, columns=tuple(column for column in term.columns if column in kept)) for term in terms]
-    return [term for term in cut if term.columns]
 
 
 def columns_of_terms(terms: Sequence[Term]) -> Rows:

@@ -9,7 +9,7 @@ measures with the error of subject by condition, and in the two-stage analysis o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,10 +105,33 @@ class Within:
             )  # fmt: skip
         return tuple(strata)
 
+    def conditions(self) -> Iterator[tuple[Term, FloatArray]]:
+        """Yield the terms within subjects with the subjects' means of their columns, less those of most subjects.
+
+        The median is the balanced condition where most subjects have it, so that theirs needs no adjustment.
+        """
+        means = means_of(self.effects.matrix[self.rows], self.at)
+        means = means - np.median(means, axis=0)
+        first = np.array([self.rows[np.flatnonzero(self.at == one)[0]] for one in range(self.count)])
+        scale = self.effects.matrix.std(axis=0)
+        for effect, terms in self.terms.items():
+            columns = list(self.effects.terms[effect].columns)
+            own = means[:, columns] / scale[columns]
+            if np.abs(own).max() <= _ESTIMABLE:
+                continue
+            for term in terms:
+                between = self.design.part([term.factors - self.factors]).matrix[first]
+                yield term, (own[:, :, None] * between[:, None, :]).reshape(self.count, -1)
+
     def holds(self, variables: frozenset[str]) -> bool:
         """Return whether the joint effect of variables, by their names inside, may differ between subjects."""
         own = variables & self.variables
         return bool(own) and any(own <= self.effects.terms[effect].variables for effect in self.random)
+
+    @property
+    def factors(self) -> frozenset[str]:
+        """Factors of the terms that differ within subjects."""
+        return frozenset(factor for term in self.effects.terms for factor in term.factors)
 
     @property
     def variables(self) -> frozenset[str]:
@@ -196,12 +219,10 @@ class Within:
         """Return the terms that contain some effects, and the design of their parts between subjects."""
         chosen = [term for effect in effects for term in self.terms[effect]]
         chosen.sort(key=self.design.terms.index)
-        inside = {factor for term in self.effects.terms for factor in term.factors}
-        parts = list(dict.fromkeys(term.factors - inside for term in chosen))
-        parts.sort(key=len)
+        parts = sorted(dict.fromkeys(term.factors - self.factors for term in chosen), key=len)
         made = self.design.part(parts)
         # Terms of several effects with the same part between subjects share its columns.
-        terms = [replace(term, columns=made.terms[parts.index(term.factors - inside)].columns) for term in chosen]
+        terms = [replace(term, columns=made.terms[parts.index(term.factors - self.factors)].columns) for term in chosen]
         return tuple({term.columns: term for term in terms}.values()), made
 
     def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> Responses:
@@ -313,10 +334,10 @@ def strata_of(
     elif random:
         raise _no_effect(random[0], design)
     if outer:
-        own = np.array([term in inner for term in design.terms for _ in term.columns])
-        conditions = np.where(own, design.matrix - design.with_held(varying), 0.0) if inner else 0.0 * design.matrix
+        first = np.array([np.flatnonzero(at == one)[0] for one in range(len(names))])
+        conditions = () if within is None else tuple(within.conditions())
         strata.insert(
-            0, between_stratum(means, design.matrix[rows], conditions[rows], at, design, outer, inner, blocks)
+            0, between_stratum(means_of(means, at), design.matrix[rows[first]], conditions, design, outer, blocks)
         )
     notes, warnings = list[str](), list[str]()
     if len(rows) < n:
