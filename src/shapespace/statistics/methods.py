@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from shapespace.cohort.cohort import Cohort
 from shapespace.schemas import Dispersion, Methods, SampleSize
 from shapespace.statistics.dispersion import DispersionTest
@@ -25,7 +27,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         "source": cohort.source.kind,
         "modes": cohort.source.modes,
         "explained_variance_ratio": cohort.source.explained_variance_ratio,
-        "dimensions": len(cohort.basis),
+        "dimensions": int(np.linalg.matrix_rank(cohort.coefficients - cohort.coefficients.mean(axis=0))),
         "unit": cohort.unit,
     }
     return Methods(subjects=subjects, **{**own, **known})
