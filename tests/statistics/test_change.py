@@ -532,6 +532,7 @@ def test_shapes_without_size_and_points_are_refused() -> None:
     cohort = cells(**PAIR)
     assert "gauge form" in refusal(replace(cohort, gauge="shape"), order=ORDER)
     assert "triangles" in refusal(replace(cohort, faces=None), order=ORDER)
+    assert "no unit" in refusal(replace(cohort, unit=""), order=ORDER)
 
 
 def test_a_stable_region_is_read_from_a_file_and_found_in_the_model(tmp_path: Path) -> None:

@@ -76,6 +76,8 @@ def change(
     settings = settings or ChangeSettings()
     if cohort.gauge != "form":
         raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")
+    if cohort.unit != "mm":
+        raise InputError("Changes are in millimetres, but these coordinates have no unit; give surfaces in mm.")
     if cohort.faces is None:
         raise InputError("Changes are along normals, and points have none; give surfaces with triangles.")
     if settings.permutations < 1 or settings.seed < 0:

@@ -78,8 +78,9 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
 
 def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.options.effect_size]
     for test in comparison.tests:
-        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
+        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
         where = f" {test.stratum}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
