@@ -1,6 +1,8 @@
 """Unequal group dispersion: its test, and tests of means that stay valid under it, by plain oracles and simulation."""
 
 import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,6 +145,25 @@ def test_dispersions_are_standard_deviations_about_the_group_mean_and_classes_of
     assert found.ratio == pytest.approx(expected[0] / expected[1])
     assert found.smaller_is_more_variable is True
     assert dispersion_test("site", residual[:4] * 0, np.zeros(4), codes[:4], ("a", "b"), 2, 50, 0) is None
+
+
+def test_dispersions_and_their_p_are_those_of_morphol_disparity(shared_data: Path) -> None:
+    path = shared_data / "geomorph" / "reference.json"
+    if not path.is_file():
+        pytest.skip("reference results of geomorph absent: set SHAPESPACE_DATA to a folder holding geomorph/")
+    data = json.loads(path.read_text())
+    shapes, expected = np.array(data["plethodon_gpa"]["coords"]), data["plethodon_disparity_partial"]
+    table = data["plethodon_table"]
+    cells = [f"{one}.{other}" for one, other in zip(table["species"], table["site"], strict=True)]
+    codes = np.array([expected["groups"].index(cell) for cell in cells])
+    counts = np.bincount(codes)
+    residual = shapes - np.stack([shapes[codes == k].mean(axis=0) for k in range(4)])[codes]
+    names = tuple(expected["groups"])
+    found = dispersion_test("group", residual, 1 / counts[codes], codes, names, 12, 999, 0)
+    assert found is not None
+    # Theirs is divided by n, ours by n - 1.
+    np.testing.assert_allclose(12 * np.array(found.stddev_mm) ** 2 * (counts - 1) / counts, expected["var"], rtol=1e-6)
+    assert found.p > 0.4 and np.min(expected["p"]) > 0.4
 
 
 def test_change_between_groups_of_unequal_variance_keeps_its_level() -> None:
