@@ -664,63 +664,61 @@ def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterat
             continue
         levels = other.levels[:_MOST_LEVELS]
         words = [f"{_told(one, *_pairs(one)[0])}, {other.told(level)}" for level in levels]
-        for first, second in itertools.combinations(range(len(levels)), 2):
-            drawn = _changes_in_two(design, strata, one, other, (levels[first], levels[second]), options)
-            if drawn is None:
-                break
+        pairs = list(itertools.combinations(range(len(levels)), 2))
+        for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, options), strict=False):
             angles = _angles(*drawn)
             # Their arrangements assume equal variances.
             p = None if options.unequal_variances else float((angles >= angles[0] - _TIE).mean())
             yield Angle(words[first], words[second], float(angles[0]), p)
 
 
-def _changes_in_two(
-    design: Design, strata: Strata, one: Variable, other: Variable, classes: tuple[str, str], options: CompareOptions
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return what a variable changes (P, K) in each of two classes of another, in each arrangement.
+def _changes_in_pairs(
+    design: Design, strata: Strata, one: Variable, other: Variable, options: CompareOptions
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield what a variable changes (P, K) in the two classes of each pair of another, in each arrangement.
 
-    None where the two changes are not of one stratum.
+    There are none where the changes of the two variables are not of one stratum.
     """
     both = frozenset({one.column, other.column})
     low, high = _pairs(one)[0]
+    levels = other.levels[:_MOST_LEVELS]
     within = strata.within
     if within is None or not within.holds(both):
         stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
-        if stratum is None or not any(term.variables == frozenset({one.column}) for term in stratum.terms):
-            return None
-        contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in classes]
-        return _changes_of(stratum, both, contrasts, options)
+        if stratum is not None and any(term.variables == frozenset({one.column}) for term in stratum.terms):
+            contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in levels]
+            yield from itertools.combinations(_changes_of(stratum, both, contrasts, options), 2)
+        return
     if one.column not in within.variables:
-        return None
+        return
     if other.column not in within.variables:
         contrast = within.effects.contrast(one.column, low, high)
         stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
-        return _changes_of(stratum, both, [between.average({other.column: level}) for level in classes], options)
+        contrasts = [between.average({other.column: level}) for level in levels]
+        yield from itertools.combinations(_changes_of(stratum, both, contrasts, options), 2)
+        return
     # Both within subjects: in each arrangement some subjects change their two changes for each other.
-    first, second = (within.effects.contrast(one.column, low, high, {other.column: level}) for level in classes)
-    name = f"{one.name}:{other.name}"
-    half, between = within.contrast_stratum((first - second) / 2, both, name)
-    middle = within.contrast_stratum((first + second) / 2, frozenset({one.column}), name)
-    mean = middle[0].direction(middle[1].average({})) @ middle[0].shapes
-    differ = half.direction(between.average({}))
-    flipped = half.products(differ[:, None], half.shapes, options.permutations, options.seed, flips=True)[:, 0]
-    return mean + flipped, mean - flipped
+    own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
+    for first, second in itertools.combinations(own, 2):
+        half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
+        middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
+        mean = middle.direction(parts.average({})) @ middle.shapes
+        differ = half.direction(between.average({}))
+        flipped = half.products(differ[:, None], half.shapes, options.permutations, options.seed, flips=True)[:, 0]
+        yield mean + flipped, mean - flipped
 
 
 def _changes_of(
     stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], options: CompareOptions
-) -> tuple[FloatArray, FloatArray]:
-    """Return two contrasts (P, K) in each arrangement of the model without the terms of some variables."""
+) -> list[FloatArray]:
+    """Return contrasts (P, K) in each arrangement of the model without the terms of some variables."""
     beside = stratum.without(variables)
     residual = stratum.residual(beside)
     products = stratum.products(
         stratum.basis, residual, options.permutations, options.seed, flips=stratum.flips(beside)
     )
     products += stratum.basis.T @ (stratum.shapes - residual)
-    first, second = (
-        np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(contrast), products) for contrast in contrasts
-    )
-    return first, second
+    return [np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(one), products) for one in contrasts]
 
 
 def _between(effects: Sequence[Effect]) -> Iterator[Angle]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,6 +36,13 @@ FUNCTIONS: Mapping[str, str] = {
 
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
 _MOST_CELLS = 100_000
+_MOST_COLUMNS = 5000
+"""Before repeated or implied ones are left out; more take seconds to expand, and as many shapes to estimate."""
+_DEEPEST = 30
+"""Brackets in brackets."""
+_SPLINE = 4
+"""Columns of a polynomial or spline of which no number is given; 3 for cubic ones."""
+_TOKEN = re.compile(r"\s*(`[^`]*`|[\w.]+|\*\*|[-+*:/^()])")
 _PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
 _POWER = re.compile(r"\*\*|\^")
 _ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
@@ -354,6 +362,12 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
         raise InputError(f"{where} is too long; write a shorter one.")
     if not _PLAIN.fullmatch(right) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", right):
         raise InputError(f"{where} holds something other than columns, + - * : / ^ and the functions of a formula.")
+    columns = _Bound(right, table, where).columns()
+    if columns > _MOST_COLUMNS:
+        raise InputError(
+            f"{where} makes up to {columns if columns < 10**9 else 'billions of'} columns, and {_MOST_COLUMNS} are "
+            "the limit; leave out interactions or classes."
+        )
     try:
         terms = list(formulaic.Formula("~ " + right, _ordering="degree"))
         keeps_mean = any(str(term) == "1" for term in terms)
@@ -368,6 +382,126 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
     if not drawn:
         raise InputError(f"{where} names no column; write one such as '~ sex + age'.")
     return drawn
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Upper bounds of the columns of a part of a formula, and of the product of all its factors."""
+
+    columns: int
+    product: int
+
+
+class _Bound:
+    """Bounds the number of columns of a formula without expanding it: its operators are those of R, by precedence."""
+
+    def __init__(self, text: str, table: Table, where: str) -> None:
+        self.table, self.where = table, where
+        self.tokens: list[str] = []
+        at = 0
+        while text[at:].strip():
+            found = _TOKEN.match(text, at)
+            # Only arguments of functions have other characters, and these are read by name and numbers alone.
+            self.tokens.append(found.group(1) if found else text[at])
+            at = found.end() if found else at + 1
+        self.at = self.depth = 0
+
+    def columns(self) -> int:
+        """Return an upper bound of the columns.
+
+        Raises:
+            InputError: brackets or operators do not match.
+        """
+        if not self.tokens:
+            return 0
+        size = self._sum()
+        if self.at < len(self.tokens):
+            raise self._unreadable()
+        return size.columns
+
+    def _unreadable(self) -> InputError:
+        near = self.tokens[min(self.at, len(self.tokens) - 1)]
+        return InputError(f"{self.where} cannot be read near {near[:20]!r}; write one such as '~ sex + age'.")
+
+    def _next(self, *wanted: str) -> str:
+        """Return the next token and pass it if it is one of those wanted, else nothing."""
+        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        if token not in wanted:
+            return ""
+        self.at += 1
+        return token
+
+    def _sum(self) -> _Size:
+        self._next("+", "-")
+        size = self._product()
+        while self._next("+", "-"):
+            other = self._product()
+            size = _Size(size.columns + other.columns, size.product * other.product)
+        return size
+
+    def _product(self) -> _Size:
+        size = self._interaction()
+        while operator := self._next("*", "/"):
+            other = self._interaction()
+            # a / b is a + a:b, with all factors of a in the product.
+            own = size.columns if operator == "*" else size.product
+            columns = size.columns + own * other.columns + (other.columns if operator == "*" else 0)
+            size = _Size(columns, size.product * other.product)
+        return size
+
+    def _interaction(self) -> _Size:
+        size = self._power()
+        while self._next(":"):
+            other = self._power()
+            size = _Size(size.columns * other.columns, size.product * other.product)
+        return size
+
+    def _power(self) -> _Size:
+        size = self._atom()
+        while self._next("**", "^"):
+            exponent = self._next("2", "3")
+            if not exponent:
+                raise self._unreadable()
+            # Products of different terms, in whatever order.
+            each = range(1, int(exponent) + 1)
+            size = _Size(sum(size.columns**k // math.factorial(k) + 1 for k in each), size.product)
+        return size
+
+    def _atom(self) -> _Size:
+        if self._next("("):
+            self.depth += 1
+            if self.depth > _DEEPEST:
+                raise self._unreadable()
+            size = self._sum()
+            self.depth -= 1
+            if not self._next(")"):
+                raise self._unreadable()
+            return size
+        token = self.tokens[self.at] if self.at < len(self.tokens) else ""
+        if not re.match(r"[\w.`]", token):
+            raise self._unreadable()
+        self.at += 1
+        if not self._next("("):
+            return self._size_of(token.strip("`"))
+        inside, depth = list[str](), 1
+        while depth and self.at < len(self.tokens):
+            inside.append(self.tokens[self.at])
+            depth += {"(": 1, ")": -1}.get(inside[-1], 0)
+            self.at += 1
+        if depth:
+            raise self._unreadable()
+        if token in ("poly", "bs"):
+            columns = max([_SPLINE, *(int(one) for one in inside if one.isdecimal() and len(one) < 3)])
+            return _Size(columns, columns)
+        return max(
+            (self._size_of(one.strip("`"), classes=token == "C") for one in inside), key=lambda size: size.columns
+        )
+
+    def _size_of(self, name: str, *, classes: bool = False) -> _Size:
+        if name not in self.table.columns or not (classes or self.table.kind(name) == "text"):
+            return _Size(1, 1)
+        levels = len(set(self.table.texts(name)))
+        return _Size(levels, levels)
 
 
 def _factor(factor: Any, table: Table, where: str) -> _Factor:

@@ -251,8 +251,8 @@ def between_stratum(
             lengths = np.linalg.norm(values, axis=0)
             if (np.linalg.norm(less(values, known), axis=0) <= _ALIASED * lengths).any():
                 raise InputError(
-                    f"In {design.formula!r} {term.label} follows from {labels} {where}, so groups and conditions cannot "
-                    "be told apart; leave out one of them."
+                    f"In {design.formula!r} {term.label} follows from {labels} {where}, so the effects of groups and "
+                    "conditions cannot be separated; leave out one of them."
                 )
     model = np.column_stack([covariates, *kept])
     ids = np.array([*own, *range(matrix.shape[1], matrix.shape[1] + len(kept))], dtype=np.intp)
