@@ -34,7 +34,7 @@ from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import STATUSES, model_path, person_path, read_fits
 from study_people import StudyPeople
 
-AS_EXACT = "likelihood-ratio, fits taken for exact"
+AS_EXACT = "plda, fits taken for exact"
 MODES = (1, 2, 3, 5, 10, 20, 40, 80, 160)
 STUDY = "10 % missing"
 
@@ -106,7 +106,7 @@ def score_matrices(folds: Sequence[Fold], name: str, modes: int | None) -> list[
                  for part in (fold.training, fold.gallery, fold.probes)]  # fmt: skip
         if name == AS_EXACT:
             parts = [replace(part, variance=np.zeros_like(part.x)) for part in parts]
-        scorer = SCORES["likelihood-ratio" if name == AS_EXACT else name](parts[0])
+        scorer = SCORES["plda" if name == AS_EXACT else name](parts[0])
         out.append(scorer(parts[1], parts[2]))
     return out
 

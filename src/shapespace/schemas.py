@@ -230,6 +230,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     b_stddev_calibrated: bool = False
     shrinkage: tuple[float, ...] = ()
     evidence: Mapping[str, Any] = {}
+    chirality: Literal["as scanned", "mirrored", "undecidable"] | None = None
     found_landmarks: Mapping[str, FoundLandmark] = {}
     distances_mm: Mapping[str, BothWays] = {}
     shown: ShownDistances | None = None
@@ -377,7 +378,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         hash: SHA-256 of its content.
         status: `corresponding` or `set aside`.
         reason: why it is set aside.
-        seen_share: share of the template's vertices that it shows; the others are not-a-number.
+        seen_share: share of the template's vertices that it shows; the others are estimates.
         covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
         area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
             parts that the scan shows.
@@ -438,6 +439,9 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
         other_units: NAME to `unit_ratio` of those that are in another unit than most.
         settings: of the run.
         version: of shapespace.
+        inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
+            reuses the results.
+        results_hash: SHA-256 of the files that the run wrote, except this one.
     """
 
     CALLED: ClassVar = "a correspondence"
@@ -454,6 +458,8 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     settings: dict[str, Any]
     version: str
     other_units: dict[str, float] = {}
+    inputs_hash: str = ""
+    results_hash: str = ""
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -53,6 +53,8 @@ class Mesh:
         name: where it came from, used in messages and result files.
         colours: (V, 3) uint8 red, green and blue of each vertex, as screens show them (sRGB); None where not known.
         notes: what was left out as it was read, a sentence each.
+        observed: (V,) bool, False for vertices whose positions are estimates because the scan does not show them;
+            None if all are observed.
 
     Raises:
         MeshError: arrays of the wrong shape, or faces that index past the end of the vertices.
@@ -64,6 +66,7 @@ class Mesh:
     name: str = "mesh"
     colours: ByteArray | None = None
     notes: tuple[str, ...] = ()
+    observed: BoolArray | None = None
 
     __repr__ = short_repr
 
@@ -99,6 +102,13 @@ class Mesh:
             colours = np.ascontiguousarray(given).view()
             colours.setflags(write=False)
             object.__setattr__(self, "colours", colours)
+        if self.observed is not None:
+            mask = np.asarray(self.observed)
+            if mask.shape != vertices.shape[:1] or mask.dtype != np.bool_:
+                raise MeshError(f"{self.name}: observed must be (V,) bool, not {mask.shape} {mask.dtype}.")
+            flags = np.ascontiguousarray(mask).view()
+            flags.setflags(write=False)
+            object.__setattr__(self, "observed", None if flags.all() else flags)
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -109,9 +119,9 @@ class Mesh:
         self.__init__(**state)  # type: ignore[misc]
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
-        """Return the same triangles and colours on other `vertices` (V, 3); landmarks are dropped unless given."""
+        """Return the same mesh with other `vertices` (V, 3); landmarks are dropped unless given."""
         moved = np.asarray(vertices, dtype=np.float64)
-        return Mesh(moved, self.faces, landmarks or {}, self.name, self.colours, self.notes)
+        return Mesh(moved, self.faces, landmarks or {}, self.name, self.colours, self.notes, self.observed)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.

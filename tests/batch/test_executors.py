@@ -174,3 +174,54 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path) -> None:
             list(on_dask.OnDask("tcp://127.0.0.1:9").run(Letters(tmp_path), ["a"]))
     finally:
         on_dask.FINDS_S = before
+
+
+def set_version(version: str) -> None:
+    """Let the code that Dask runs in this worker, and what it starts, be of another version."""
+    import shapespace.batch.on_dask
+    import shapespace.version
+
+    shapespace.version.__version__ = shapespace.batch.on_dask.__version__ = version
+
+
+def test_workers_of_another_version_are_refused_by_name(cluster: Any, tmp_path: Path) -> None:
+    from shapespace.batch import on_dask
+    from shapespace.version import __version__
+
+    other, same = sorted(cluster.nthreads())
+    cluster.run(set_version, "9.8.7", workers=[other])
+    try:
+        with pytest.raises(FitError) as refused:
+            list(on_dask.OnDask(cluster).run(Letters(tmp_path), ["a", "b"]))
+        said = str(refused.value)
+        assert __version__ in said and f"9.8.7 at {other}" in said and same not in said and said.endswith(".")
+        assert not list(tmp_path.iterdir())
+        # One that comes after the versions were checked refuses its tasks.
+        late = cluster.submit(
+            on_dask.do_chunk, Letters(tmp_path), ["a"], None, __version__, workers=[other], allow_other_workers=False
+        )
+        with pytest.raises(FitError, match=r"9\.8\.7"):
+            late.result()
+        assert not list(tmp_path.iterdir())
+    finally:
+        cluster.run(set_version, __version__, workers=[other])
+    assert [answer[0] for _, answer in on_dask.OnDask(cluster).run(Letters(tmp_path), ["a"])] == ["A"]
+
+
+def test_a_cluster_without_workers_is_told_while_it_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    from shapespace.batch import on_dask
+
+    assert on_dask.TELLS_S == 10.0
+    monkeypatch.setattr(on_dask, "TELLS_S", 0.1)
+    monkeypatch.setattr(on_dask, "WORKERS_S", 0.5)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
+        distributed.Client(empty) as client,
+        pytest.raises(FitError, match=r"no worker after 0\.5 s"),
+    ):
+        list(on_dask.OnDask(client).run(Letters(tmp_path), ["a"]))
+    said = capsys.readouterr().err
+    assert "No Dask worker has connected" in said and "dask worker" in said and said.count("\n") == 1

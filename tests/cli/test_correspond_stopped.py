@@ -129,6 +129,36 @@ def test_results_that_are_not_all_written_are_not_taken(
     assert run("build", same, "-o", model).code == 0
 
 
+def test_a_finished_run_is_repeated_only_for_other_inputs_or_damaged_results(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, same = scans(tmp_path / "scans", 0, 1, 2), tmp_path / "same"
+    (folder / "torn.ply").write_text("ply\n", "utf-8")
+    told = "already contains the results of these scans and settings; nothing is computed"
+    first = run("correspond", folder, "-o", same, *QUICK)
+    assert first.code == 1 and told not in first.err
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in same.rglob("*") if path.is_file()}
+
+    done = counted(monkeypatch)
+    again = run("correspond", folder, "-o", same, *QUICK)
+    assert again.code == 1 and told in again.err and again.out == first.out and not done
+    assert before == {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in same.rglob("*") if path.is_file()}
+
+    def computed(*options: str) -> bool:
+        done.clear()
+        outcome = run("correspond", folder, "-o", same, *QUICK, *options)
+        assert (told in outcome.err) is not bool(done)
+        return bool(done)
+
+    assert computed("--rounds", "1") and not computed("--rounds", "1")
+    (same / "blob1.corresponding.ply").unlink()
+    assert computed("--rounds", "1") and (same / "blob1.corresponding.ply").is_file()
+    (same / "template" / "mean.ply").write_text("damaged", "utf-8")
+    assert computed("--rounds", "1")
+    scans(folder, 0, 1, 3)
+    assert computed("--rounds", "1") and not computed("--rounds", "1")
+
+
 def test_a_surface_that_is_gone_is_named(run: Run, raw: Path, tmp_path: Path) -> None:
     same = tmp_path / "same"
     assert run("correspond", raw, "-o", same, *QUICK).code == 0

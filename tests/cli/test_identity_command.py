@@ -45,7 +45,7 @@ def test_a_table_and_fits_end_in_an_answer_and_a_report(command: str, folder: Pa
     assert "1 of 27 fits are left out, which are doubtful (p26)." in outcome.err
     assert (tmp_path / "analysis.json").is_file() and (tmp_path / "figures.csv").is_file()
     assert (tmp_path / "report.html").is_file() == (outcome.facts["report"] is not None)
-    assert run(*asked, "--doubtful", "--gallery", "expression=neutral").out.startswith("By likelihood ratio")
+    assert run(*asked, "--doubtful", "--gallery", "expression=neutral").out.startswith("By PLDA score")
 
 
 def test_the_first_score_is_told_of_first(folder: Path, tmp_path: Path, run: Run) -> None:

@@ -54,16 +54,16 @@ def test_lists_of_lines_and_patterns_name_scans(run: Run, world: World, tmp_path
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name,age\na,3\n", "column named scan, file or path"),
-        ("scan,scan\na,b\n", "no name twice"),
+        ("person,age\na,3\n", "needs a column named scan or file or path"),
+        ("scan,scan\na,b\n", "two columns of one name"),
         ("scan\n", "lists no scans"),
         ("", "needs a column"),
         ("id,scan\n../x,a.ply\n", "row 2 has an id that no file can have"),
         ("id,scan\nx,a.ply\nX,b.ply\n", "Two scans have the id"),
-        ("scan,age\na.ply,3,4\n", "row 2 has 3 cells"),
+        ("scan,age\na.ply,3,4\n", "has 3 cells in row 1"),
         ("scan,age\n,3\n", "row 2 names no scan"),
         ("scan\n\0\n", "binary"),
-        (b"\xff\xfe\x00", "UTF-8"),
+        (b"\xff\xfe\x00", "UTF-16"),
     ],
 )
 def test_a_list_that_is_none_is_one_sentence(

@@ -1,6 +1,6 @@
 """Cohorts: coefficients stand for shapes exactly, and who cannot be compared is left out, counted or refused."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +13,7 @@ from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource, with_columns
 from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
-from shapespace.geometry.procrustes import centroid_size
+from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.files import write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -182,7 +182,7 @@ def test_a_part_of_a_cohort_is_that_of_the_shapes_taken() -> None:
 
 def test_shapes_that_make_no_cohort_are_refused() -> None:
     shapes = np.stack([mesh.vertices for mesh in training_meshes(3, vertices=60)])
-    for wrong in (shapes[:1], shapes[0], np.where(shapes > 50, np.nan, shapes)):
+    for wrong in (shapes[:1], shapes[0], np.where(shapes > 50, np.inf, shapes)):
         with pytest.raises(InputError, match="two or more finite shapes"):
             Cohort.of_shapes(wrong, {})
     with pytest.raises(InputError, match="cells for 3 rows"):
@@ -375,11 +375,91 @@ def test_meshes_that_are_not_in_correspondence_are_refused(meshes: Callable[...,
         read_cohort(table, CohortOptions(shapes=tmp_path / "meshes"))
 
 
-def test_meshes_with_missing_vertices_are_refused_by_name() -> None:
+def cut(meshes: Sequence[Mesh], seed: int = 0, share: float = 0.15) -> list[Mesh]:
+    """Return meshes of which every second lacks the vertices around one of its own."""
+    rng, out = np.random.default_rng(seed), []
+    for k, mesh in enumerate(meshes):
+        far = np.linalg.norm(mesh.vertices - mesh.vertices[rng.integers(len(mesh.vertices))], axis=1)
+        there = (far > np.quantile(far, share)) | (k % 2 == 0)
+        out.append(mesh.with_vertices(np.where(there[:, None], mesh.vertices, np.nan)))
+    return out
+
+
+def masked(mesh: Mesh) -> Mesh:
+    """Return a mesh with missing vertices as a complete one, with the mask of observed vertices."""
+    whole = np.nan_to_num(mesh.vertices, nan=3.0)
+    return replace(mesh, vertices=whole, observed=np.isfinite(mesh.vertices).all(axis=1))
+
+
+@pytest.mark.parametrize("gauge", ["shape", "form"])
+def test_missing_vertices_are_estimated_and_the_others_are_those_of_whole_shapes(gauge: Gauge) -> None:
+    plain = [
+        m.with_vertices(similarity(k, scale=1.0).apply(m.vertices))
+        for k, m in enumerate(training_meshes(24, vertices=200))
+    ]
+    whole = Cohort.of_meshes(plain, blank(24)[1], gauge)
+    cohort = Cohort.of_meshes(cut(plain), blank(24)[1], gauge)
+    assert cohort.observed is not None and cohort.analysed is None
+    assert np.allclose(cohort.estimated_share, np.where(np.arange(24) % 2, 0.15, 0.0))
+    assert np.abs(cohort.sizes_mm / whole.sizes_mm - 1).max() < 0.01
+    spread = np.sqrt(((all_vertices(whole) - whole.reference) ** 2).sum(axis=2).mean())
+    off = np.linalg.norm(all_vertices(cohort) - all_vertices(whole), axis=2)
+    assert off[cohort.observed].mean() < 0.05 * spread and off[~cohort.observed].mean() < 0.35 * spread
+    part = cohort.take([1, 3, 5])
+    assert part.observed.shape == (3, 200) and np.allclose(part.estimated_share, 0.15)
+
+
+def test_meshes_with_a_mask_are_those_with_missing_vertices() -> None:
+    holed = cut(training_meshes(12, vertices=120))
+    one, other = (Cohort.of_meshes(given, blank(12)[1]) for given in (holed, [masked(mesh) for mesh in holed]))
+    np.testing.assert_array_equal(one.observed, other.observed)
+    np.testing.assert_array_equal(one.coefficients, other.coefficients)
+
+
+def test_vertices_that_few_shapes_observe_carry_no_variation() -> None:
+    plain = training_meshes(12, vertices=200)
+    seldom = plain[0].vertices[:, 0] > np.quantile(plain[0].vertices[:, 0], 0.9)
+    holed = [m.with_vertices(np.where((seldom & (k > 4))[:, None], np.nan, m.vertices)) for k, m in enumerate(plain)]
+    for meshes in (holed, [masked(mesh) for mesh in holed]):
+        cohort = Cohort.of_meshes(meshes, blank(12)[1])
+        assert cohort.analysed is not None
+        np.testing.assert_array_equal(cohort.analysed, ~seldom)
+        assert np.abs(cohort.displacements(slice(0, 200))[:, seldom]).max() < 1e-9
+        assert (cohort.observed_share[seldom] == 0).all() and (cohort.observed_share[~seldom] >= 0.5).all()
+        near = np.linalg.norm(cohort.reference[seldom] - cohort.reference[~seldom].mean(axis=0), axis=1)
+        assert near.max() < 3 * np.linalg.norm(cohort.reference - cohort.reference.mean(axis=0), axis=1).mean()
+
+
+def test_a_vertex_that_nobody_observes_lies_between_its_neighbours() -> None:
+    plain = training_meshes(6, vertices=200)
+    shapes = np.stack([mesh.vertices for mesh in plain])
+    shapes[:, 17] = np.nan
+    cohort = Cohort.of_shapes(shapes, {}, faces=plain[0].faces)
+    around = np.unique(plain[0].faces[(plain[0].faces == 17).any(axis=1)])
+    np.testing.assert_allclose(
+        cohort.reference[17], cohort.reference[around[around != 17]].mean(axis=0), rtol=0, atol=1e-3
+    )
+
+
+def test_a_new_shape_with_missing_vertices_is_completed_by_the_population() -> None:
+    plain = training_meshes(30, vertices=200)
+    population = Cohort.of_meshes(plain[:25], blank(25)[1])
+    new = [m.with_vertices(similarity(k, degrees=60.0).apply(m.vertices)) for k, m in enumerate(plain[25:])]
+    whole = Cohort.of_meshes(new, blank(5)[1], onto=population)
+    holed = Cohort.of_meshes(cut(new), blank(5)[1], onto=population)
+    spread = np.sqrt(((all_vertices(whole) - population.reference) ** 2).sum(axis=2).mean())
+    off = np.linalg.norm(all_vertices(holed) - all_vertices(whole), axis=2)
+    assert off[~holed.observed].mean() < 0.35 * spread and off[holed.observed].mean() < 0.1 * spread
+    assert np.abs(holed.sizes_mm / whole.sizes_mm - 1).max() < 0.01
+
+
+def test_shapes_of_which_hardly_a_vertex_is_observed_are_refused_by_name() -> None:
     plain = training_meshes(4, vertices=60)
-    holed = plain[2].with_vertices(np.where(plain[2].vertices > 60, np.nan, plain[2].vertices))
-    with pytest.raises(InputError, match=r"1 of 4 meshes lack vertices .*\(blob_2.ply\)"):
-        Cohort.of_meshes([*plain[:2], holed, plain[3]], blank(4)[1])
+    bare = plain[2].with_vertices(np.full((60, 3), np.nan))
+    with pytest.raises(InputError, match=r"blob_2\.ply: hardly a vertex is observed"):
+        Cohort.of_meshes([*plain[:2], bare, plain[3]], blank(4)[1])
+    with pytest.raises(InputError, match="No vertex is observed by 50 % of the shapes"):
+        Cohort.of_meshes([bare, bare, bare, plain[3]], blank(4)[1])
 
 
 def test_a_mesh_that_was_copied_is_refused(meshes: Callable[..., Path], tmp_path: Path) -> None:

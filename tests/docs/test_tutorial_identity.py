@@ -56,6 +56,6 @@ def test_the_tutorial_on_identity_goes_from_saved_fits(workplace_of_documents: P
         for row in csv.DictReader(Path("verified/figures.csv").read_text().splitlines())
         if row["value"]
     }
-    assert figures["likelihood-ratio", "eer"] <= 0.5 * figures["distance", "eer"]
+    assert figures["plda", "eer"] <= 0.5 * figures["distance", "eer"]
     assert Path("verified/report.html").is_file() and Path("identified/report.html").is_file()
     assert Path("again/analysis.json").is_file()

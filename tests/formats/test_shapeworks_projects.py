@@ -2,15 +2,17 @@
 
 import io
 import json
+import time
 import zipfile
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
+from scipy.interpolate import RBFInterpolator
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
-from shapespace.formats.shapeworks import ShapeWorks
+from shapespace.formats.shapeworks import NEIGHBOURS, ShapeWorks, interpolate_displacements
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
@@ -121,6 +123,48 @@ def test_the_mesh_of_the_most_average_subject_is_carried_by_the_particles(tmp_pa
     assert abs(spread - 1) < 0.1
     nearest = ((truth - truth.mean(axis=0)) ** 2).sum(axis=(1, 2)).argmin()
     assert any(f"mesh of sub {nearest}, the most average" in note for note in found.notes)
+
+
+def test_local_splines_are_those_of_scipy_and_near_the_dense_one() -> None:
+    particles, others = (shape(sphere(700, 0.3)[0], number) for number in (0, 1))
+    points, truth = (shape(sphere(500)[0], number) for number in (0, 1))
+    steps = others - particles
+    found = interpolate_displacements(particles, steps, points, most_dense=0)
+    design, at = (np.column_stack([np.ones(len(x)), x]) for x in (particles, points))
+    affine = np.linalg.lstsq(design, steps, rcond=None)[0]
+    local = RBFInterpolator(particles, steps - design @ affine, kernel="linear", degree=0, neighbors=NEIGHBOURS)
+    assert np.allclose(found, local(points) + at @ affine, atol=1e-9)
+    dense = interpolate_displacements(particles, steps, points)
+    apart, signal, error = (np.sqrt((d**2).mean()) for d in (found - dense, dense, dense - (truth - points)))
+    assert apart < 1e-3 * signal and apart < 0.5 * error
+
+
+def test_many_particles_carry_a_mesh_soon(tmp_path: Path) -> None:
+    spots, mesh = sphere(8_000, 0.3)[0], sphere(300)
+    rows: list[dict[str, str]] = []
+    for number in range(3):
+        np.savetxt(tmp_path / f"{number}.particles", shape(spots, number), "%.6f")
+        write_mesh(tmp_path / f"{number}.ply", Mesh(shape(mesh[0], number), mesh[1]))
+        rows.append({"world_particles_1": f"{number}.particles", "groomed_1": f"{number}.ply"})
+    path = swproj(tmp_path, rows)
+    start = time.process_time()
+    found = ShapeWorks().read(path)
+    # One dense spline takes 512 MB for its matrix alone, and some 15 s.
+    assert time.process_time() - start < 4.0
+    truth = np.mean([shape(mesh[0], number) for number in range(3)], axis=0)
+    assert np.abs(found.mean - truth).max() < 0.05
+
+
+def test_particles_in_a_plane_are_a_point_model(tmp_path: Path) -> None:
+    spots = np.column_stack([np.random.default_rng(0).random((40, 2)) * 50, np.zeros(40)])
+    square = Mesh(np.array([[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    rows: list[dict[str, str]] = []
+    for number in range(3):
+        np.savetxt(tmp_path / f"{number}.particles", spots * (1 + 0.01 * number), "%.6f")
+        write_mesh(tmp_path / f"{number}.ply", square)
+        rows.append({"world_particles_1": f"{number}.particles", "groomed_1": f"{number}.ply"})
+    found = ShapeWorks().read(swproj(tmp_path, rows))
+    assert found.faces is None and any("lie in a plane" in note for note in found.notes)
 
 
 def test_particles_that_are_the_vertices_need_no_splines(tmp_path: Path) -> None:

@@ -31,6 +31,8 @@ from shapespace.batch.results import (
 )
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.formats.flame import Flame
+from shapespace.formats.gias import Gias
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.saved import FACTS, SavedClassifier, load_classifier, software_versions
@@ -49,6 +51,7 @@ from shapespace.schemas import (
     json_text,
     read,
 )
+from shapespace.statistics.predictor import Predictor
 from shapespace.store.corresponding import json_of
 from synthetic_shapes import blob_model, raw_scan
 
@@ -237,6 +240,84 @@ def other_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
     if kind == "cut" and array.ndim:
         return array[:-1]
     return array[None] if kind == "axis" else array.reshape(-1)[:1].reshape(()) if array.size else array
+
+
+# Headers of arrays
+
+
+LENGTHS = (True, False, -1, -8, 0, 1, 3, 2**31, 2**40, 2**63, 10**30, 1.0, 1e300, None, "3", (3,), [3])
+"""What a header of .npy may declare as the length of an axis; few of these are lengths."""
+
+
+def with_headers(path: Path, rng: random.Random) -> Path:
+    """Replace the shape that one or two arrays of an .npz file declare, and keep their numbers."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    for name in rng.sample(sorted(members), rng.choice([1, 1, 2])):
+        stream = io.BytesIO(members[name])
+        np.lib.format.read_magic(stream)
+        _, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        numbers = stream.read()
+        shape = tuple(rng.choice(LENGTHS) for _ in range(rng.choice([0, 1, 1, 2, 3])))
+        header = io.BytesIO()
+        told = {"descr": dtype.str, "fortran_order": fortran, "shape": shape}
+        np.lib.format.write_array_header_1_0(header, told)
+        kept = rng.choice([len(numbers), dtype.itemsize, 0])
+        members[name] = header.getvalue() + numbers[:kept]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path
+
+
+def learned(path: Path) -> Path:
+    """Write a small predictor."""
+    ways, rows, vertices = 4, 6, 5
+    Predictor(
+        target="age", gauge="form", model_hash="", method="pls", subjects=rows, lowest=1.0, highest=9.0,
+        farthest_mm=4.0, level=0.9, mean=np.ones((vertices, 3)), intercepts=np.zeros(ways),
+        weights=np.zeros((ways, 3 * vertices)), residuals=np.ones(rows), fold=np.array([1, 2, 3, 1, 2, 3]),
+        share=np.ones(rows),
+    ).save(path)  # fmt: skip
+    return path
+
+
+def test_headers_of_arrays_that_declare_anything_are_taken_or_refused(home: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(12, 3))
+    np.savez(
+        tmp_path / "smpl.npz", v_template=points, shapedirs=rng.normal(size=(12, 3, 4)), f=np.arange(12).reshape(4, 3)
+    )
+    np.savez(
+        tmp_path / "a.pc.npz", mean=points.ravel(), weights=np.arange(1.0, 4.0), modes=rng.normal(size=(36, 3)),
+        projectedWeights=rng.normal(size=(3, 5)),
+    )  # fmt: skip
+    learned(tmp_path / "age.npz")
+    (tmp_path / "one.fit.json").write_bytes((home / "one.fit.json").read_bytes())
+    (tmp_path / "one.stages.npz").write_bytes((home / "one.stages.npz").read_bytes())
+    readers: dict[str, Callable[[], object]] = {
+        "smpl.npz": lambda: Flame().read(tmp_path / "smpl.npz"),
+        "a.pc.npz": lambda: Gias().read(tmp_path / "a.pc.npz"),
+        "age.npz": lambda: Predictor.load(tmp_path / "age.npz"),
+        "one.stages.npz": lambda: staged(tmp_path),
+    }
+    whole = {name: (tmp_path / name).read_bytes() for name in readers}
+    for reader in readers.values():
+        reader()
+
+    @fuzzed(150)
+    def run(seed: int) -> None:
+        rng = random.Random(seed)
+        name = rng.choice(sorted(readers))
+        (tmp_path / name).write_bytes(whole[name])
+        with_headers(tmp_path / name, rng)
+        with soon():
+            try:
+                readers[name]()
+            except ShapespaceError as error:
+                refusal(error)
+
+    run()
 
 
 # Tables

@@ -2,6 +2,7 @@ import base64
 import errno
 import json
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from hand_made import POINTS, gltf_tree, ply_header, vtp
 
 from shapespace.errors import FileError, FileFormatError, InputError, MeshError, ShapespaceError
+from shapespace.geometry.doctor import examine
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
@@ -215,6 +217,36 @@ def test_ply_ascii_with_extras_and_crlf(write):
     mesh = read_mesh(write("a.ply", (header + body).replace(b"\n", b"\r\n")))
     np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [0, 1, 2]])
     assert mesh.vertices[3, 2] == 0.125
+
+
+def test_ply_keeps_which_vertices_are_observed(tetrahedron: Mesh, tmp_path: Path):
+    observed = np.array([True, False, True, True])
+    colours = np.arange(12, dtype=np.uint8).reshape(4, 3)
+    for mesh in (replace(tetrahedron, observed=observed), replace(tetrahedron, observed=observed, colours=colours)):
+        path = tmp_path / "out.ply"
+        write_mesh(path, mesh)
+        assert b"property uchar observed\n" in path.read_bytes()
+        back = read_mesh(path)
+        np.testing.assert_array_equal(back.observed, observed)
+        np.testing.assert_array_equal(back.vertices, mesh.vertices)
+        assert mesh.colours is None or (back.colours == colours).all()
+        other = trimesh.load(path, process=False)
+        np.testing.assert_array_equal(other.vertices, mesh.vertices)
+        np.testing.assert_array_equal(other.metadata["_ply_raw"]["vertex"]["data"]["observed"], observed)
+        assert not [f for f in examine(back).findings if f.level == "refused"]
+    write_mesh(tmp_path / "whole.ply", replace(tetrahedron, observed=np.ones(4, np.bool_)))
+    assert read_mesh(tmp_path / "whole.ply").observed is None
+    assert b"observed" not in (tmp_path / "whole.ply").read_bytes()
+
+
+@pytest.mark.parametrize(("kind", "known"), [("uchar", True), ("int", True), ("float", False)])
+def test_ply_ascii_observed_is_a_whole_number(write, kind: str, known: bool):
+    text = f"ply\nformat ascii 1.0\nelement vertex 3\nproperty {kind} observed\n"
+    text += "".join(f"property float {axis}\n" for axis in "xyz")
+    path = write("a.ply", (text + "end_header\n1 0 0 0\n0 1 0 0\n1 0 1 0\n").encode())
+    back = read_mesh(path)
+    assert (back.observed is not None and back.observed.tolist() == [True, False, True]) is known
+    np.testing.assert_array_equal(back.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
 def test_ply_binary_that_starts_with_a_newline_byte(write):

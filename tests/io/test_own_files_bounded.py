@@ -9,6 +9,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from shapespace.batch.folder import records_in
 from shapespace.batch.results import read_record
 from shapespace.errors import FileError, FileFormatError
 from shapespace.io.archives import read_arrays
+from shapespace.io.arrays import read_arrays as kept_arrays
 from shapespace.io.json_files import plain_json, read_json
 from shapespace.io.labels import read_labels
 from shapespace.model.shape_model import ShapeModel
@@ -71,7 +73,7 @@ def test_files_far_too_large_are_refused_unread(reader: Callable[[Path], object]
             reader(wrong)
 
 
-def npy(shape: tuple[int, ...], data: bytes = b"", kind: str = "<f8") -> bytes:
+def npy(shape: tuple[Any, ...], data: bytes = b"", kind: str = "<f8") -> bytes:
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
     return stream.getvalue() + data
@@ -94,6 +96,12 @@ def test_archives_that_unpack_to_far_more_than_their_size_are_refused(tmp_path: 
         path = archive(tmp_path / "x.npz", {"a.npy": npy(shape, bytes(8), kind)})
         with pytest.raises(FileFormatError):
             read_arrays(path, AGAIN)
+    for shape in ((True,), (False,), (2**40, 0), (0, 10**30), (-1, -1), (1.0,), (None,)):
+        for data in (b"", bytes(8)):
+            path = archive(tmp_path / "x.npz", {"a.npy": npy(shape, data)})
+            with pytest.raises(FileFormatError):
+                read_arrays(path, AGAIN)
+            assert kept_arrays(path) is None
     path = archive(tmp_path / "x.npz", {"a.npy": b"\x93NUMPY\x01\x00" + struct.pack("<H", 9000) + b"(" * 9000})
     with pytest.raises(FileFormatError, match="is not an array"):
         read_arrays(path, AGAIN)

@@ -6,7 +6,9 @@ import json
 import struct
 import subprocess
 import sys
+import time
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from hand_made import gltf_tree, ply_header
 from shapespace.errors import MeshError
 from shapespace.geometry.doctor import repair
 from shapespace.io import textures
+from shapespace.io.files import read_bytes
 from shapespace.io.meshes import MESH_FORMATS, read_mesh, write_mesh
 from shapespace.types import GREY, Mesh
 
@@ -224,3 +227,54 @@ def test_colours_that_do_not_fit_the_vertices_are_refused() -> None:
     with pytest.raises(ValueError):
         PAINTED.colours[0, 0] = 1
     assert np.array_equal(replace(PAINTED, name="b").with_vertices(2 * SQUARE).colours, COLOURS)
+
+
+def seconds(call: Callable[[], object]) -> float:
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def test_an_obj_of_many_materials_is_read_in_time_that_grows_with_the_file(tmp_path: Path) -> None:
+    path = folder_of(tmp_path)
+
+    def scan(count: int) -> None:
+        # Each spelling of the picture names the same file.
+        names = [f".{'/' * (1 + k % 128)}{'./' * (k // 128)}p.png" for k in range(count)]
+        library = "".join(f"newmtl {k}\nmap_Kd {name}\n" for k, name in enumerate(names))
+        (tmp_path / "the one.mtl").write_text(library)
+        rows = "".join(f"v 0 0 0\nusemtl {k}\nf {k + 1}/1 1/1 1/1\n" for k in range(count))
+        path.write_text(f"mtllib the one.mtl\nvt 0.1 0.1\n{rows}")
+        assert np.array_equal(read_mesh(path).colours, np.tile(PIXELS[1, 0], (count, 1)))
+
+    few, many = (seconds(lambda n=n: scan(n)) for n in (1_000, 8_000))
+    assert many < 14 * few
+
+
+def test_a_materials_file_of_many_spellings_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder_of(tmp_path)
+    (tmp_path / "below").mkdir()
+    (tmp_path / "link.mtl").symlink_to(tmp_path / "the one.mtl")
+    spelled = ["the one.mtl", "./the one.mtl", ".//the one.mtl", "below/../the one.mtl", ".\\the one.mtl", "link.mtl"]
+    path.write_text("".join(f"mtllib {name}\n" for name in spelled) + TEXTURED)
+    opened: list[str] = []
+
+    def counted(file: Path, at_most: int | None = None) -> bytes:
+        opened.append(file.name)
+        return read_bytes(file, at_most)
+
+    monkeypatch.setattr(textures, "read_bytes", counted)
+    mesh = read_mesh(path)
+    assert sorted(opened) == ["p.png", "the one.mtl"] and mesh.colours is not None and not mesh.notes
+
+
+def test_files_of_materials_are_read_up_to_a_bound_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder_of(tmp_path)
+    for name in ("a.mtl", "b.mtl"):
+        (tmp_path / name).write_bytes(b"#" * (3 * 2**20))
+    path.write_text("mtllib a.mtl\nmtllib b.mtl\n" + TEXTURED)
+    mesh = read_mesh(path)
+    assert mesh.colours is None and "materials file 'b.mtl' cannot be read" in mesh.notes[0]
+    monkeypatch.setattr(textures, "MOST_NAMES", 2)
+    path.write_text("".join(f"mtllib {'./' * k}the one.mtl\n" for k in range(3)) + TEXTURED)
+    assert "names more than 2 files" in read_mesh(path).notes[0]

@@ -1,5 +1,6 @@
 """Models of shapes with missing vertices: what is not shown neither narrows nor bends them, and is told."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
-from shapespace.model.missing import Kept
+from shapespace.model.missing import Kept, with_estimates
 from shapespace.model.pca import principal_components
 from shapespace.model.ppca import ppca
+from shapespace.model.quality import QualitySettings, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh
 from synthetic_shapes import similarity, training_meshes
@@ -164,6 +166,45 @@ def test_modes_are_chosen_as_for_whole_shapes(modes: object) -> None:
     assert model.n_modes == {3: 3}.get(modes, model.n_modes)
     assert 3 <= model.n_modes <= 10
     assert np.allclose(model.basis.T @ model.basis, np.eye(model.n_modes), atol=1e-9)
+
+
+def estimated(meshes: list[Mesh]) -> list[Mesh]:
+    """Return meshes with missing vertices as complete meshes, far-off estimates in their place, with the mask."""
+    return [
+        replace(mesh, vertices=np.nan_to_num(mesh.vertices, nan=500.0), observed=np.isfinite(mesh.vertices).all(axis=1))
+        for mesh in meshes
+    ]
+
+
+@pytest.mark.parametrize("out_of_core", [False, True])
+def test_a_vertex_that_is_not_observed_is_treated_as_missing(out_of_core: bool) -> None:
+    meshes = noisy(count=12, vertices=200)
+    masked = holed(meshes, patches(meshes))
+    if out_of_core:
+        for given in (masked, estimated(masked)):
+            with pytest.raises(InputError, match="vertices are missing"):
+                ShapeModel.fit(given, modes=4, out_of_core=True)
+        return
+    one, other = (ShapeModel.fit(given, modes=4) for given in (masked, estimated(masked)))
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(one.basis, other.basis)
+    settings = QualitySettings(modes=3, samples=20)
+    first, second = (measure_quality(given, settings) for given in (masked, estimated(masked)))
+    np.testing.assert_array_equal(first.generalisation.mean, second.generalisation.mean)
+
+
+def test_estimates_lie_nearer_the_truth_than_the_mean_and_leave_the_observed_vertices() -> None:
+    meshes = noisy()
+    shown = patches(meshes)
+    # Any poses and sizes.
+    moved = np.stack([similarity(k).apply(mesh.vertices) for k, mesh in enumerate(meshes)])
+    found = with_estimates(np.where(shown[:, :, None], moved, np.nan), [mesh.name for mesh in meshes])
+    np.testing.assert_array_equal(found[shown], moved[shown])
+    scales = np.array([similarity(k).scale for k in range(len(meshes))])
+    off = np.linalg.norm(found - moved, axis=2) / scales[:, None]
+    aligned = np.stack([mesh.vertices for mesh in meshes])
+    by_mean = np.linalg.norm(filled_by_the_mean(aligned, shown) - aligned, axis=2)
+    assert off[~shown].mean() < 0.35 * by_mean[~shown].mean()
 
 
 def test_two_meshes_with_holes_and_meshes_as_they_stand_make_models() -> None:

@@ -179,6 +179,12 @@ def test_the_bootstrap_interval_covers_the_truth_about_as_often_as_it_says():
     assert 86 <= covered <= 100
 
 
+def test_an_accuracy_of_one_has_the_exact_interval_of_the_class_that_the_fewest_people_show():
+    labels, subjects = ["a"] * 12 + ["b"] * 6, [f"p{k}" for k in range(12)] + [f"p{k}" for k in range(6)]
+    low, high = subject_bootstrap(labels, labels, subjects)
+    assert high == 1.0 and low == pytest.approx(0.025 ** (1 / 6))
+
+
 def test_the_fast_permutation_test_is_the_slow_one(monkeypatch):
     z, labels, subjects = people(n=8, spread=1.5)
     z[5] = np.nan

@@ -2,14 +2,17 @@
 
 import base64
 import hashlib
+import io
 import itertools
 import json
 import os
 import re
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from report_page import Page, edit
 
@@ -178,6 +181,16 @@ def test_without_stages_a_sentence_names_the_command_and_stills_are_shown(fits: 
     assert "shapespace fit ../model.h5 ../scans -o . --stages --resume" in words
     alts = [str(image["alt"]) for image in Page(page).images()]
     assert "The fitted surface of able" in alts and not [alt for alt in alts if "over each other" in alt]
+
+
+def test_stages_with_an_impossible_header_leave_a_page_without_them(fits: Path, sketched: None) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<i8", "fortran_order": False, "shape": (True,)})
+    with zipfile.ZipFile(fits / "baker.stages.npz", "w") as archive:
+        archive.writestr("format_version.npy", header.getvalue() + bytes(8))
+    page = Page(write_report(fits).read_text(encoding="utf-8"))
+    assert "baker.stages.npz is not an .npz file of arrays" in page.words and "whole number" in page.words
+    assert "able" in page.words
 
 
 def test_damaged_stages_and_records_cost_only_themselves(fits: Path, sketched: None) -> None:

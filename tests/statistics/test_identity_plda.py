@@ -1,4 +1,4 @@
-"""The likelihood ratio of two people against the densities that it is made of."""
+"""The PLDA score of two people against the densities that it is made of."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def test_it_is_the_ratio_of_normal_densities():
     gallery, probes = people(3, 1, 1, error=0.5), people(4, 1, 2, error=0.5)
     back = np.linalg.inv(learned.basis)
     between = back.T @ np.diag(learned.between) @ back
-    found = learned.log_ratio(gallery, probes)
+    found = learned.score(gallery, probes)
     for i, g in enumerate(gallery.x):
         for j, p in enumerate(probes.x):
             one, other = (
@@ -61,8 +61,8 @@ def test_it_does_not_change_with_the_coordinates():
         return replace(samples, x=3.0 * samples.x @ turn.T + move)
 
     training, gallery, probes = people(40, 4), people(5, 1, 1), people(6, 1, 2)
-    found = TwoCovariance.learn(training).log_ratio(gallery, probes)
-    again = TwoCovariance.learn(other(training)).log_ratio(other(gallery), other(probes))
+    found = TwoCovariance.learn(training).score(gallery, probes)
+    again = TwoCovariance.learn(other(training)).score(other(gallery), other(probes))
     np.testing.assert_allclose(again, found, atol=1e-6)
 
 
@@ -70,8 +70,8 @@ def test_a_fit_that_knows_nothing_says_nothing():
     learned = TwoCovariance.learn(people(60, 4, error=0.3))
     gallery, probe = people(5, 1, 1, error=0.3), people(1, 1, 2, error=0.3)
     blind = replace(probe, variance=np.full_like(probe.variance, 1e9))
-    assert np.abs(learned.log_ratio(gallery, blind)).max() < 1e-3
-    assert np.abs(learned.log_ratio(gallery, probe)).max() > 1.0
+    assert np.abs(learned.score(gallery, blind)).max() < 1e-3
+    assert np.abs(learned.score(gallery, probe)).max() > 1.0
 
 
 def test_within_a_person_it_finds_on_average_what_it_learned():
@@ -84,7 +84,7 @@ def test_within_a_person_it_finds_on_average_what_it_learned():
 def test_it_beats_distance_and_cosine_where_expressions_are_large():
     training, tested = people(60, 4), people(40, 3, 1)
     errors = {name: eer(learn(training)(tested, tested), tested, tested) for name, learn in SCORES.items()}
-    assert errors["likelihood-ratio"] < 0.5 * min(errors[name] for name in ("cosine", "mahalanobis", "distance"))
+    assert errors["plda"] < 0.5 * min(errors[name] for name in ("cosine", "mahalanobis", "distance"))
 
 
 def test_errors_that_fits_state_help_where_they_differ():
@@ -102,7 +102,7 @@ def test_errors_that_fits_state_help_where_they_differ():
         return replace(samples, variance=np.zeros_like(samples.x))
 
     stated, exact = (
-        eer(TwoCovariance.learn(one).log_ratio(other, other), tested, tested)
+        eer(TwoCovariance.learn(one).score(other, other), tested, tested)
         for one, other in ((training, tested), (without(training), without(tested)))
     )
     assert stated < 0.9 * exact
@@ -117,7 +117,7 @@ def test_too_few_people_to_learn_from_are_refused(count, scans):
 def test_few_people_with_many_modes_are_shrunk_and_not_refused():
     few = people(4, 2, k=30)
     learned = TwoCovariance.learn(few)
-    assert np.isfinite(learned.log_ratio(few, few)).all()
+    assert np.isfinite(learned.score(few, few)).all()
     assert (learned.between >= 0).all()
 
 

@@ -140,10 +140,10 @@ def found():
     return verify(cohort(24, 3), options)
 
 
-def test_the_likelihood_ratio_beats_the_plain_distance_by_a_factor_of_two(found):
-    assert found["likelihood-ratio"].eer.value <= 0.5 * found["distance"].eer.value
-    assert found["likelihood-ratio"].cllr_min < found["distance"].cllr_min
-    assert [one.name for one in found.scores] == ["likelihood-ratio", "cosine", "mahalanobis", "distance"]
+def test_the_plda_score_beats_the_plain_distance_by_a_factor_of_two(found):
+    assert found["plda"].eer.value <= 0.5 * found["distance"].eer.value
+    assert found["plda"].cllr_min < found["distance"].cllr_min
+    assert [one.name for one in found.scores] == ["plda", "cosine", "mahalanobis", "distance"]
 
 
 def test_figures_of_the_parts_belong_to_the_values_of_the_probes(found):
@@ -201,7 +201,7 @@ def test_surfaces_without_fits_are_whitened_by_people_who_are_not_tested():
     found = samples_of(surfaces, told.subjects, training)
     np.testing.assert_allclose(np.cov(found.x[:18].T), np.eye(found.x.shape[1]), atol=1e-6)
     assert not found.variance.any()
-    assert verify(surfaces, FEW)["likelihood-ratio"].eer.value < 0.3
+    assert verify(surfaces, FEW)["plda"].eer.value < 0.3
     with pytest.raises(InputError, match="three are the least"):
         samples_of(surfaces, told.subjects, [0, 1])
 

@@ -16,7 +16,7 @@ from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known
-from shapespace.statistics.regression import Regression, compare_with, regress
+from shapespace.statistics.regression import Regression, compare_with, permutation_scheme, regress, share_of
 from shapespace.statistics.regression_answer import predicted_answer
 from shapespace.statistics.smoothers import Choice, Decomposed, folds_of
 from shapespace.types import Mesh, read_only
@@ -55,7 +55,7 @@ def test_raw_coefficients_are_those_of_ridge_regression() -> None:
     X, y = cohort.coefficients, cohort.table.numbers("age")
     penalty = 0.01 * np.linalg.svd(X - X.mean(axis=0))[1][0] ** 2
     other = Ridge(alpha=float(penalty), solver="svd").fit(X, y)
-    beta, intercept = Decomposed.of(X).weights(y, Choice("raw", 0.01))
+    beta, intercept = Decomposed.of(X, np.ones(len(X))).weights(y, Choice("raw", 0.01))
     assert np.allclose(beta, other.coef_, rtol=1e-8) and intercept == pytest.approx(other.intercept_, rel=1e-8)
 
 
@@ -64,8 +64,114 @@ def test_whitened_coefficients_are_those_of_principal_component_regression() -> 
     X, y = cohort.coefficients, cohort.table.numbers("age")
     pca = PCA(5, whiten=True, svd_solver="full").fit(X)
     expected = LinearRegression().fit(pca.transform(X), y).predict(pca.transform(X[:7]))
-    found = Decomposed.of(X).predict(X[:7], y[:, None], [Choice("whitened", 5)])[0, :, 0]
+    found = Decomposed.of(X, np.ones(len(X))).predict(X[:7], y[:, None], [Choice("whitened", 5)])[0, :, 0]
     assert np.allclose(found, expected, rtol=1e-8)
+
+
+def unequal_scans(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients, target and 1 / number of scans of 30 subjects with 1 to 9 scans."""
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(1, 10, 30)
+    X = np.repeat(rng.standard_normal((30, 12)) * 3, counts, axis=0) + rng.standard_normal((counts.sum(), 12))
+    return X, X[:, 0] + rng.standard_normal(len(X)), np.repeat(1.0 / counts, counts)
+
+
+def test_weighted_ridge_regression_is_that_of_scikit_learn() -> None:
+    X, y, weight = unequal_scans(0)
+    found = Decomposed.of(X, weight)
+    penalty = 0.01 * found.singular[0] ** 2
+    other = Ridge(alpha=float(penalty), solver="cholesky").fit(X, y, sample_weight=weight)
+    beta, intercept = found.weights(y, Choice("raw", 0.01))
+    assert np.allclose(beta, other.coef_, rtol=1e-9) and intercept == pytest.approx(other.intercept_, rel=1e-9)
+    predicted = found.predict(X[:5], y[:, None], [Choice("raw", 0.01)])[0, :, 0]
+    assert np.allclose(predicted, other.predict(X[:5]), rtol=1e-9)
+
+
+def test_weighted_principal_component_regression_is_weighted_least_squares_on_weighted_components() -> None:
+    X, y, weight = unequal_scans(1)
+    mean = np.average(X, axis=0, weights=weight)
+    components = np.linalg.eigh(np.cov(X.T, aweights=weight))[1][:, ::-1][:, :4]
+    expected = LinearRegression().fit((X - mean) @ components, y, sample_weight=weight).predict((X - mean) @ components)
+    found = Decomposed.of(X, weight).predict(X, y[:, None], [Choice("whitened", 4)])[0, :, 0]
+    assert np.allclose(found, expected, rtol=1e-9)
+
+
+def each_scan_repeated(cohort: Cohort, times: int) -> Cohort:
+    """All scans of each subject `times` times."""
+    rows = [row for row in range(len(cohort)) for _ in range(times)]
+    names = tuple(f"{cohort.names[row]} {k}" for k, row in enumerate(rows))
+    return replace(cohort.take(rows), names=names)
+
+
+def with_scans(cohort: Cohort, counts: list[int]) -> Cohort:
+    """The first so many scans of each subject."""
+    seen: dict[str, int] = {}
+    kept = []
+    for row, subject in enumerate(cohort.table.texts("subject")):
+        seen[subject] = seen.get(subject, 0) + 1
+        if seen[subject] <= counts[list(seen).index(subject)]:
+            kept.append(row)
+    return cohort.take(kept)
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_scans_that_all_stand_there_three_times_change_nothing(varies: bool) -> None:
+    cohort = with_scans(drawn(20, 6, repeats=4), [1, 2, 3, 4] * 5)
+    if varies:
+        age = cohort.table.numbers("age") + np.random.default_rng(0).standard_normal(len(cohort))
+        cohort = replace(cohort, table=replace(cohort.table, columns={**cohort.table.columns,
+                                                                      "age": numbers_as_text(age)}))  # fmt: skip
+    # Within a subject three equal scans have more orders than one, so p of a target that varies there is left out.
+    one, three = (
+        regress(each_scan_repeated(cohort, times), "age", folds=5, permutations=0 if varies else 19, draws=50)
+        for times in (1, 3)
+    )
+    for name, measure in one.measures.items():
+        other = three.measures[name]
+        assert [other.value, other.low, other.high] == pytest.approx([measure.value, measure.low, measure.high])
+    for name in ("predicted", "low", "high", "baseline"):
+        assert np.allclose(getattr(three, name)[::3], getattr(one, name), rtol=1e-9), name
+    assert np.allclose(three.pattern, one.pattern) and np.allclose(three.map, one.map)
+    assert three.p == one.p and three.choice == one.choice and three.effective == pytest.approx(one.effective)
+    assert [three.low_at, three.high_at] == pytest.approx([one.low_at, one.high_at])
+    assert [three.baseline_rmse, three.baseline_mae] == pytest.approx([one.baseline_rmse, one.baseline_mae])
+    told, again = (found.predictor.predict(drawn(5, 7)) for found in (one, three))
+    for name in ("value", "low", "high"):
+        assert np.allclose(getattr(told, name), getattr(again, name), rtol=1e-9), name
+    assert told.outside == again.outside
+
+
+def test_the_shapes_shown_are_at_the_percentiles_of_one_value_for_each_subject() -> None:
+    cohort = drawn(40, 8)
+    found = regress(cohort, "age", folds=5, permutations=0, draws=1)
+    low, high = np.percentile(cohort.table.numbers("age"), [5, 95])
+    assert [found.low_at, found.high_at] == pytest.approx([low, high], rel=1e-12)
+
+
+def test_one_subject_with_forty_scans_does_not_make_a_relation() -> None:
+    r2, p = [], []
+    for seed in range(12):
+        cohort = with_scans(drawn(30, seed, repeats=40, told=False), [40] + [1] * 29)
+        found = regress(cohort, "age", permutations=19, draws=1, seed=seed)
+        r2.append(found.measures["r2"].value)
+        p.append(found.p)
+    assert np.mean(r2) < 0.0
+    assert np.mean(p) == pytest.approx(0.5, abs=0.25)
+
+
+def test_targets_of_subjects_are_exchanged_whatever_their_number_of_scans() -> None:
+    cohort = with_scans(drawn(20, 9, repeats=20), list(range(1, 21)))
+    found = regress(cohort, "age", folds=5, permutations=99, draws=1)
+    assert found.p is not None and found.p < 0.2, "no two subjects have as many scans"
+    assert permutation_scheme(found.subjects, found.observed).endswith("the targets of all 20 subjects.")
+
+
+def test_new_subjects_count_once_in_the_figures_of_new_shapes(learned: Regression) -> None:
+    new = drawn(30, 50)
+    many = new.take([*range(30), *[0] * 20])
+    share = share_of(many.table.texts("subject"))
+    once = compare_with(learned.predictor.predict(new), new.table.numbers("age"))
+    assert compare_with(learned.predictor.predict(many), many.table.numbers("age"), share) == pytest.approx(once)
 
 
 def test_no_subject_stands_in_two_folds() -> None:

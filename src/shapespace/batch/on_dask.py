@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from shapespace.batch.executors import Child
+from shapespace.batch.progress import tell_after
 from shapespace.errors import FitError, InputError, ShapespaceError
+from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -28,6 +30,9 @@ AHEAD = 2
 FINDS_S = 30.0
 WORKERS_S = 600.0
 """A queue may take so long to start the first worker."""
+TELLS_S = 10.0
+"""Seconds without a worker after which a line on standard error says what the command waits for."""
+_MOST_NAMED = 5
 _LOST = "its workers ended again and again, most likely for lack of memory; thin it"
 
 
@@ -90,6 +95,7 @@ class _Run:
         Dask blames all tasks that wait at a worker for its death, so those are tried again at the end, one at a time.
         """
         workers = self._workers()
+        self._check_versions()
         size = max(1, min(LARGEST_CHUNK, len(self._tasks) // (workers * CHUNKS_A_WORKER)))
         chunks = [range(at, min(at + size, len(self._tasks))) for at in range(0, len(self._tasks), size)]
         try:
@@ -118,6 +124,9 @@ class _Run:
             if isinstance(error, KilledWorker):
                 self._suspects.extend(numbers)
             elif error is not None:
+                if not isinstance(error, ShapespaceError):
+                    # A worker of another version that came later may fail in any way, as where it loads the tasks.
+                    self._check_versions()
                 raise error
             answers: list[Any] = [] if error is not None else future.result()
             ended.update(self._submit(left, 1))
@@ -129,23 +138,82 @@ class _Run:
         sent: list[Any] = []
         for _, numbers in zip(range(count), chunks, strict=False):
             tasks = [self._tasks[number] for number in numbers]
-            future = self._client.submit(do_chunk, self._work, tasks, self._timeout_s, pure=False)
+            future = self._client.submit(do_chunk, self._work, tasks, self._timeout_s, __version__, pure=False)
             self._flying[future] = numbers
             sent.append(future)
         return sent
 
     def _workers(self) -> int:
+        sentence = (
+            f"No Dask worker has connected to the scheduler at {self._client.scheduler.address} yet; waiting up to "
+            f"{WORKERS_S:g} s. Start workers with: dask worker {self._client.scheduler.address} --nthreads 1"
+        )
         try:
-            self._client.wait_for_workers(1, timeout=WORKERS_S)
+            with tell_after(TELLS_S, sentence):
+                self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
             raise FitError(
                 f"The Dask cluster has no worker after {WORKERS_S:g} s; start some and run again."
             ) from error
         return max(1, len(self._client.nthreads()))
 
+    def _check_versions(self) -> None:
+        """Refuse workers with another version of shapespace than this process, or with none.
 
-def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None) -> list[R]:
-    """Do some tasks at a worker of Dask, in a process below it that may die without it."""
+        Raises:
+            FitError: there are such workers.
+        """
+        found: Mapping[str, object] = self._client.run(_version_reader(), on_error="return")
+        by_version: dict[str, list[str]] = {}
+        for address, version in sorted(found.items()):
+            by_version.setdefault(str(version), []).append(address)
+        by_version.pop(__version__, None)
+        if by_version:
+            raise FitError(_other_versions(by_version))
+
+
+def _version_reader() -> Callable[[], str]:
+    """Return a function that finds the version of shapespace at a worker.
+
+    It is defined here, not in the module, because Dask then sends its code: a worker of another version may not have
+    this module, and `Client.get_versions` finds what is installed, not what is imported.
+    """
+
+    def version_here() -> str:
+        try:
+            from shapespace.version import __version__ as found
+        except ImportError:
+            return "no shapespace"
+        return found
+
+    return version_here
+
+
+def _other_versions(by_version: Mapping[str, Sequence[str]]) -> str:
+    told = "; ".join(
+        f"{version} at {', '.join(workers[:_MOST_NAMED])}"
+        + (f" and {len(workers) - _MOST_NAMED} more" if len(workers) > _MOST_NAMED else "")
+        for version, workers in by_version.items()
+    )
+    return (
+        f"This process uses shapespace {__version__}, but Dask workers have another version ({told}); install the same "
+        "version on all of them and restart the workers."
+    )
+
+
+def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None, version: str) -> list[R]:
+    """Do some tasks at a worker of Dask, in a process below it that may die without it.
+
+    Raises:
+        FitError: the worker, which may have come after the versions were checked, has another one than `version`.
+    """
+    if version != __version__:
+        from distributed import get_worker
+
+        raise FitError(
+            f"The command uses shapespace {version}, but the Dask worker {get_worker().address} has {__version__}; "
+            "install the same version on both and restart the worker."
+        )
     if getattr(_here, "work", None) != (work, timeout_s):
         if (earlier := getattr(_here, "child", None)) is not None:
             earlier.stop()

@@ -71,14 +71,17 @@ def _telling_a_log(what: str, *, quiet: bool) -> Generator[None]:
     if quiet or sys.stderr.isatty():
         yield
         return
-    later = threading.Timer(TOLD_AFTER_S, _line(what))
+    with tell_after(TOLD_AFTER_S, f"shapespace: {what} ..."):
+        yield
+
+
+@contextmanager
+def tell_after(seconds: float, sentence: str) -> Generator[None]:
+    """Print `sentence` on standard error, above any progress bar, if the block takes longer than `seconds`."""
+    later = threading.Timer(seconds, tqdm.write, (sentence, sys.stderr))
     later.daemon = True
     later.start()
     try:
         yield
     finally:
         later.cancel()
-
-
-def _line(what: str) -> Callable[[], None]:
-    return lambda: print(f"shapespace: {what} ...", file=sys.stderr, flush=True)

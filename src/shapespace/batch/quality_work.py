@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from shapespace.batch.where import Where
 from shapespace.errors import FitError
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
-from shapespace.io.files import make_folder
+from shapespace.io.files import make_folder, temporary_folder
 from shapespace.model.quality import Part, QualitySettings, Shapes
 from shapespace.types import FloatArray, Mesh
 
@@ -55,8 +54,8 @@ class QualityElsewhere:
                 work = QualityWork(Path())
             else:
                 make_folder(self.folder)
-                temporary = stack.enter_context(tempfile.TemporaryDirectory(prefix=".quality-", dir=self.folder))
-                work = QualityWork(Path(temporary) / "shapes.npz")
+                temporary = stack.enter_context(temporary_folder(self.folder))
+                work = QualityWork(temporary / "shapes.npz")
                 work.save(shapes)
             work.remember(shapes)
             stack.callback(_shapes.clear)

@@ -23,7 +23,7 @@ from shapespace.io.tables import checked_table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.results import json_at
-from shapespace.store.rows import META, coefficient_columns, safe_cells
+from shapespace.store.rows import META, coefficient_columns
 from shapespace.store.rows import coefficient_row as coefficient_row
 from shapespace.version import __version__
 
@@ -146,6 +146,7 @@ def fit_record(
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
         "evidence": dict(result.evidence),
+        "chirality": result.chirality,
         **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
         "history": [
@@ -287,4 +288,4 @@ def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: i
     """
     known = list(dict.fromkeys(column for row in rows for column in row if column.startswith(META)))
     columns = coefficient_columns(n_modes, known)
-    write_text(path, checked_table_text(columns, ([row.get(c) for c in columns] for row in map(safe_cells, rows))))
+    write_text(path, checked_table_text(columns, ([row.get(c) for c in columns] for row in rows)))

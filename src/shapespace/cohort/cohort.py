@@ -14,13 +14,14 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.cohort.incomplete import completed_by, completed_shapes
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
 
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
@@ -129,6 +130,9 @@ class Cohort:
         notes: who was left out and why, a sentence each.
         source: where the shapes come from.
         unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
+        observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
+        analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
+            nothing varies. None if all are analysed.
     """
 
     names: tuple[str, ...]
@@ -144,9 +148,16 @@ class Cohort:
     notes: tuple[str, ...] = ()
     source: ShapeSource = ShapeSource()
     unit: LengthUnit = "mm"
+    observed: BoolArray | None = None
+    analysed: BoolArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
+        agree = (self.observed is None or self.observed.shape == (n, len(self.reference))) and (
+            self.analysed is None or self.analysed.shape == (len(self.reference),)
+        )
+        if not agree:
+            raise InputError("The masks of a cohort need a flag for each vertex, and that of observed ones a row each.")
         agree = (
             self.coefficients.shape == (n, len(self.basis))
             and self.basis.shape[1] == self.reference.size
@@ -163,6 +174,31 @@ class Cohort:
     def n_vertices(self) -> int:
         """Number of vertices, V."""
         return len(self.reference)
+
+    @property
+    def observed_share(self) -> FloatArray:
+        """(V,) share of the shapes that observe each vertex; 0 for vertices that are not analysed."""
+        share = np.ones(self.n_vertices) if self.observed is None else self.observed.mean(axis=0)
+        return share if self.analysed is None else np.where(self.analysed, share, 0.0)
+
+    @property
+    def estimated_share(self) -> FloatArray:
+        """(N,) share of the analysed vertices of each shape that are estimates."""
+        if self.observed is None:
+            return np.zeros(len(self))
+        mask = self.observed if self.analysed is None else self.observed[:, self.analysed]
+        return 1.0 - mask.mean(axis=1)
+
+    def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
+        """Return (V,) whether all of some shapes observe a vertex that is analysed; None if they observe all."""
+        if self.observed is None and self.analysed is None:
+            return None
+        seen: BoolArray = np.ones(self.n_vertices, np.bool_)
+        if self.observed is not None:
+            seen = np.logical_and.reduce(self.observed[list(rows)], axis=0, dtype=np.bool_)
+        if self.analysed is not None:
+            seen = np.logical_and(seen, self.analysed)
+        return None if seen.all() else seen
 
     def vertices(self, shape: int | FloatArray) -> FloatArray:
         """Return the vertices (V, 3), mm, of a shape by its number, or of coefficients (K,)."""
@@ -189,6 +225,7 @@ class Cohort:
             sizes_mm=read_only(self.sizes_mm[at]),
             table=self.table.take(rows),
             fitted=None if self.fitted is None else self.fitted.take(rows),
+            observed=None if self.observed is None else self.observed[at],
             notes=(*self.notes, *notes),
         )
 
@@ -230,11 +267,15 @@ class Cohort:
         onto: Cohort | None = None,
         least: int = 2,
         unit: LengthUnit | None = None,
+        observed: BoolArray | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
+        Missing vertices are estimated by their conditional means, by PCA with missing data. Vertices that fewer than
+        half of the shapes observe are not analysed.
+
         Args:
-            shapes: (N, V, 3) mm.
+            shapes: (N, V, 3) mm; vertices that are not-a-number are missing.
             columns: name -> N values, of the table; None and NaN are missing.
             names: of the shapes; None numbers them.
             faces: (F, 3) triangles.
@@ -245,22 +286,38 @@ class Cohort:
             least: how many shapes there must be, where `onto` is None.
             unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
                 after a Procrustes superimposition, which divides the unit out.
+            observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
 
         Raises:
-            InputError: too few shapes, values that are not finite, columns of another length, two shapes that are the
-                same, or other vertices than those of `onto`.
+            InputError: too few shapes, values that are infinite, hardly a vertex observed in a shape, columns of
+                another length, two shapes that are the same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
         fewest = least if onto is None else 1
-        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or not np.isfinite(shapes).all():
+        if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or np.isinf(shapes).any():
             said = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {said} or more finite shapes (N, V, 3), not {shapes.shape}.")
         called = tuple(names) if names is not None else tuple(f"shape {k + 1}" for k in range(len(shapes)))
         cells = {name: tuple(_cell(value) for value in values) for name, values in columns.items()}
+        there: BoolArray = ~np.logical_or.reduce(np.isnan(shapes), axis=2)
+        there = there if observed is None else np.logical_and(there, observed)
+        mask, analysed = None if there.all() else there, None
         sizes = read_only([centroid_size(shape) for shape in shapes])
         if onto is not None:
-            gauge = onto.gauge
+            gauge, analysed = onto.gauge, onto.analysed
+            _refuse_other_vertices(shapes, onto)
+            if analysed is not None:
+                mask = None if there[:, analysed].all() else np.logical_and(there, analysed)
+            if mask is not None:
+                shapes = _completed_by(onto, shapes, there, called)
+            if mask is not None or analysed is not None:
+                part = slice(None) if analysed is None else analysed
+                sizes = read_only([centroid_size(shape[part]) for shape in shapes])
             _bring_onto(shapes, onto)
+        elif mask is not None:
+            found = completed_shapes(shapes, there, called, gauge, faces, align=align)
+            shapes, mask, sizes = found.shapes, found.observed, read_only(found.sizes_mm)
+            analysed = None if found.analysed.all() else found.analysed
         elif align:
             align_in_place(shapes, gauge)
             if gauge == "shape":
@@ -270,6 +327,7 @@ class Cohort:
         cohort = Cohort(
             called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks,
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
+            observed=mask, analysed=analysed,
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort
@@ -287,14 +345,8 @@ class Cohort:
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
-            InputError: as `of_shapes`, or meshes with missing vertices.
+            InputError: as `of_shapes`.
         """
-        holed = [mesh.name for mesh in meshes if not np.isfinite(mesh.vertices).all()]
-        if holed:
-            raise InputError(
-                f"{len(holed)} of {len(meshes)} meshes lack vertices that their scans do not show ({named(holed)}); "
-                "build a model of all and fit it to the scans, or leave these out."
-            )
         first = meshes[0]
         for mesh in meshes[1:]:
             if mesh.vertices.shape != first.vertices.shape or not _same_faces(mesh.faces, first.faces):
@@ -304,7 +356,11 @@ class Cohort:
                 )
         shapes = np.stack([mesh.vertices for mesh in meshes])
         names = [mesh.name for mesh in meshes]
-        found = Cohort.of_shapes(shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least)
+        whole = np.ones(len(first.vertices), dtype=np.bool_)
+        observed = np.stack([whole if mesh.observed is None else mesh.observed for mesh in meshes])
+        found = Cohort.of_shapes(
+            shapes, {}, names=names, faces=first.faces, gauge=gauge, onto=onto, least=least, observed=observed
+        )
         return replace(found, table=table)
 
     @staticmethod
@@ -359,18 +415,33 @@ class Cohort:
 
 def _bring_onto(shapes: FloatArray, onto: Cohort) -> None:
     """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
-    mean = onto.vertices(onto.coefficients.mean(axis=0))
-    if shapes.shape[1:] != mean.shape:
-        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {len(mean)}.")
+    whole = onto.vertices(onto.coefficients.mean(axis=0))
+    part = slice(None) if onto.analysed is None else onto.analysed
+    mean = whole[part]
     middle = mean - mean.mean(axis=0)
-    for k, shape in enumerate(shapes):
+    for k, shape in enumerate(shapes[:, part]):
         if centroid_size(shape) <= 0:
             raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
         moved = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
         if onto.gauge == "shape":
             along = float(np.sum(moved * middle)) / float(np.sum(middle**2))
             moved = mean.mean(axis=0) + (moved - moved.mean(axis=0)) / along
-        shapes[k] = moved
+        shapes[k] = whole
+        shapes[k, part] = moved
+
+
+def _refuse_other_vertices(shapes: FloatArray, onto: Cohort) -> None:
+    if shapes.shape[1] != onto.n_vertices:
+        raise InputError(f"Shapes of {shapes.shape[1]} vertices cannot be compared with those of {onto.n_vertices}.")
+
+
+def _completed_by(onto: Cohort, shapes: FloatArray, there: BoolArray, names: Sequence[str]) -> FloatArray:
+    """Return shapes (M, V, 3) in which analysed vertices that are not `there` (M, V) are estimated by a cohort."""
+    part = np.ones(onto.n_vertices, dtype=np.bool_) if onto.analysed is None else onto.analysed
+    population = np.stack([onto.vertices(k) for k in range(len(onto))])[:, part]
+    out = shapes.copy()
+    out[:, part] = completed_by(population, population.mean(axis=0), shapes[:, part], there[:, part], names, onto.gauge)
+    return out
 
 
 def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:

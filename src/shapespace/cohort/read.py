@@ -22,9 +22,9 @@ from shapespace.store.results import ENDINGS, Results, mesh_at, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, read_only
 
-Surfaces: TypeAlias = Literal["coefficients", "fitted", "dense"]
-SURFACES: tuple[Surfaces, ...] = ("coefficients", "fitted", "dense")
-"""What of a fit stands for its shape: the model's coefficients, or a surface beside its record."""
+Surfaces: TypeAlias = Literal["auto", "coefficients", "fitted", "dense"]
+SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
+"""Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense where all have one."""
 
 _USED = ("converged", "max_iterations")
 _ENDINGS = (*ENDINGS.values(), SURFACE)
@@ -37,7 +37,8 @@ class CohortOptions:
     Args:
         shapes: folder of the results of fits, or of meshes in correspondence; None for that of the table.
         model: file of the model of the fits; None goes by their records.
-        surfaces: one of `SURFACES`.
+        surfaces: one of `SURFACES`; `auto` takes dense surfaces where all fits have one, else coefficients, and is
+            the kind of the shapes of a cohort that these are compared with.
         gauge: `shape` divides size out, `form` keeps it.
         doubtful: take doubtful fits too.
         least: shapes that there must be; one will do where it is compared with what is known already.
@@ -45,7 +46,7 @@ class CohortOptions:
 
     shapes: Path | None = None
     model: Path | None = None
-    surfaces: Surfaces = "coefficients"
+    surfaces: Surfaces = "auto"
     gauge: Gauge = "shape"
     doubtful: bool = False
     least: int = 2
@@ -185,13 +186,14 @@ def _of_results(
         read_only([row.beyond_mm for row in fits]),
         additive,
     )
-    if options.surfaces == "coefficients":
+    kind = _kind(options.surfaces, results, names, options.gauge, fits, onto)
+    if kind == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, options.gauge)
     else:
-        lacking = [name for name in names if not results.has(name, options.surfaces)]
+        lacking = [name for name in names if not results.has(name, kind)]
         if lacking:
-            raise InputError(f"{results.folder} holds no {options.surfaces} surface of {named(lacking)}; fit them again"
-                             f"{' with --dense' if options.surfaces == 'dense' else ''}.")  # fmt: skip
+            raise InputError(f"{results.folder} holds no {kind} surface of {named(lacking)}; fit them again"
+                             f"{' with --dense' if kind == 'dense' else ''}.")  # fmt: skip
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
         if unknown and options.gauge == "form":
             raise InputError(
@@ -200,7 +202,7 @@ def _of_results(
             )
         meshes: list[Mesh] = []
         for at, row in enumerate(fits):
-            mesh = results.surface(row.name, options.surfaces)
+            mesh = results.surface(row.name, kind)
             ratio = row.mm_per_unit if np.isfinite(row.mm_per_unit) else 1.0
             meshes.append(replace(mesh.with_vertices(mesh.vertices * ratio), name=row.name))
             if on_shape is not None:
@@ -210,9 +212,21 @@ def _of_results(
             fitted=fitted,
             landmarks=dict(model.landmarks),
             sizes_mm=sizes,
-            source=fitted.source(options.surfaces),
+            source=fitted.source(kind),
         )
     return replace(cohort, notes=(*notes, *cohort.notes))
+
+
+def _kind(
+    asked: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
+) -> Literal["coefficients", "fitted", "dense"]:
+    """Return which shapes of fits are taken: those asked for, or for `auto` the ones that lose least."""
+    if asked != "auto":
+        return asked
+    if onto is not None and onto.fitted is not None and onto.source.kind in ("coefficients", "fitted", "dense"):
+        return onto.source.kind
+    sized = gauge == "shape" or all(np.isfinite(row.mm_per_unit) for row in fits)
+    return "dense" if sized and all(results.has(name, "dense") for name in names) else "coefficients"
 
 
 def _of_surfaces(

@@ -1,4 +1,4 @@
-"""A table of what is known of shapes, such as subject, sex and age: one row each, read from CSV."""
+"""Covariates of shapes, such as subject, sex and age: a table with one row for each, read from CSV or Excel files."""
 
 from __future__ import annotations
 
@@ -15,24 +15,20 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.meshes import stem_of
-from shapespace.io.tables import CHECKSUM, table_rows
+from shapespace.io.tables import CHECKSUM, KEYS, MISSING, key_column, table_rows
 from shapespace.types import FloatArray, read_only
 
-NAMES = ("file", "scan", "name", "id")
-"""The columns that may name the shape of a row; the first that is there does."""
-
 _META = "meta_"
-_MISSING = frozenset({"", "na", "nan", "n/a", "null", "none"})
 _LARGEST_BYTES = 2**28
 _NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What is known of N shapes, as text.
+    """What is known of N shapes, as text without white space at its ends.
 
     Args:
-        columns: name -> N cells; a cell that says nothing is empty.
+        columns: name -> N cells; a missing one is empty.
         rows: what each row is called in messages, N of them.
         where: what the table is called in messages.
 
@@ -51,6 +47,10 @@ class Table:
                     f"{self.where}: the column {name!r} has {len(cells)} cells for {len(self.rows)} rows; give one "
                     "for each."
                 )
+        plain = {name.strip(): tuple(map(str.strip, cells)) for name, cells in self.columns.items()}
+        if len(plain) < len(self.columns):
+            raise InputError(f"{self.where} has two columns of one name but for white space; rename one of them.")
+        object.__setattr__(self, "columns", plain)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -111,10 +111,11 @@ class Table:
 
 
 def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
-    """Return a CSV table, and the name of the shape of each row, without folder and ending.
+    """Return a table, and the name of the shape of each row, without folder and ending.
 
-    The shape stands in the column `file`, `scan`, `name` or `id`, the first that is there. Columns of a
-    coefficients.csv that came with the list of its scans lose their `meta_`.
+    The table is what `io.tables.table_rows` reads. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
+    that it has, in any case, names the shapes. Columns of a coefficients.csv that came with the list of its scans lose
+    their `meta_`.
 
     Raises:
         FileError: it cannot be read.
@@ -123,14 +124,15 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
     check_file(path, _LARGEST_BYTES, "give a smaller table")
     try:
         lines = table_rows(read_bytes(path))
-        heads = [head.strip() for head in next(lines)]
-        rows = [[_plain(cell) for cell in line] for line in lines]
+        heads = next(lines)
+        rows = [[plain_cell(cell) for cell in line] for line in lines]
     except ValueError as error:
         raise FileFormatError(f"{path} {error}; write it as CSV with a header.") from error
-    names = next((head for head in NAMES if head in heads), None)
-    if names is None or not rows:
-        raise FileFormatError(f"{path} is no table of shapes; it needs rows, and a column {' or '.join(NAMES)}.")
-    places = [PurePath(row[heads.index(names)].replace("\\", "/")) for row in rows]
+    key = key_column(heads)
+    if key is None or not rows:
+        raise FileFormatError(f"{path} is no table of shapes; it needs rows, and a column {' or '.join(KEYS)}.")
+    names = heads[key]
+    places = [PurePath(row[key].replace("\\", "/")) for row in rows]
     # Scans of one name in different folders are called by their folders too, as their fits are.
     several = {stem for stem, count in Counter(stem_of(place) for place in places).items() if count > 1}
     keys = tuple(_with_folders(place) if stem_of(place) in several else stem_of(place) for place in places)
@@ -155,10 +157,12 @@ def _with_folders(place: PurePath) -> str:
     return "_".join((*(part for part in place.parent.parts if part not in (".", "/")), stem_of(place)))
 
 
-def _plain(cell: str) -> str:
-    # The writer of coefficients.csv puts an apostrophe before what a spreadsheet would run.
-    text = (cell[1:] if cell[:1] == "'" and cell[1:2] in tuple("=+-@\t\r") else cell).strip()
-    return "" if text.lower() in _MISSING else "".join(c if c.isprintable() else " " for c in text)
+def plain_cell(cell: str) -> str:
+    """Return the text of a cell without white space at its ends, characters without a shape as spaces; empty where it
+    stands for a missing value."""
+    text = cell if cell.isprintable() else "".join(c if c.isprintable() else " " for c in cell)
+    text = text.strip()
+    return "" if text.lower() in MISSING else text
 
 
 def _is_number(cell: str) -> bool:

@@ -17,6 +17,7 @@ from shapespace.batch.results import read_record
 from shapespace.commands.about import ABOUT, read_about
 from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.procrustes import Gauge
+from shapespace.geometry.surface import without_estimates
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import read_landmark_indices, read_landmarks
@@ -391,7 +392,7 @@ def _odd_size(model: ShapeModel, unit: str) -> list[str]:
 
 def _training_mesh(path: Path) -> Mesh:
     try:
-        mesh = mesh_at(path)
+        mesh = without_estimates(mesh_at(path))
     except MeshError as error:
         raise MeshError(naming(path, str(error))) from error
     if not len(mesh.vertices):

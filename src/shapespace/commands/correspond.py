@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -35,17 +37,21 @@ from shapespace.errors import MeshError, ShapespaceError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import face_areas
+from shapespace.geometry.surface import face_areas, without_estimates
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
+from shapespace.io.json_files import read_json
 from shapespace.io.landmarks import write_landmark_indices
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
 _KEPT = ".rounds"
+_UNREADABLE = "unreadable"
+_WITH_OTHER_FILES = (".gltf",)
+"""Endings of meshes whose vertices may lie in other files."""
 _LISTED = 10
 _ANOTHER_SHAPE = 0.25
 """The mean change of another object, as a share of its size."""
@@ -115,6 +121,10 @@ def _corresponding(
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     marks = LandmarkFiles.of(files.landmarks)
     marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+    inputs_hash = _inputs_hash(jobs, marks, files, settings)
+    if (finished := _finished(jobs, folder, inputs_hash)) is not None:
+        say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
+        return finished
     read = _read_all(jobs, marks, quiet=quiet)
     scans, notes = read.scans, read.notes
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
@@ -146,10 +156,74 @@ def _corresponding(
         settings=asdict(settings),
         version=__version__,
         other_units={record.name: record.unit_ratio for record in records if record.unit_ratio != 1.0},
+        inputs_hash=inputs_hash,
+        results_hash=_results_hash(jobs, folder),
     )
     write_text(folder / SUMMARY, json_text(summary))
     shutil.rmtree(folder / _KEPT, ignore_errors=True)
     return summary, records
+
+
+def _inputs_hash(
+    jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, settings: CorrespondSettings
+) -> str:
+    """Return the SHA-256 of all inputs of a run, without parsing the scans; where it runs makes no difference."""
+
+    def landmarks_hash(scan: Path, own: Path | None) -> str:
+        file = own or marks.of_scan(scan)
+        return "" if file is None else _hash_of(file)
+
+    scans: list[object] = []
+    for job in jobs:
+        try:
+            with job.readable() as file:
+                content = _hash_of(file)
+        except ShapespaceError:
+            content = _UNREADABLE
+        scans.append([job.name, content, landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
+    template = None if files.template is None else [_hash_of(files.template), landmarks_hash(files.template, None)]
+    model = None if files.model is None else _hash_of(files.model)
+    content = json.dumps([scans, template, model, asdict(settings), __version__], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _hash_of(file: Path) -> str:
+    """Return the SHA-256 of a file, and of the vertices of a mesh that names other files with its content."""
+    try:
+        own = sha256_of_file(file)
+        if ending_of(file) not in _WITH_OTHER_FILES:
+            return own
+        mesh = read_mesh(file)
+    except ShapespaceError:
+        return _UNREADABLE
+    parts = [own.encode(), mesh.vertices.tobytes(), b"" if mesh.faces is None else mesh.faces.tobytes()]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def _results_hash(jobs: Sequence[Job], folder: Path) -> str:
+    """Return the SHA-256 of the names and contents of all files of a run except its summary."""
+    names = [MEAN, LANDMARKS, *(f"{job.name}{ending}" for job in jobs for ending in (RECORD, SURFACE))]
+    digest = hashlib.sha256()
+    for name in names:
+        if (folder / name).is_file():
+            digest.update(f"{name} {sha256_of_file(folder / name)}\n".encode())
+    return digest.hexdigest()
+
+
+def _finished(
+    jobs: Sequence[Job], folder: Path, inputs_hash: str
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
+    """Return the summary and records of a finished run with the same inputs whose files are whole; else None."""
+    try:
+        summary = CorrespondenceRecord.from_json(read_json(folder / SUMMARY, CORRESPOND_AGAIN))
+        if summary.inputs_hash != inputs_hash or summary.results_hash != _results_hash(jobs, folder):
+            return None
+        files = [folder / f"{job.name}{RECORD}" for job in jobs]
+        return summary, [
+            read(CorrespondRecord, read_json(file, CORRESPOND_AGAIN), file.name, CORRESPOND_AGAIN) for file in files
+        ]
+    except ShapespaceError:
+        return None
 
 
 class _Rounds:
@@ -275,7 +349,7 @@ def _records(
         record = _record(name, source, one, read.unread.get(name, ""), read.notes.get(name, []))
         record = structs.replace(record, metadata=dict(job.metadata))
         if one is not None and one.vertices is not None:
-            surface = Mesh(one.vertices, made.template.faces, name=name)
+            surface = without_estimates(Mesh(one.vertices, made.template.faces, name=name, observed=one.observed))
             record = _judged(record, surface, made.template, read.scans[name])
         if name in sizes:
             scale, ratio = map(float, sizes[name])
@@ -339,7 +413,7 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         if record.reason or one is None or one.vertices is None:
             remove_file(surface)
         else:
-            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name))
+            write_mesh(surface, Mesh(one.vertices, made.template.faces, name=record.name, observed=one.observed))
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)

@@ -18,7 +18,7 @@ from shapespace.io.files import atomic_path, make_folder, write_bytes, write_err
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import CHECKSUM, write_checked
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
-from shapespace.store.rows import META, coefficient_columns, kind_of, safe_cells
+from shapespace.store.rows import META, coefficient_columns, kind_of
 
 _MAT_HEADER, _MAT_HEADER_BYTES = b"MATLAB 5.0 MAT-file, written by shapespace", 116
 _LONGEST_IN_MATLAB = 63
@@ -111,7 +111,7 @@ def write_table(results: Results, path: Path) -> None:
     with atomic_path(path) as temporary:
         try:
             with temporary.open("w", encoding="utf-8", newline="") as stream:
-                cells = ([row.get(c) for c in columns] for row in map(safe_cells, _rows(results, columns)))
+                cells = ([row.get(c) for c in columns] for row in _rows(results, columns))
                 write_checked(stream, columns, cells)
         except OSError as error:
             raise write_error(path, error) from error

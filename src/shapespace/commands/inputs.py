@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import glob
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,12 +11,16 @@ from shapespace.batch.fit_work import Job
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import MESH_FILE_ENDINGS
+from shapespace.io.json_files import check_file
+from shapespace.io.meshes import MESH_FILE_ENDINGS, stem_of
 from shapespace.io.remote import addresses, is_address
+from shapespace.io.tables import decoded_text, key_column, table_rows
 
-_LISTS = (".csv", ".tsv", ".txt")
-_PLACES = ("scan", "file", "path")
-_LANDMARKS = "landmarks"
+_LISTS = (".csv", ".tsv", ".txt", ".xlsx")
+_PLACES = ("scan", "file", "path", "specimen", "name", "id")
+_LANDMARKS, _ID = "landmarks", "id"
+_LARGEST_BYTES = 2**26
+"""Of a list of scans; a million rows take less."""
 _LONGEST = 200
 
 
@@ -59,8 +61,8 @@ def given_scans(
 
     Args:
         scans: paths of scans and of folders, patterns, addresses, and lists: a text file with one of these in a line,
-            or a CSV table with a column `scan` (or `file`, or `path`), perhaps `id` and `landmarks`, and others that
-            are kept.
+            or a table that `io.tables.table_rows` reads, with a column `scan`, `file`, `path`, `specimen`, `name` or
+            `id`, perhaps `id` and `landmarks` as well, and others that are kept.
         folder: of the results, not looked into.
         recursive: whether to take what lies in folders below too.
         say: told what was not taken.
@@ -123,48 +125,61 @@ def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[
 
 def _rows(file: Path) -> list[Given]:
     """Return the rows of a list, with places relative to its folder."""
+    check_file(file, _LARGEST_BYTES, "give a smaller list")
     try:
-        text = read_bytes(file).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file} is not text in UTF-8; save it as such.") from error
-    if file.suffix.lower() == ".txt":
-        lines = [line.strip() for line in text.splitlines()]
-        rows = [Given(_beside(file, line)) for line in lines if line and not line.startswith("#")]
-    else:
-        rows = _table(file, text)
+        content = read_bytes(file)
+        if file.suffix.lower() == ".txt":
+            lines = [line.strip() for line in decoded_text(content).splitlines()]
+            rows = [Given(_beside(file, line)) for line in lines if line and not line.startswith("#")]
+        else:
+            rows = _table(file, content)
+    except ValueError as error:
+        raise InputError(f"{file} {error}; save it as a CSV table or an Excel workbook.") from error
     if not rows:
         raise InputError(f"{file} lists no scans; write one in a line.")
     return rows
 
 
-def _table(file: Path, text: str) -> list[Given]:
-    if "\0" in text:
-        raise InputError(f"{file} is not a table but binary; save it as CSV.")
-    delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
-    try:
-        lines = [line for line in reader if any(cell.strip() for cell in line)]
-    except csv.Error as error:
-        raise InputError(f"{file} is not a table ({error}); save it as CSV.") from error
-    header = [cell.strip() for cell in lines[0]] if lines else []
-    column = next((name for name in _PLACES if name in header), None)
-    if column is None or len(set(header)) < len(header):
-        raise InputError(
-            f"{file} needs a column named scan, file or path, and no name twice; it has {', '.join(header)}."
-        )
+def _table(file: Path, content: bytes) -> list[Given]:
+    """Return the rows of a table of scans.
+
+    Raises:
+        InputError: it has no column for the scans, or a row without one or with an id that no file can have.
+        ValueError: it is no table; with a clause on the fault.
+    """
+    lines = table_rows(content)
+    header = next(lines)
+    column, called_by, marks_by = (key_column(header, names) for names in (_PLACES, (_ID,), (_LANDMARKS,)))
+    if column is None:
+        raise InputError(f"{file} needs a column named {' or '.join(_PLACES)}; it has {', '.join(header)}.")
+    own = {column, called_by, marks_by}
     rows: list[Given] = []
-    for number, line in enumerate(lines[1:], 2):
-        if len(line) > len(header):
-            raise InputError(f"{file}: row {number} has {len(line)} cells, and the table {len(header)} columns.")
-        cells = dict(zip(header, (cell.strip() for cell in line), strict=False))
-        place, called = cells.pop(column, ""), cells.pop("id", "")
+    for number, line in enumerate(lines, 2):
+        cells = [cell.strip() for cell in line]
+        if any("\0" in cell for cell in cells):
+            raise ValueError("is not a table but binary")
+        place, marks = cells[column], "" if marks_by is None else cells[marks_by]
+        called = "" if called_by is None or called_by == column else cells[called_by]
         if not place:
-            raise InputError(f"{file}: row {number} names no scan in the column {column}.")
+            raise InputError(f"{file}: row {number} names no scan in the column {header[column]}.")
         if called and (called.startswith(".") or len(called.encode()) > _LONGEST or set(called) & set('/\\:*?"<>|\0')):
             raise InputError(f"{file}: row {number} has an id that no file can have, {called[:40]!r}; change it.")
-        marks = cells.pop(_LANDMARKS, "")
-        rows.append(Given(_beside(file, place), called, cells, file.parent / marks if marks else None))
+        known = {head: cells[at] for at, head in enumerate(header) if head and at not in own}
+        rows.append(Given(_scan_at(file, place), called, known, file.parent / marks if marks else None))
     return rows
+
+
+def _scan_at(file: Path, place: str) -> Path | str:
+    """Return the place of a scan, which may be named without its ending where one mesh file has that name."""
+    found = _beside(file, place)
+    if isinstance(found, str) or found.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(place):
+        return found
+    try:
+        there = [one for one in sorted(found.parent.glob(f"{found.name}.*")) if stem_of(one) == found.name]
+        meshes = [one for one in there if one.name.lower().endswith(MESH_FILE_ENDINGS)]
+        return meshes[0] if len(meshes) == 1 and not found.exists() else found
+    except (OSError, ValueError):
+        return found  # the reader of the scans says what is wrong with such a name
 
 
 def _beside(file: Path, text: str) -> Path | str:

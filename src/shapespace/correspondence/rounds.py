@@ -26,9 +26,10 @@ from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
+from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
@@ -87,7 +88,8 @@ class Corresponding:
     Args:
         name: of the scan.
         reason: why it is set aside; empty where it is not.
-        vertices: (V, 3) in the scan's own frame and unit, not-a-number where the scan shows nothing; None if set aside.
+        vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
+            estimates, the conditional means given the observed vertices; None if set aside.
         T_scan_template: to the scan's own frame; None where no pose was found.
         seen: share of the template's vertices that the scan shows.
         covered: share of the scan that the template reaches.
@@ -96,6 +98,7 @@ class Corresponding:
         seconds: CPU time of each round.
         landmarks: RMS distance of the scan's landmarks from their places on the surface, in the scan's unit;
             not-a-number where it has none.
+        observed: (V,) bool, False where `vertices` are estimates; None if set aside.
     """
 
     name: str
@@ -108,6 +111,7 @@ class Corresponding:
     moved: tuple[float, ...] = ()
     seconds: tuple[float, ...] = ()
     landmarks: float = np.nan
+    observed: BoolArray | None = None
 
     __repr__ = short_repr
 
@@ -131,9 +135,11 @@ class Correspondence:
     __repr__ = short_repr
 
     def meshes(self) -> list[Mesh]:
-        """Return the surfaces of those that are not set aside, in their scans' own frames."""
+        """Return the complete surfaces of scans that are not set aside, in their own frames, with `Mesh.observed`."""
         return [
-            Mesh(scan.vertices, self.template.faces, name=scan.name) for scan in self.scans if scan.vertices is not None
+            Mesh(scan.vertices, self.template.faces, name=scan.name, observed=scan.observed)
+            for scan in self.scans
+            if scan.vertices is not None
         ]
 
 
@@ -460,23 +466,38 @@ class _State:
 
     def result(self, why: str) -> Correspondence:
         """Return the scans with what is known of each."""
-        scans = [self._ended(i) for i in range(len(self.names))]
+        complete = self._completed()
+        scans = [self._ended(i, complete.get(i)) for i in range(len(self.names))]
         points = dict(zip(self.places.names, self.places.at(self.template.vertices), strict=True))
         template = self.template.with_vertices(self.template.vertices, points)
         return Correspondence(template, tuple(scans), why, tuple(self.moved))
 
-    def _ended(self, i: int) -> Corresponding:
+    def _completed(self) -> dict[int, FloatArray]:
+        """Return the vertices (V, 3) of each placed scan, in the template's frame, with estimates where not observed.
+
+        An estimate is the conditional mean by probabilistic PCA of all placed scans. A vertex that fewer than
+        `FEWEST` scans show, and any vertex of too few scans for a model, stays where the registration has put it.
+        """
+        order = sorted(self.placed)
+        seen = np.stack([self.placed[i].seen for i in order])
+        shapes = np.stack([self.placed[i].vertices for i in order])
+        learnt = seen.sum(axis=0) >= FEWEST
+        if not seen[:, learnt].all() and len(order) >= _ENOUGH_TO_SETTLE:
+            masked = np.where(seen[:, learnt, None], shapes[:, learnt], np.nan)
+            shapes[:, learnt] = with_estimates(masked, [self.names[i] for i in order])
+        return dict(zip(order, shapes, strict=True))
+
+    def _ended(self, i: int, complete: FloatArray | None) -> Corresponding:
         moves, seconds = tuple(self.moves.get(i, ())), tuple(self.seconds.get(i, ()))
-        if i not in self.placed:
+        if complete is None:
             return Corresponding(self.names[i], self.reasons[i], moved=moves, seconds=seconds)
         placed = self.placed[i]
         T = placed.T_scan_template
-        vertices = T.apply(placed.vertices)
+        vertices = T.apply(complete)
         marks = Marks.shared(self.places, self.scans[i], self.settings.landmark_uncertainty)
         off = np.nan if marks is None else marks.rms(vertices)
-        vertices[~placed.seen] = np.nan
         mean, p95, p99, largest = (T.scale * length for length in placed.distance)
         return Corresponding(
             self.names[i], "", vertices, T, float(placed.seen.mean()), placed.covered, (mean, p95, p99, largest), moves,
-            seconds, off,
+            seconds, off, placed.seen,
         )  # fmt: skip

@@ -7,7 +7,6 @@ Database For Facial Behavior Research*, FGR 2006, A. Savran et al., *Bosphorus D
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 from collections import Counter
@@ -19,6 +18,7 @@ from types import MappingProxyType
 from shapespace.errors import InputError
 from shapespace.io.files import read_bytes, read_error
 from shapespace.io.meshes import MESH_ENDINGS
+from shapespace.io.tables import table_rows
 
 EXPRESSIONS = ("neutral", "anger", "disgust", "fear", "smile", "sadness", "surprise")
 """The words of the studies, in the order in which they are listed."""
@@ -296,9 +296,9 @@ def _bosphorus(path: Path) -> tuple[ScanEntry, tuple[str, ...], tuple[int, int]]
 def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], list[LeftOut]]:
     path = folder / LABELS
     try:
-        rows = list(csv.reader(read_bytes(path).decode("utf-8-sig").splitlines(), strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is not comma-separated text in UTF-8; save it again.") from error
+        rows = list(table_rows(read_bytes(path)))
+    except ValueError as error:
+        raise InputError(f"{path} {error}, so it is not comma-separated text; save it again.") from error
     numbered = [(n, [cell.strip() for cell in row]) for n, row in enumerate(rows, start=1)]
     numbered = [(n, row) for n, row in numbered if any(row)]
     header = [cell.lower() for cell in numbered[0][1]] if numbered else []

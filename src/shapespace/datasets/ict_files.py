@@ -19,12 +19,13 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, TypeAlias, cast
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import DataError, FileFormatError
+from shapespace.io.archives import npy_header
 from shapespace.io.files import atomic_path, read_bytes, read_error
 from shapespace.types import FloatArray, IntArray
 
@@ -177,7 +178,9 @@ def read_packed(path: Path) -> PackedIct:
                 ("faces", "<i4", (3,)),
             ):
                 with archive.open(f"{entry}.npy") as stream:
-                    shape, found = _npy_header(stream)
+                    shape, fortran, found = npy_header(stream)
+                if fortran:
+                    raise ValueError(f"{entry} is in column order")
                 modes = entry in ("identity", "expression", "expression_names")
                 fits = shape == tail if entry == "mean" else shape[1:] == tail and len(shape) == len(tail) + 1
                 if not fits or not found.str.startswith(dtype) or (modes and shape[0] > _MAX_MODES):
@@ -205,16 +208,6 @@ def read_packed(path: Path) -> PackedIct:
             f"{path} is not packed ICT-FaceKit or is damaged ({str(error).strip('.')}); delete it and get it again."
         ) from error
     return packed
-
-
-def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"array format {version} is not supported")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if fortran:
-        raise ValueError("its arrays are in column order")
-    return tuple(shape), cast("np.dtype[np.generic]", dtype)
 
 
 def check_content(packed: PackedIct, hashes: Mapping[str, str], where: Path) -> None:

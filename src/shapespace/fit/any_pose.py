@@ -109,6 +109,29 @@ def search(model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool,
     return upright, sides.upright_unless_clearly_worse(upright, sides.everywhere(upright))
 
 
+def refine(
+    model: ShapeModel,
+    scan_vertices_mm: FloatArray,
+    starts: Sequence[Similarity],
+    *,
+    with_scale: bool,
+    step: Step = LONG,
+    seed: int = 0,
+) -> list[Pose]:
+    """Return the pose to which one step of the search leads from each of `starts`, in their order.
+
+    Args:
+        model: the shape space.
+        scan_vertices_mm: (S, 3).
+        starts: from the model's frame to the scan's, mm.
+        with_scale: whether the pose has a free scale.
+        step: of the search.
+        seed: of the subsample that is searched.
+    """
+    sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
+    return [sides.refined(step, T.rotation, T.translation, T.scale) for T in starts]
+
+
 def _score(pose: Pose) -> float:
     return pose.score_mm
 
@@ -188,8 +211,8 @@ class _Sides:
     def upright(self) -> Pose:
         """Return the better of two poses without rotation: centres together, or the outermost parts."""
         R, t = self._placed(np.eye(3)[None])
-        pose = self._refined(GLANCE, R[0], t[0])
-        return pose if self.is_close(pose) else min(pose, self._refined(GLANCE, R[1], t[1]), key=_score)
+        pose = self.refined(GLANCE, R[0], t[0])
+        return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
 
     def is_close(self, pose: Pose) -> bool:
         """Return whether the model fits so well there that it is worth asking whether anything else fits better."""
@@ -201,7 +224,7 @@ class _Sides:
         T, centre = pose.T_scan_model, self.model.points.mean(axis=0)
         for axis in self.model.axes:
             R = T.rotation @ (2 * np.outer(axis, axis) - np.eye(3))
-            out.append(self._refined(FLIPS, R, T.apply(centre) - T.scale * R @ centre, T.scale))
+            out.append(self.refined(FLIPS, R, T.apply(centre) - T.scale * R @ centre, T.scale))
         return out
 
     def everywhere(self, upright: Pose) -> list[Pose]:
@@ -218,7 +241,7 @@ class _Sides:
             order = np.argsort(score)
             kept = order[_distinct_rows(R[order], t[order], step.kept, _SAME_TURN, _SAME_PLACE * size)]
             R, t = R[kept], t[kept]
-        coarse = sorted((self._refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
+        coarse = sorted((self.refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
         coarse = _distinct(coarse, len(coarse), _SAME_TURN)
         poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.kept]]
         poses = sorted([upright, *poses], key=_score)
@@ -255,11 +278,12 @@ class _Sides:
 
     def _again(self, step: Step, pose: Pose) -> Pose:
         T = pose.T_scan_model
-        return self._refined(step, T.rotation, T.translation, T.scale, pose.b)
+        return self.refined(step, T.rotation, T.translation, T.scale, pose.b)
 
-    def _refined(
+    def refined(
         self, step: Step, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
     ) -> Pose:
+        """Return the pose to which `step` leads from a pose and the coefficients `b` of the leading modes."""
         begun = Similarity(scale, R, t)
         shape = self.model.shapes[min(step.modes, max(self.model.shapes))]
         R, t, out = np.array(R), np.array(t), np.empty(3)

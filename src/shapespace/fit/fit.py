@@ -188,7 +188,10 @@ def fit_scan(
         clock.append(time.perf_counter())
         limits = config.limits(model)
         if held is not None:
-            limits, on_state = replace(limits, modes=None), None if on_state is None else held.telling(on_state)
+            limits, on_state = (
+                replace(limits, modes=None, part=True),
+                None if on_state is None else held.telling(on_state),
+            )
         driven = _drive(own, placed, config, limits, on_state)
         clock.append(time.perf_counter())
         stages = _measure(own, placed, driven, config)

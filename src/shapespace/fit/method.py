@@ -21,11 +21,13 @@ class Limits:
         with_scale: whether the pose has a free scale.
         modes: how many coefficients to report, from the first; None for all.
         max_iterations: cap of each phase.
+        part: whether the model is a part of a larger one, which need not be symmetric where the whole is.
     """
 
     with_scale: bool
     modes: int | None
     max_iterations: int
+    part: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from shapespace.errors import InputError
 from shapespace.fit.colours import carried_colours
 from shapespace.fit.regions import MATCHED, SHOWN
 from shapespace.fit.state import IcpState
+from shapespace.fit.trust import Chirality, chirality_of
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.late import OpenViewer, late
@@ -184,6 +185,15 @@ class FitResult:
             seen = np.isin(self.regions, MATCHED) if followed is None else followed
             found[name] = carried_colours(colours, self.scan, self.find_closest(self._vertices(name)), seen)
         return found
+
+    @property
+    def chirality(self) -> Chirality:
+        """Whether the scan is `mirrored` or `as scanned`; `undecidable` where its mirror image fits about as well.
+
+        That is so for a model that is mirror-symmetric, such as one of faces, for a region of a model, and by the
+        paper's method, which does not test it.
+        """
+        return chirality_of(self.evidence)
 
     @property
     def iterations(self) -> dict[str, int]:

@@ -303,10 +303,16 @@ def robust_icp(
 
     gathered, equations = problem.equations(look, at, len(at.b))
     surface, vertices = problem.surface, look.matches.vertices
-    known = posterior(
-        model, surface, problem.prior, equations, look.weights, look.sigma_mm,
-        beyond_model_mm=float(np.sqrt(max(left_mm2, 0.0))), allowed_share=float(vertices.allowed.mean()),
-    )  # fmt: skip
+    try:
+        known = posterior(
+            model, surface, problem.prior, equations, look.weights, look.sigma_mm,
+            beyond_model_mm=float(np.sqrt(max(left_mm2, 0.0))), allowed_share=float(vertices.allowed.mean()),
+        )  # fmt: skip
+    except LinAlgError as error:
+        raise FitError(
+            f"{target.mesh.name}: the matches do not determine the pose; check the scan's unit (--unit), or give "
+            "landmarks (--landmarks)."
+        ) from error
     # Modes that nobody asked for are no reason to doubt the fit, so the verdict is on all of them.
     every = told = problem.told(at, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)

@@ -12,7 +12,15 @@ from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
 from shapespace.fit.start import Start, start_evidence
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.trust import doubts_of_layers, doubts_of_robust
+from shapespace.fit.trust import (
+    chirality_of,
+    doubts_of_chirality,
+    doubts_of_few_shapes,
+    doubts_of_inconsistent_parts,
+    doubts_of_layers,
+    doubts_of_reliability,
+    doubts_of_robust,
+)
 from shapespace.model.shape_model import ShapeModel
 
 
@@ -31,7 +39,8 @@ class Robust(RobustSettings):
         self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
     ) -> Generator[IcpState, None, Fitted]:
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
-        from shapespace.fit.another import another_beside, layers  # compiled
+        from shapespace.fit.another import displaced, find_second_instance, layers  # compiled
+        from shapespace.fit.chirality import mirrored_log_odds
         from shapespace.fit.robust import robust_icp
 
         fitted = yield from robust_icp(
@@ -43,15 +52,33 @@ class Robust(RobustSettings):
             modes=limits.modes,
             max_iterations=limits.max_iterations,
         )
-        evidence = {**fitted.evidence, **start_evidence(start), **layers(model, scan, fitted)}
+        evidence = {
+            **fitted.evidence,
+            "training_shapes": float(model.n_training),
+            **start_evidence(start),
+            **layers(model, scan, fitted),
+            **displaced(model, scan, fitted),
+        }
         evidence |= reliability(evidence).as_evidence()
-        beside = another_beside(model, scan, fitted, self, with_scale=limits.with_scale)
-        return replace(fitted, evidence=evidence, notes=(*fitted.notes, *(() if beside is None else (beside,))))
+        if not limits.part:
+            log_odds = mirrored_log_odds(model, scan, fitted, self, with_scale=limits.with_scale)
+            evidence |= {} if log_odds is None else {"mirrored_log_odds": log_odds}
+        second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
+        notes = [*fitted.notes, *([] if second is None else [second.note])]
+        if "mirrored_log_odds" in evidence and chirality_of(evidence) == "undecidable":
+            notes.append("Whether the scan is mirrored is undecidable: its mirror image fits the model about as well.")
+        return replace(fitted, evidence=evidence | ({} if second is None else second.as_evidence()), notes=notes)
 
     def doubts(self, ended: Ended) -> list[str]:
         """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""
         evidence = ended.fitted.evidence
-        return [*doubts_of_layers(evidence), *doubts_of_robust(evidence)]
+        return [
+            *doubts_of_chirality(evidence),
+            *doubts_of_layers(evidence),
+            *doubts_of_inconsistent_parts(evidence),
+            *doubts_of_few_shapes(evidence),
+            *(doubts_of_robust(evidence) or doubts_of_reliability(evidence)),
+        ]
 
     def reason(self, ended: Ended) -> str:
         """Return that it stood still, and how near."""

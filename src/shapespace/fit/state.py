@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,6 +70,15 @@ class Fitted:
     b_covariance: FloatArray | None = None
     notes: Sequence[str] = ()
     landmark_covariance: FloatArray | None = None
+
+
+def last_of(states: Generator[IcpState, None, Fitted]) -> Fitted:
+    """Return the end of a fit, whose states nobody follows."""
+    while True:
+        try:
+            next(states)
+        except StopIteration as end:
+            return end.value
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from shapespace.fit.reliability import FAILED_SHARE
+
+Chirality: TypeAlias = Literal["as scanned", "mirrored", "undecidable"]
+"""Whether left and right of a scan are as those of the model."""
 
 _OFFSET = -3.70
 _LEAST_SHARE = 0.01
@@ -21,6 +27,22 @@ _ALL_OVER = 0.8
 """A model is called too narrow only where its surface has the scan near all over."""
 _LAYERED = 0.16
 """Share of a scan over which it has two surfaces; chosen on fits of `benchmarks/reliability.py`."""
+_PROBABLY_FAILED = 0.5
+"""Failure probability above which a fit is doubted, whatever its score is."""
+_DISPLACED, _PURE, _PURE_INWARD = 0.035, 0.6, 0.35
+"""Share of the scan that is displaced, and of its unexplained parts, above which its parts do not fit together. Correct
+fits of the development seeds of `benchmarks/odd_cases.py` stay below one or the other. Hair lies outside the surface
+and reaches a purity of 0.49, so parts inside it need less."""
+_SCATTERED, _NOISY = 0.35, 0.02
+"""Share of the scan that scatters, and spread of the matches as a share of the size, from which noise hides the shape.
+Of those seeds, scans with noise of 5 to 15 % of the size reach both, and those with 20 % outliers neither."""
+_FEW_SHAPES = 10
+"""Fewest shapes of the models that `reliability` was calibrated on."""
+_LEAVES_SPAN = 0.005
+"""Share of the size; shapes in the span of a model leave it by less than 0.001 (`benchmarks/odd_cases.py`)."""
+_DECIDED = 5.0
+"""Log odds (nats) from which the chirality counts as decided: odds of 150 to 1. Of `benchmarks/odd_cases.py`, the 25
+mirrored scans of the development seeds reach 7 and more, correct fits of unmirrored scans -11 and less."""
 
 
 @dataclass(frozen=True)
@@ -173,3 +195,66 @@ def doubts_of_layers(evidence: Mapping[str, float]) -> list[str]:
     if evidence["layered_share"] < _LAYERED:
         return []
     return [f"the scan shows two surfaces on top of each other, about {evidence['layers_apart_mm']:.1f} mm apart"]
+
+
+def doubts_of_inconsistent_parts(evidence: Mapping[str, float]) -> list[str]:
+    """Return reasons to doubt a fit whose scan has parts that fit the model only apart from each other."""
+    found: list[str] = []
+    if evidence.get("second_instance_gap_mm", 0.0) < 0.0:
+        found.append(
+            f"the scan shows two overlapping instances, {evidence['second_instance_mm']:.0f} mm apart; crop it to one "
+            "of them (--crop)"
+        )
+    share, inward = evidence["displaced_share"], evidence["displaced_inward_share"]
+    pure = _PURE_INWARD if inward > _DISPLACED else _PURE
+    if share > _DISPLACED and evidence["displaced_purity"] > pure:
+        found.append(
+            f"{100 * share:.0f} % of the scan runs along the fitted surface at a distance from it, as where its parts "
+            "differ in scale or position; check how the scan was assembled, or crop it (--crop)"
+        )
+    if evidence["scattered_share"] > _SCATTERED and evidence["spread_mm"] > _NOISY * evidence["size_mm"]:
+        found.append(
+            f"{100 * evidence['scattered_share']:.0f} % of the scan scatters widely around the fitted surface; remove "
+            "its noise first"
+        )
+    return found
+
+
+def doubts_of_few_shapes(evidence: Mapping[str, float]) -> list[str]:
+    """Return a reason to doubt a fit that leaves the span of a model of few shapes; none where it does not."""
+    shapes, left = evidence["training_shapes"], evidence["beyond_model_mm"]
+    if not 0 < shapes < _FEW_SHAPES or left < _LEAVES_SPAN * evidence["size_mm"]:
+        return []
+    return [
+        f"the model is made of {shapes:.0f} shapes, too few to predict how others differ, and this shape leaves its "
+        f"span by {left:.1f} mm; build a model of at least {_FEW_SHAPES} shapes"
+    ]
+
+
+def doubts_of_reliability(evidence: Mapping[str, float]) -> list[str]:
+    """Return a reason to doubt a fit that has probably failed by its expected error; none where it has not."""
+    if evidence["failure_probability"] <= _PROBABLY_FAILED:
+        return []
+    return [
+        f"its vertices are expected to be {evidence['expected_error_mm']:.1f} mm off (90 % interval "
+        f"{evidence['error_low_mm']:.1f} to {evidence['error_high_mm']:.1f} mm), where "
+        f"{FAILED_SHARE * evidence['size_mm']:.1f} mm is the limit; build a model of more shapes or modes"
+    ]
+
+
+def doubts_of_chirality(evidence: Mapping[str, float]) -> list[str]:
+    """Return a reason to doubt a fit whose scan is mirrored; none where it is not, or where that is undecidable."""
+    if chirality_of(evidence) != "mirrored":
+        return []
+    return [
+        "the scan is mirrored: its mirror image fits the model better; mirror the scan (negate one coordinate of each "
+        "vertex and reverse the triangles) and fit it again"
+    ]
+
+
+def chirality_of(evidence: Mapping[str, float]) -> Chirality:
+    """Return whether the scan is mirrored, by `mirrored_log_odds`, which symmetric models do not have."""
+    log_odds = evidence.get("mirrored_log_odds", 0.0)
+    if abs(log_odds) < _DECIDED:
+        return "undecidable"
+    return "mirrored" if log_odds > 0.0 else "as scanned"

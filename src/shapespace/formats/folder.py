@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
 from shapespace.errors import InputError
-from shapespace.io.files import write_error
+from shapespace.io.files import temporary_folder, write_error
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -23,8 +22,8 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             raise InputError(f"{path} is there already; give the name of a new folder.")
         path.parent.mkdir(parents=True, exist_ok=True)
         # Beside it, so that one step puts it there.
-        with tempfile.TemporaryDirectory(prefix=".shapespace-", dir=path.parent) as temporary:
-            whole = Path(temporary) / "whole"
+        with temporary_folder(path.parent) as temporary:
+            whole = temporary / "whole"
             whole.mkdir()
             for name, data in files.items():
                 (whole / name).write_bytes(data)

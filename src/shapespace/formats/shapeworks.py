@@ -6,7 +6,6 @@ D, text files of `x y z` rows, and `groomed_D`, the surface on which the local p
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -17,32 +16,40 @@ from typing import Any, cast
 import numpy as np
 from scipy.fft import dct
 from scipy.interpolate import RBFInterpolator
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
-from shapespace.errors import FileError, InputError, ModelFileError, ShapespaceError
+from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
 from shapespace.formats.folder import write_folder
 from shapespace.formats.parts import LinearModel, Modes
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.archives import zip_members
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.json_files import check_file, json_of
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES, Allowance
 from shapespace.io.meshes import MESH_ENDINGS, read_mesh
-from shapespace.io.parsing import floats_of, number_lines, xml_root
+from shapespace.io.parsing import floats_of, number_lines
 from shapespace.io.vtk import write_vtk
+from shapespace.io.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
 _LARGEST_PROJECT_BYTES = 2**26
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
-_CELL = re.compile(r"([A-Z]{1,3})\d+")
 _ON_PARTICLES = 1e-6
+MOST_DENSE = 2_000
+"""Particles through which one spline passes; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
+NEIGHBOURS = 32
+"""Particles of a local spline: within 0.1 % (RMS) of the dense one, by tests/formats/test_shapeworks_projects.py."""
+_BATCH = 512
+"""Points whose splines are solved together: 40 MB of matrices."""
+_MOST_CARRIED_BYTES = 2**31
+"""Memory of the modes of a carried mesh (2 GiB)."""
 _MOST_APART = 0.02
 """Of the size of a shape: further from its mesh, the particles are those of another."""
 _IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
-_RELATIONS = "xl/_rels/workbook.xml.rels"
 
 Row = Mapping[str, str]
 
@@ -184,8 +191,10 @@ def _model(project: _Project) -> LinearModel:
         notes.append(f"It is a point model of {len(points)} particles: {surface}.")
     elif surface.carry is None:
         faces = surface.faces
+    elif isinstance(carried := surface.carried(points, moved), str):
+        notes.append(f"It is a point model of {len(points)} particles: {carried}.")
     else:
-        points, moved = surface.carried(points, moved)
+        points, moved = carried
         faces = surface.faces
         notes.append(
             f"Its surface is the mesh of {surface.subject}, the most average subject, carried by the particles with "
@@ -229,8 +238,10 @@ class _Surface:
     faces: IntArray
     carry: Sequence[tuple[FloatArray, FloatArray]] | None
 
-    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry."""
+    def carried(self, mean: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry, or why not."""
+        if 24 * sum(len(mesh) for _, mesh in self.carry or ()) * (1 + moved.shape[1]) > _MOST_CARRIED_BYTES:
+            return f"its modes on the mesh of {self.subject} would take more than {_MOST_CARRIED_BYTES >> 30} GiB"
         steps = moved.reshape(len(mean), -1)
         at, vertices, modes = 0, list[FloatArray](), list[FloatArray]()
         for particles, mesh in self.carry or ():
@@ -238,11 +249,64 @@ class _Surface:
             at += len(particles)
             # Splines are linear in what the particles do, so that the model stays a linear one.
             what = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
-            spline = RBFInterpolator(particles, what, kernel="linear", degree=1)
-            found = np.asarray(spline(mesh), dtype=np.float64)
+            try:
+                found = interpolate_displacements(particles, what, mesh)
+            except np.linalg.LinAlgError:
+                return "its particles lie in a plane or nearly coincide, so that they carry no mesh"
             vertices.append(mesh + found[:, :3])
             modes.append(found[:, 3:].reshape(3 * len(mesh), -1))
         return np.concatenate(vertices), np.concatenate(modes)
+
+
+def interpolate_displacements(
+    particles: FloatArray, values: FloatArray, points: FloatArray, *, most_dense: int = MOST_DENSE
+) -> FloatArray:
+    """Interpolate values at particles to other points by biharmonic splines.
+
+    Up to `most_dense` particles, one spline passes through all of them: time grows with their cube. More particles
+    are fitted by an affine map, and a spline through the `NEIGHBOURS` nearest particles interpolates the residuals at
+    each point, as `scipy.interpolate.RBFInterpolator(neighbors=...)` does: time grows with the number of points.
+
+    Args:
+        particles: (P, 3) mm, P at least 5, all different.
+        values: (P, D) such as displacements and modes, mm.
+        points: (V, 3) mm.
+        most_dense: the largest P for which one spline passes through all particles.
+
+    Returns:
+        (V, D) values at the points.
+
+    Raises:
+        np.linalg.LinAlgError: the particles lie in a plane, or nearly coincide.
+    """
+    if len(particles) <= most_dense:
+        spline = RBFInterpolator(particles, values, kernel="linear", degree=1)
+        return np.asarray(spline(points), dtype=np.float64)
+    centre = particles.mean(axis=0)
+    design = np.column_stack([np.ones(len(particles)), particles - centre])
+    affine = np.linalg.lstsq(design, values, rcond=None)[0]
+    nearest = np.asarray(KDTree(particles).query(points, NEIGHBOURS)[1], dtype=np.int64)
+    weights = np.concatenate(
+        [
+            _spline_weights(points[at : at + _BATCH], particles[nearest[at : at + _BATCH]])
+            for at in range(0, len(points), _BATCH)
+        ]
+    )
+    starts = np.arange(0, nearest.size + 1, NEIGHBOURS)
+    matrix = csr_array((weights.ravel(), nearest.ravel(), starts), shape=(len(points), len(particles)))
+    residuals = np.asarray(matrix @ (values - design @ affine), dtype=np.float64)
+    return residuals + np.column_stack([np.ones(len(points)), points - centre]) @ affine
+
+
+def _spline_weights(points: FloatArray, neighbours: FloatArray) -> FloatArray:
+    """Return the weights (B, k) of a biharmonic spline with a constant, through `neighbours` (B, k, 3), at `points`."""
+    count = neighbours.shape[1]
+    system = np.ones((len(points), count + 1, count + 1))
+    system[:, :count, :count] = -np.linalg.norm(neighbours[:, :, None] - neighbours[:, None], axis=3)
+    system[:, count, count] = 0.0
+    right = np.ones((len(points), count + 1, 1))
+    right[:, :count, 0] = -np.linalg.norm(neighbours - points[:, None], axis=2)
+    return np.asarray(np.linalg.solve(system, right)[:, :count, 0], dtype=np.float64)
 
 
 def _surface(
@@ -307,40 +371,8 @@ def _rows(data: object) -> list[Row]:
 def _sheet(content: bytes, path: Path) -> list[Row]:
     """Return the rows of the sheet `data` of a workbook, by their headings."""
     try:
-        members = zip_members(io.BytesIO(content), len(content))
-    except (ValueError, OSError) as error:
-        raise ModelFileError(f"{path} is no workbook, or it is cut short ({error}); {_AGAIN}.") from error
-    strings = [
-        "".join(part.text or "" for part in one.iter() if part.tag.endswith("}t"))
-        for one in _elements(members, "xl/sharedStrings.xml", "si", path)
-    ]
-    sheets = {sheet.get("name"): sheet for sheet in _elements(members, "xl/workbook.xml", "sheet", path)}
-    if "data" not in sheets:
-        raise ModelFileError(f"{path} has no sheet called data, so it is no project of ShapeWorks; {_AGAIN}.")
-    key = next((value for name, value in sheets["data"].items() if name.endswith("}id")), "")
-    targets = {one.get("Id"): one.get("Target", "") for one in _elements(members, _RELATIONS, "Relationship", path)}
-    target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
-    table: list[dict[str, str]] = []
-    for row in _elements(members, f"xl/{target}", "row", path):
-        cells: dict[str, str] = {}
-        for cell in row:
-            at = _CELL.fullmatch(cell.get("r", ""))
-            text = "".join(part.text or "" for part in cell.iter() if part.tag.endswith(("}v", "}t")))
-            if at is None:
-                continue
-            if cell.get("t") == "s":
-                text = strings[int(text)] if text.isdecimal() and int(text) < len(strings) else ""
-            cells[at[1]] = text
-        table.append(cells)
-    if not table:
-        return []
-    heads = table[0]
+        table = sheet_rows(content, "data")
+    except ValueError as error:
+        raise ModelFileError(f"{path} {error}, so it is no project of ShapeWorks; {_AGAIN}.") from error
+    heads = table[0] if table else {}
     return [{heads[at]: text for at, text in cells.items() if at in heads} for cells in table[1:]]
-
-
-def _elements(members: Mapping[str, bytes], name: str, tag: str, path: Path) -> list[Any]:
-    try:
-        root = xml_root(members.get(name, b"<none/>"), path)
-    except FileError as error:
-        raise ModelFileError(f"{path} is a damaged workbook; {_AGAIN}.") from error
-    return [one for one in root.iter() if one.tag.rpartition("}")[2] == tag]

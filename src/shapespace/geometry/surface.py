@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from shapespace.errors import MeshError
@@ -35,7 +37,16 @@ def part_of(mesh: Mesh, kept: BoolArray) -> Mesh:
     else:
         vertices, faces = without_vertices(mesh.vertices, faces, kept)
     colours = None if mesh.colours is None else mesh.colours[kept]
-    return Mesh(vertices, faces, mesh.landmarks, mesh.name, colours, mesh.notes)
+    observed = None if mesh.observed is None else mesh.observed[kept]
+    return Mesh(vertices, faces, mesh.landmarks, mesh.name, colours, mesh.notes, observed)
+
+
+def without_estimates(mesh: Mesh) -> Mesh:
+    """Return `mesh` with not-a-number at the vertices that are not observed, and no mask."""
+    if mesh.observed is None:
+        return mesh
+    vertices = np.where(mesh.observed[:, None], mesh.vertices, np.nan)
+    return replace(mesh, vertices=vertices, observed=None)
 
 
 def rms_size(points: FloatArray) -> float:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.io.archives import arrays_in
 from shapespace.io.files import atomic_path
 
 
@@ -26,7 +26,7 @@ def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]] | None:
     """Return the arrays in `path`; None where there are none, or none that are whole."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            return {name: np.asarray(stored[name]) for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        with path.open("rb") as stream:
+            return arrays_in(stream, path.stat().st_size)
+    except (OSError, ValueError):
         return None

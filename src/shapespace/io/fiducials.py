@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.io.landmarks import LANDMARK_FORMATS, csv_text
+from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.tables import rows_text
 
 FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
 """Of the files that hold the landmarks of a fit, after NAME."""
@@ -34,7 +35,7 @@ def fiducial_texts(found: Found) -> dict[str, str]:
 
 def _table(found: Found) -> str:
     header = ["name", *_AXES, *(f"stddev_{axis}_mm" for axis in _AXES)]
-    return csv_text([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
+    return rows_text([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
 
 
 def _markups(found: Found) -> str:
@@ -50,7 +51,7 @@ def _fcsv(found: Found) -> str:
         [str(number), *_told(one["at"]), "0", "0", "0", "1", "1", "1", "0", name, _described(one["stddev_mm"]), ""]
         for number, (name, one) in enumerate(found.items(), 1)
     ]
-    return _FCSV + csv_text(rows)
+    return _FCSV + rows_text(rows)
 
 
 def _told(numbers: Sequence[float] | None) -> list[str]:

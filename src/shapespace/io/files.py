@@ -8,6 +8,7 @@ import hashlib
 import os
 import platform
 import re
+import shutil
 import stat
 import tempfile
 import time
@@ -18,8 +19,8 @@ from pathlib import Path
 from shapespace.errors import FileError
 
 _TEMPORARY = ".shapespace-"
-_HOST = re.sub(r"\W|_", "", platform.node())[:24]
 _LEFT_S = 3600.0
+"""Temporary files of another machine, where no process can be asked, are removed after this time in seconds."""
 _WRITE_HINTS = {
     errno.ENOSPC: "the disk is full; free some space and run again",
     errno.EACCES: "no permission; choose another folder",
@@ -31,6 +32,20 @@ _WRITE_HINTS = {
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EEXIST: "a file of that name is in the way; choose another folder",
 }
+
+
+def _host() -> str:
+    """Return a word for this machine; on Linux also for the process numbers of this container."""
+    try:
+        space = Path("/proc/self/ns/pid").stat().st_ino
+    except OSError:
+        space = 0
+    return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node())[:24]}n{space}"
+
+
+_HOST = _host()
+_swept: set[Path] = set()
+"""Folders from which this process has removed the temporary files of killed processes."""
 
 
 def write_error(path: Path, error: OSError) -> FileError:
@@ -155,14 +170,42 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
                 raise write_error(path, error) from error
 
 
-def _temporary_beside(path: Path) -> Path:
+@contextlib.contextmanager
+def temporary_folder(parent: Path) -> Generator[Path]:
+    """Yield a new folder in `parent` that vanishes when the block ends, or with the next write after a kill.
+
+    Raises:
+        FileError: `parent` cannot be written.
+    """
+    _sweep_once(parent)
     try:
-        prefix = f"{_TEMPORARY}{_HOST}-{os.getpid()}-{path.stem[:40]}."
-        handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
+        stack = tempfile.TemporaryDirectory(prefix=_prefix("folder"), dir=parent)
+    except OSError as error:
+        raise write_error(parent, error) from error
+    with stack as name:
+        yield Path(name)
+
+
+def _prefix(stem: str) -> str:
+    return f"{_TEMPORARY}{_HOST}-{os.getpid()}-{stem}."
+
+
+def _temporary_beside(path: Path) -> Path:
+    _sweep_once(path.parent)
+    try:
+        handle, name = tempfile.mkstemp(prefix=_prefix(path.stem[:40]), suffix=path.suffix, dir=path.parent)
         os.close(handle)
     except OSError as error:
         raise write_error(path, error) from error
     return Path(name)
+
+
+def _sweep_once(folder: Path) -> None:
+    """Remove what killed processes left in `folder`, before this process first writes there."""
+    folder = folder.absolute()
+    if folder not in _swept:
+        _swept.add(folder)
+        sweep(folder)
 
 
 def _put(temporary: Path, path: Path) -> None:
@@ -173,21 +216,23 @@ def _put(temporary: Path, path: Path) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the temporary files of processes that were killed as they wrote into `folder`.
+    """Remove the temporary files and folders of processes that were killed as they wrote into `folder`.
 
-    Those of another machine are left for an hour, since nobody here knows whether it writes still.
+    Every writer does so before its first file in a folder. Those of another machine, or of any on Windows, are left
+    for an hour, since whether their process still writes cannot be known.
     """
     for path in folder.glob(f"{_TEMPORARY}*-*-*"):
         host, pid = path.name.removeprefix(_TEMPORARY).split("-")[:2]
-        with contextlib.suppress(OSError, ValueError):
-            ended = _has_ended(int(pid)) if host == _HOST else time.time() - path.stat().st_mtime > _LEFT_S
-            if ended:
-                path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError, ValueError, OverflowError):
+            known = host == _HOST and os.name != "nt"  # Windows has no harmless signal to ask with
+            if _has_ended(int(pid)) if known else time.time() - path.lstat().st_mtime > _LEFT_S:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
 
 
 def _has_ended(pid: int) -> bool:
-    if os.name == "nt":
-        return False  # there is no harmless signal to ask with
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

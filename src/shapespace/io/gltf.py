@@ -31,7 +31,7 @@ from shapespace.io.parsing import (
     mesh_of,
     strip_triangles,
 )
-from shapespace.io.textures import Pictures, TextureError, beside
+from shapespace.io.textures import FilesBeside, Pictures, TextureError
 from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -83,6 +83,10 @@ class _Gltf:
     allowance: Allowance
     buffers: dict[str | None, bytes] = field(default_factory=lambda: dict[str | None, bytes]())
     pictures: Pictures = field(default_factory=Pictures)
+    files: FilesBeside = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.files = FilesBeside(self.path)
 
     def buffer(self, index: int) -> bytes:
         entry = self.tree["buffers"][index]
@@ -453,8 +457,10 @@ def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[
         # Of glTF the upper left corner is the origin.
         uv[:, 1] = 1.0 - uv[:, 1]
         uri = str(image.get("uri", ""))
-        name = f"{number} in it" if not uri or uri.startswith("data:") else unquote(uri)
-        return gltf.pictures.sampled(name, partial(_picture, gltf, image), uv)
+        if not uri or uri.startswith("data:"):
+            return gltf.pictures.sampled(f"{number} in it", partial(_picture, gltf, image), uv)
+        file = gltf.files.find(unquote(uri), "its picture")
+        return gltf.pictures.sampled(file.name, partial(gltf.files.read, file, "its picture"), uv, str(file))
     except TextureError as reason:
         notes.append(f"It is read without all of its colours: {reason}.")
         return None
@@ -463,13 +469,11 @@ def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[
 
 
 def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
-    """Return the content of a picture that lies in a buffer, in the JSON or in a file."""
+    """Return the content of a picture that lies in a buffer or in the JSON."""
     if "bufferView" in image:
         length = int(gltf.tree["bufferViews"][image["bufferView"]]["byteLength"])
         return gltf.view(image["bufferView"], 0, np.dtype(np.uint8), length, 1).tobytes()
-    if image["uri"].startswith("data:"):
-        return base64.b64decode(image["uri"].partition(",")[2], validate=True)
-    return beside(gltf.path, unquote(image["uri"]), "its picture")
+    return base64.b64decode(image["uri"].partition(",")[2], validate=True)
 
 
 def _from_linear(values: Values) -> ByteArray | None:

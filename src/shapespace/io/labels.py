@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes import stem_of
+from shapespace.io.tables import KEYS, key_column, table_rows
 
 LABELS_FILE = "labels.csv"
-_NAMES = ("file", "scan", "name")
 _LABELS = ("label", "expression", "class", "group", "subject")
 _LARGEST_BYTES = 16 * 2**20
 
@@ -34,18 +32,21 @@ class Label:
     subject: str = ""
 
 
-def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
-    """Return the labels in a CSV table by the name of the scan, without folder and ending.
+def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -> dict[str, Label]:
+    """Return the labels in a table by the name of the scan, without folder and ending.
+
+    The table is what `io.tables.table_rows` reads; names of columns may be in any case.
 
     Scans of the same name in different folders, with different labels, are called by their folders too, as their fits
     are: `anna/smile.ply` is `anna_smile`, and no scan is `smile`.
 
-    The scan stands in the column `file`, `scan` or `name`; its class in `label`, `expression`, `class`, `group` or
-    `subject`, the first that is there; `intensity` and `subject` may stand beside it.
+    The first of the columns `file`, `scan`, `specimen`, `name` and `id` names the scan, the first of `label`,
+    `expression`, `class`, `group` and `subject` its class; there may be `intensity` and `subject` as well.
 
     Args:
         path: the table.
         of_subjects: whether subjects may stand for classes where there is no other column.
+        of_any: whether the first other column of classes, of which several scans have one, may as well.
 
     Raises:
         FileError: it cannot be read.
@@ -55,28 +56,29 @@ def read_labels(path: Path, *, of_subjects: bool = True) -> dict[str, Label]:
     if len(content) > _LARGEST_BYTES:
         raise FileFormatError(f"{path} is too large for a table of labels ({len(content) / 2**20:.0f} MiB).")
     try:
-        lines = filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
-        heads = next(lines, list[str]())
-        # No more cells than there are: a row may be shorter than the header.
-        rows = [dict(zip(heads, line, strict=False)) for line in lines]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path} is not a CSV table in UTF-8 ({error}).") from error
-    if not rows:
-        heads = []
-    name = next((head for head in _NAMES if head in heads), None)
-    label = next((head for head in _LABELS if head in heads and (of_subjects or head != "subject")), None)
-    if name is None or label is None:
+        lines = table_rows(content)
+        heads = next(lines)
+        rows = [[_printable(cell) for cell in line] for line in lines]
+    except ValueError as error:
+        raise FileFormatError(f"{path} {error}; write it as CSV with a header.") from error
+    name, intensity, owner = key_column(heads), key_column(heads, ("intensity",)), key_column(heads, ("subject",))
+    label = key_column(heads, [head for head in _LABELS if head != "subject"])
+    if label is None and of_any:
+        label = _first_classes(heads, rows, {name, intensity, owner})
+    if label is None and of_subjects:
+        label = owner
+    if name is None or label is None or not rows:
         raise FileFormatError(
-            f"{path} is no table of labels; it needs rows, a column {_NAMES[0]} and a column {_LABELS[0]} or "
+            f"{path} is no table of labels; it needs rows, a column {' or '.join(KEYS)}, and a column {_LABELS[0]} or "
             f"{_LABELS[1]}."
         )
     named: dict[str, dict[PurePath, Label]] = {}
     for row in rows:
-        text = _printable(row.get(label) or "")
-        subject = _printable(row.get("subject") or "")
-        if row.get(name) and (text or subject):
+        text, subject = row[label], "" if owner is None else row[owner]
+        if row[name] and (text or subject):
             place = PurePath(row[name].replace("\\", "/").removesuffix(".gz")).with_suffix("")
-            named.setdefault(place.name, {})[place] = Label(text, _intensity(row.get("intensity")), subject)
+            known = None if intensity is None else _intensity(row[intensity])
+            named.setdefault(place.name, {})[place] = Label(text, known, subject)
     found: dict[str, Label] = {}
     for stem, group in named.items():
         if len(set(group.values())) == 1:
@@ -91,6 +93,23 @@ def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
     parts = file.resolve().parent.parts[1:]
     names = ("_".join((*parts[len(parts) - depth :], stem_of(file))) for depth in range(len(parts) + 1))
     return next((labels[name] for name in names if name in labels), None)
+
+
+def _first_classes(heads: Sequence[str], rows: Sequence[Sequence[str]], others: set[int | None]) -> int | None:
+    """Return the first column of words of which some stand in several rows; None where there is none."""
+    for at, head in enumerate(heads):
+        cells = [row[at] for row in rows if row[at]]
+        if head and at not in others and len(set(cells)) < len(cells) and not any(map(_is_number, cells)):
+            return at
+    return None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _intensity(text: str | None) -> float | None:

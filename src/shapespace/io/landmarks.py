@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -19,6 +18,7 @@ from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.parsing import damaged, json_value, xml_root
+from shapespace.io.tables import as_written, rows_text
 from shapespace.types import FloatArray
 
 Pairs = list[tuple[str, FloatArray]]
@@ -143,7 +143,7 @@ def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
-    write_text(Path(path), csv_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
+    write_text(Path(path), rows_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
 
 
 def _format(path: Path, verb: str) -> LandmarkFormat:
@@ -331,7 +331,7 @@ def _csv_rows(data: bytes, path: Path) -> list[list[str]]:
     try:
         text = data.decode("utf-8-sig")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        return [[cell.strip() for cell in row] for row in csv.reader(lines, strict=True)]
+        return [[as_written(cell.strip()) for cell in row] for row in csv.reader(lines, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise damaged(path, "it is not comma-separated text") from error
 
@@ -365,16 +365,9 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     return out
 
 
-def csv_text(rows: Iterable[Iterable[str]]) -> str:
-    """Return `rows` as CSV, each ended by a line feed."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
-
-
 def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
     rows = [[name, *map(repr, _numbers(point))] for name, point in landmarks.items()]
-    return csv_text([["name", "x", "y", "z"], *rows])
+    return rows_text([["name", "x", "y", "z"], *rows])
 
 
 def _text_lines(data: bytes) -> list[str]:
@@ -438,7 +431,7 @@ def _write_fcsv(landmarks: Mapping[str, FloatArray]) -> str:
         [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, "", ""]
         for i, (name, point) in enumerate(landmarks.items(), start=1)
     )
-    return head + csv_text(rows)
+    return head + rows_text(rows)
 
 
 def _read_tps(data: bytes, path: Path) -> Pairs:

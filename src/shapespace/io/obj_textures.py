@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import re
 from array import array
+from collections.abc import Iterable
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from shapespace.io.parsing import line_blocks, plain_text
-from shapespace.io.textures import Pictures, TextureError, beside
+from shapespace.io.textures import FilesBeside, Pictures, TextureError
 from shapespace.types import GREY, ByteArray
 
 _LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
-_LARGEST_LIBRARY = 2**22
+_LARGEST_LIBRARIES = 2**22
+"""Bytes of all materials files of one surface together (4 MiB); those of scanners have some hundred."""
+_LIBRARY, _PICTURE = "its materials file", "its picture"
 
 
 def texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray | None, tuple[str, ...]]:
@@ -31,22 +35,32 @@ def texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray |
     if not named or b"vt" not in data:
         return None, ()
     try:
-        pictures: dict[bytes, str] = {}
-        for library in dict.fromkeys(named):
-            text = beside(path, library.strip().decode("utf-8", "replace"), "its materials file", _LARGEST_LIBRARY)
-            pictures |= _pictures(plain_text(text))
+        files = FilesBeside(path)
+        pictures = _libraries(files, dict.fromkeys(named))
         if not pictures:
             return None, ()
-        return _colours(data, vertices, pictures, path), ()
+        return _colours(data, vertices, pictures, files), ()
     except TextureError as reason:
         return None, (f"It is read without its colours: {reason}.",)
+
+
+def _libraries(files: FilesBeside, named: Iterable[bytes]) -> dict[bytes, str]:
+    """Return material -> name of its picture, of all materials files; each is read once, however it is spelled."""
+    found = dict.fromkeys(files.find(name.strip().decode("utf-8", "replace"), _LIBRARY) for name in named)
+    pictures: dict[bytes, str] = {}
+    left = _LARGEST_LIBRARIES
+    for file in found:
+        text = files.read(file, _LIBRARY, left)
+        left -= len(text)
+        pictures |= _pictures(plain_text(text))
+    return pictures
 
 
 def _pictures(library: bytes) -> dict[bytes, str]:
     """Return material -> name of its picture."""
     found: dict[bytes, str] = {}
     material = b""
-    for line in library.splitlines():
+    for line in chain.from_iterable(line_blocks(library)):
         key, _, rest = line.strip().partition(b" ")
         rest = rest.strip()
         if key == b"newmtl":
@@ -57,7 +71,7 @@ def _pictures(library: bytes) -> dict[bytes, str]:
     return found
 
 
-def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], path: Path) -> ByteArray | None:
+def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: FilesBeside) -> ByteArray | None:
     uv, corners, materials = _corners(data)
     if not len(corners):
         return None
@@ -67,16 +81,23 @@ def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], path: Path)
     first = np.full(vertices, -1, dtype=np.int64)
     first[at[good][::-1]] = np.flatnonzero(good)[::-1]
     out = np.full((vertices, 3), GREY, dtype=np.uint8)
-    seen = first >= 0
+    painted = np.flatnonzero(first >= 0)
+    material = corners[first[painted], 2]
+    used = np.zeros(len(materials), dtype=bool)
+    used[material] = True
+    names = [pictures.get(name) if is_used else None for name, is_used in zip(materials, used, strict=True)]
+    targets = {name: files.find(name, _PICTURE) for name in names if name is not None}
+    numbers = {target: number for number, target in enumerate(dict.fromkeys(targets.values()))}
+    # The number of the picture of each material, -1 for none, and so of each vertex.
+    of_material = np.array([-1 if name is None else numbers[targets[name]] for name in names], dtype=np.int64)
+    of_vertex = of_material[material]
+    order = np.argsort(of_vertex, kind="stable")
+    ends = np.searchsorted(of_vertex[order], np.arange(-1, len(numbers)), side="right")
     shown = Pictures()
-    names = list(materials)
-    for name in dict.fromkeys(pictures.values()):
-        codes = [k for k, material in enumerate(names) if pictures.get(material) == name]
-        mine = np.flatnonzero(seen)[np.isin(corners[first[seen], 2], codes)]
-        if len(mine):
-            content = partial(beside, path, name, "its picture")
-            out[mine] = shown.sampled(name, content, uv[texture[first[mine]]])
-            seen[mine] = False
+    for target, begin, end in zip(numbers, ends[:-1], ends[1:], strict=True):
+        mine = painted[order[begin:end]]
+        content = partial(files.read, target, _PICTURE)
+        out[mine] = shown.sampled(target.name, content, uv[texture[first[mine]]], str(target))
     return out
 
 

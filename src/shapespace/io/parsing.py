@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
 from shapespace.io.limits import MOST_PARTS
-from shapespace.types import ByteArray, FloatArray, Mesh
+from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh
 
 IndexArray = npt.NDArray[np.int64]
 
@@ -173,13 +173,14 @@ def mesh_of(
     path: Path,
     colours: ByteArray | None = None,
     notes: tuple[str, ...] = (),
+    observed: BoolArray | None = None,
 ) -> Mesh:
     """Return the mesh read from `path`: (V, 3) float64 and (F, 3) int64, which `Mesh` checks and narrows.
 
     Raises:
         MeshError: faces that point past the end of the vertices.
     """
-    return Mesh(vertices, faces, {}, path.name, colours, notes)  # pyright: ignore[reportArgumentType]  # narrowed
+    return Mesh(vertices, faces, {}, path.name, colours, notes, observed)  # pyright: ignore[reportArgumentType]  # narrowed
 
 
 def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,7 @@ from shapespace.io.parsing import (
     plain_text,
     word_block,
 )
-from shapespace.types import ByteArray, FloatArray, Mesh
+from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh
 
 _SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -40,6 +40,8 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20
 _FIRST_LINES = 512
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_OBSERVED = "observed"
+"""Vertex property of surfaces in correspondence: 0 where the position is an estimate."""
 _INDEX_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -140,6 +142,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     order, elements, at = _header(data, path)
     vertices: FloatArray | None = None
     colours: ByteArray | None = None
+    observed: BoolArray | None = None
     faces: IndexArray | None = None
     words = _Words(data, at)
     for element in elements:
@@ -163,12 +166,12 @@ def read_ply(data: bytes, path: Path) -> Mesh:
                 _refuse_without_xyz(element, path)
             if order == "":
                 if positions:
-                    vertices, colours = _ascii_vertices(words, element, path)
+                    vertices, colours, observed = _ascii_vertices(words, element, path)
                 else:
                     words.skip(element.count * len(element.properties))
             else:
                 if positions:
-                    vertices, colours = _binary_vertices(data, at, element, order)
+                    vertices, colours, observed = _binary_vertices(data, at, element, order)
                 at += element.count * element.least_bytes(False)
             continue
         if element.name == "vertex":
@@ -179,7 +182,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             faces = fan_triangles(counts, corners)
     if vertices is None:
         raise damaged(path, "its header declares no vertices")
-    return mesh_of(vertices, faces, path, colours)
+    return mesh_of(vertices, faces, path, colours, observed=observed)
 
 
 def _plural(name: str) -> str:
@@ -243,20 +246,33 @@ def _colours(element: _Element, columns: dict[str, npt.NDArray[Any]]) -> ByteArr
     return bytes_of_colours(values)
 
 
-def _binary_vertices(data: bytes, at: int, element: _Element, order: str) -> tuple[FloatArray, ByteArray | None]:
+_Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None]
+"""Positions (V, 3), colours (V, 3) and mask (V,) of observed vertices."""
+
+
+def _is_observed(element: _Element, column: npt.NDArray[Any] | None) -> BoolArray | None:
+    """Return the mask (V,) of observed vertices; None unless the property holds whole numbers."""
+    kinds = {p.item[0] for p in element.properties if p.name == _OBSERVED}
+    return None if column is None or "f" in kinds else np.asarray(column != 0)
+
+
+def _binary_vertices(data: bytes, at: int, element: _Element, order: str) -> _Vertices:
     names = [p.name for p in element.properties]
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
     table = np.frombuffer(data, dtype=row, count=element.count, offset=at)
     out = np.empty((element.count, 3), dtype=np.float64)
     for axis, name in enumerate("xyz"):
         out[:, axis] = table[f"p{names.index(name)}"]
-    return out, _colours(element, {name: table[f"p{names.index(name)}"] for name in _colour_names(names)})
+    colours = _colours(element, {name: table[f"p{names.index(name)}"] for name in _colour_names(names)})
+    mask = table[f"p{names.index(_OBSERVED)}"] if _OBSERVED in names else None
+    return out, colours, _is_observed(element, mask)
 
 
-def _ascii_vertices(words: _Words, element: _Element, path: Path) -> tuple[FloatArray, ByteArray | None]:
+def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
     names = [p.name for p in element.properties]
     width = len(names)
-    columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names))}
+    flags = (_OBSERVED,) if _OBSERVED in names else ()
+    columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names), *flags)}
     taken = 0
     for part in words.take(element.count * width):
         for axis, parts in columns.items():
@@ -266,7 +282,8 @@ def _ascii_vertices(words: _Words, element: _Element, path: Path) -> tuple[Float
     if taken < element.count * width:
         raise _ended(element, path)
     found = {name: joined(parts, np.float64) for name, parts in columns.items()}
-    return np.stack([found[axis] for axis in "xyz"], axis=1), _colours(element, found)
+    positions = np.stack([found[axis] for axis in "xyz"], axis=1)
+    return positions, _colours(element, found), _is_observed(element, found.get(_OBSERVED))
 
 
 def _ended(element: _Element, path: Path) -> FileFormatError:
@@ -409,7 +426,9 @@ def _indices(values: npt.NDArray[Any]) -> IndexArray:
 
 
 def write_ply(mesh: Mesh, comment: str = "") -> bytes:
-    """Return `mesh` as binary little-endian PLY with double coordinates, and colours: reading it back is exact.
+    """Return `mesh` as binary little-endian PLY with double coordinates; reading it back is exact.
+
+    Colours and the mask of observed vertices are vertex properties of type uchar.
 
     Args:
         mesh: vertices in whatever unit they are in.
@@ -419,12 +438,17 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
     lines += [f"element vertex {len(mesh.vertices)}"]
     lines += [f"property double {axis}" for axis in "xyz"]
-    body = mesh.vertices.astype("<f8").tobytes()
+    columns: list[tuple[str, str, tuple[int, ...], npt.NDArray[Any]]] = [("at", "<f8", (3,), mesh.vertices)]
     if mesh.colours is not None:
         lines += [f"property uchar {name}" for name in _COLOURS[0]]
-        rows = np.empty(len(mesh.vertices), dtype=[("at", "<f8", (3,)), ("colour", "u1", (3,))])
-        rows["at"], rows["colour"] = mesh.vertices, mesh.colours
-        body = rows.tobytes()
+        columns.append(("colour", "u1", (3,), mesh.colours))
+    if mesh.observed is not None:
+        lines.append(f"property uchar {_OBSERVED}")
+        columns.append((_OBSERVED, "u1", (), mesh.observed))
+    rows = np.empty(len(mesh.vertices), dtype=[column[:3] for column in columns])
+    for name, _, _, values in columns:
+        rows[name] = values
+    body = rows.tobytes()
     if faces is not None:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         table = np.empty(len(faces), dtype=[("n", "u1"), ("i", "<i4", (3,))])

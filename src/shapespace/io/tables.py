@@ -1,18 +1,40 @@
-"""Plain CSV tables, and tables whose rows show any later change and are still plain CSV to everybody else."""
+"""Tables: one reader of CSV and Excel files, and one writer of CSV whose cells no spreadsheet runs as formulas.
+
+Tables may have a column `CHECKSUM` that shows any later change of a row; they are plain CSV to other programs.
+"""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
 from shapespace.io.files import write_text
+from shapespace.io.workbook import WORKBOOK_START, sheet_rows
 
 CHECKSUM: Final = "checksum"
-"""The column of a table that tells of each row whether it was changed."""
+"""The column of a table that shows of each row whether it was changed."""
+
+KEYS: Final = ("file", "scan", "specimen", "name", "id")
+"""The columns that may name the shape of a row, in any case; the first of these that a table has is its key."""
+
+MISSING: Final = frozenset({"", "na", "nan", "n/a", "null", "none"})
+"""Cells, in lower case, that stand for a missing value."""
+
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+"""What a spreadsheet would run (OWASP, CSV injection), with any apostrophes before it."""
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|nan)")
+_DELIMITERS = (",", ";", "\t")
+_INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+_OLD_EXCEL = b"\xd0\xcf\x11\xe0"
+_SEPARATOR = re.compile(r'"?sep=(.)"?')
 
 
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -26,10 +48,13 @@ def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object
 
 def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a CSV table with `header` as text."""
+    return rows_text([header, *rows])
+
+
+def rows_text(rows: Iterable[Sequence[object]]) -> str:
+    """Return rows as CSV text, each ended by a line feed; text that a spreadsheet would run gets an apostrophe."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows([_written(cell) for cell in row] for row in rows)
     return text.getvalue()
 
 
@@ -43,11 +68,25 @@ def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) 
 def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write the same to `stream`, a row at a time."""
     at = header.index(CHECKSUM)
+    header = [str(_written(name)) for name in header]
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
     for row in rows:
-        cells = ["" if cell is None else str(cell) for cell in row]
+        cells = ["" if cell is None else str(_written(cell)) for cell in row]
         writer.writerow([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+
+
+def _written(cell: object) -> object:
+    """Return a cell as it is written: text with an apostrophe where a spreadsheet would run it, others as they are."""
+    if not isinstance(cell, str):
+        return cell
+    text = cell.encode("utf-8", "backslashreplace").decode("utf-8")
+    return f"'{text}" if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
+
+
+def as_written(cell: str) -> str:
+    """Return the text of a cell without the apostrophe that the writer puts before what a spreadsheet would run."""
+    return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
@@ -57,24 +96,113 @@ def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
     return f"sha256:{hashlib.sha256(said.encode('utf-8', 'surrogatepass')).hexdigest()[:16]}"
 
 
+def key_column(header: Sequence[str], names: Sequence[str] = KEYS) -> int | None:
+    """Return the place of the first of `names` in a header, in any case; None where it has none of them."""
+    lower = [name.lower() for name in header]
+    return next((lower.index(name) for name in names if name in lower), None)
+
+
 def table_rows(content: bytes) -> Iterator[list[str]]:
-    """Yield the header and then the rows of a CSV table in UTF-8, checked where it has a column `CHECKSUM`.
+    """Yield the header and then the rows of a table, each as long as the header; rows of empty cells are left out.
+
+    The table is CSV with commas, semicolons or tabs, in UTF-8, UTF-16 with a byte order mark or Windows Latin-1, or the
+    first sheet of an Excel workbook. In tables with semicolons or tabs, columns of numbers with decimal commas get
+    decimal points. Where a table has a column `CHECKSUM`, its rows are checked.
 
     Raises:
-        ValueError: it is none, a row has more or fewer cells than the header, or was changed; with a clause on what.
+        ValueError: it is no table, a row has more cells than the header, or was changed; with a clause on the fault.
     """
+    if content.startswith(_OLD_EXCEL):
+        raise ValueError("is an Excel file of the old format (.xls); save it as .xlsx or CSV")
     try:
-        lines = filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
-        header = next(lines, list[str]())
-        if len(set(header)) != len(header):
+        lines = _sheet(content) if content.startswith(WORKBOOK_START) else _csv_lines(decoded_text(content))
+        raw = next(lines, list[str]())
+        while raw and not raw[-1].strip():
+            raw.pop()
+        if any("\0" in name for name in raw):
+            raise ValueError("is not a table but binary, or UTF-16 without a byte order mark")
+        header = [as_written(name).strip() for name in raw]
+        known = [name for name in header if name]
+        if len(set(known)) != len(known):
             raise ValueError("has two columns of one name")
         yield header
         at = header.index(CHECKSUM) if CHECKSUM in header else None
         for number, row in enumerate(lines, 1):
-            if len(row) != len(header):
-                raise ValueError(f"has {len(row)} cells in row {number}, and {len(header)} columns")
-            if at is not None and row_checksum(header, row) != row[at]:
+            if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
+                del row[len(raw) :]
+            if len(row) > len(raw) or (at is not None and len(row) != len(raw)):
+                raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
+            if at is not None and row_checksum(raw, row) != row[at]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
-            yield row
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"is not a CSV table in UTF-8 ({error})") from error
+            yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
+    except csv.Error as error:
+        raise ValueError(f"is not a CSV table ({error})") from error
+
+
+def decoded_text(content: bytes) -> str:
+    """Return the text of a file: UTF-8, UTF-16 with a byte order mark, or else Windows Latin-1 (code page 1252).
+
+    Raises:
+        ValueError: it is none of them; with a clause on that.
+    """
+    try:
+        return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        if content.startswith(_UTF_16):
+            raise ValueError("is not text, or UTF-16 that is cut short") from error
+        # Five bytes have no character in the code page of Windows; Latin-1 has one for each.
+        odd = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
+        return content.decode("latin-1" if odd else "cp1252")
+
+
+def _csv_lines(text: str) -> Iterator[list[str]]:
+    first = text[: text.find("\n") + 1].strip() if "\n" in text else ""
+    stated = _SEPARATOR.fullmatch(first)
+    if stated and stated[1] in _DELIMITERS:
+        delimiter, text = stated[1], text[text.find("\n") + 1 :]
+    else:
+        delimiter = _delimiter(text)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    lines = (line for line in reader if any(cell and not cell.isspace() for cell in line))
+    return lines if delimiter == "," else iter(_with_decimal_points(list(lines)))
+
+
+def _delimiter(text: str) -> str:
+    """Return the delimiter that stands most often in the header outside quotes; the comma where none does."""
+    start = text.lstrip("\r\n \ufeff")
+    end = re.search(r"[\r\n]", start)
+    header = re.sub(r'"[^"]*"', "", start[: end.start()] if end else start)
+    return max(_DELIMITERS, key=header.count)
+
+
+def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
+    """Return the lines with decimal points in the columns of numbers with decimal commas.
+
+    Raises:
+        ValueError: a column has both, or points for thousands.
+    """
+    for at, name in enumerate(lines[0] if lines else []):
+        cells = {number: line[at].strip() for number, line in enumerate(lines) if number and at < len(line)}
+        cells = {number: cell for number, cell in cells.items() if cell.lower() not in MISSING}
+        with_comma = [n for n, cell in cells.items() if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
+        rest = [cell for number, cell in cells.items() if number not in set(with_comma)]
+        if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in rest):
+            continue
+        if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, rest)):
+            raise ValueError(f"writes numbers with commas and with points in the column {name[:40]!r}; use one of them")
+        for number in with_comma:
+            lines[number][at] = cells[number].replace(",", ".")
+    return lines
+
+
+def _sheet(content: bytes) -> Iterator[list[str]]:
+    rows = sheet_rows(content)
+    width = max((max(row) + 1 for row in rows[:1]), default=0)
+    for row in rows:
+        last = max(row) + 1
+        if last > width:
+            # Cells beside the table, such as notes, would be lost without a name.
+            raise ValueError(f"has a cell beside its table ({row[last - 1][:40]!r}); give that column a name")
+        line = [row.get(at, "") for at in range(width)]
+        if any(cell.strip() for cell in line):
+            yield line

@@ -25,6 +25,12 @@ MOST_PIXELS = 2**26
 MOST_PIXELS_IN_ALL = 2**28
 """All pictures of one surface have no more than these."""
 
+MOST_BYTES_IN_ALL = 2**29
+"""All files of materials and pictures of one surface have no more than these (512 MiB)."""
+
+MOST_NAMES = 2**14
+"""A surface names no more files of materials and pictures than this; finding one takes some 40 microseconds."""
+
 _SIDE = 2048
 _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
 
@@ -33,29 +39,61 @@ class TextureError(Exception):
     """Why a picture gives no colours, as a clause."""
 
 
-def beside(path: Path, name: str, what: str, at_most: int = LARGEST_FILE_BYTES) -> bytes:
-    """Return the content of the file called `name` in the folder of `path` or below it.
+class FilesBeside:
+    """Materials and pictures that a surface names: in its folder or below it, at most `MOST_BYTES_IN_ALL` together.
 
     Args:
         path: of the surface.
-        name: as its file has it.
-        what: the file is, for messages.
-        at_most: bytes; a longer file is not read.
-
-    Raises:
-        TextureError: it lies elsewhere, is not there, or cannot be read.
     """
-    short = _short(name)
-    folder = path.parent.resolve()
-    try:
-        target = (folder / PurePosixPath(name.replace("\\", "/"))).resolve()
-        if "://" in name or not target.is_relative_to(folder):
-            raise TextureError(f"{what} '{short}' lies outside of its folder, where nothing is read")
-        if not target.is_file():
-            raise TextureError(f"{what} '{short}' is not beside it")
-        return read_bytes(target, at_most)
-    except (ShapespaceError, OSError, ValueError, RuntimeError) as error:
-        raise TextureError(f"{what} '{short}' cannot be read") from error
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.parent.resolve()
+        self._found: dict[str, Path] = {}
+        self._bytes = MOST_BYTES_IN_ALL
+
+    def find(self, name: str, what: str) -> Path:
+        """Return the resolved path of the file called `name`, so that two spellings of one file are recognised.
+
+        Args:
+            name: as the surface's file has it.
+            what: the file is, for messages.
+
+        Raises:
+            TextureError: it lies elsewhere or does not exist, or the surface names too many files.
+        """
+        if name in self._found:
+            return self._found[name]
+        if len(self._found) >= MOST_NAMES:
+            raise TextureError(f"it names more than {MOST_NAMES:,} files of materials and pictures")
+        short = _short(name)
+        try:
+            target = (self._folder / PurePosixPath(name.replace("\\", "/"))).resolve()
+            if "://" in name or not target.is_relative_to(self._folder):
+                raise TextureError(f"{what} '{short}' lies outside of its folder, where nothing is read")
+            if not target.is_file():
+                raise TextureError(f"{what} '{short}' is not beside it")
+        except (OSError, ValueError, RuntimeError) as error:
+            raise TextureError(f"{what} '{short}' cannot be read") from error
+        self._found[name] = target
+        return target
+
+    def read(self, file: Path, what: str, at_most: int = LARGEST_FILE_BYTES) -> bytes:
+        """Return the content of a file that `find` returned.
+
+        Args:
+            file: its resolved path.
+            what: the file is, for messages.
+            at_most: bytes; a longer file is not read.
+
+        Raises:
+            TextureError: it cannot be read or is too long, alone or together with those read before it.
+        """
+        try:
+            content = read_bytes(file, min(at_most, self._bytes))
+        except (ShapespaceError, OSError) as error:
+            raise TextureError(f"{what} '{_short(file.name)}' cannot be read") from error
+        self._bytes -= len(content)
+        return content
 
 
 class Pictures:
@@ -65,23 +103,25 @@ class Pictures:
         self._unpacked: dict[str, ByteArray | TextureError] = {}
         self._pixels = MOST_PIXELS_IN_ALL
 
-    def sampled(self, name: str, content: Callable[[], bytes], uv: FloatArray) -> ByteArray:
+    def sampled(self, name: str, content: Callable[[], bytes], uv: FloatArray, key: str = "") -> ByteArray:
         """Return the colours (N, 3) of a picture at `uv`, between its pixels linearly.
 
         Args:
-            name: of the picture, by which it is known again.
+            name: of the picture, for messages.
             content: gives the bytes of its JPEG, PNG, BMP or TIFF file.
             uv: (N, 2) from the lower left corner (0, 0) to the upper right (1, 1); beyond these it repeats.
+            key: by which the picture is recognised, such as its resolved path; empty for its name.
 
         Raises:
             TextureError: no Pillow, or the picture cannot be had, is damaged, of another kind or too large.
         """
-        if name not in self._unpacked:
+        known = key or name
+        if known not in self._unpacked:
             try:
-                self._unpacked[name] = self._unpack(content(), _short(name))
+                self._unpacked[known] = self._unpack(content(), _short(name))
             except TextureError as reason:
-                self._unpacked[name] = reason
-        found = self._unpacked[name]
+                self._unpacked[known] = reason
+        found = self._unpacked[known]
         if isinstance(found, TextureError):
             raise found
         return _between(found, uv)

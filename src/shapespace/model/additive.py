@@ -20,6 +20,7 @@ from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import without_estimates
 from shapespace.io.hdf5 import read_hdf5
 from shapespace.model import model_file
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
@@ -130,6 +131,7 @@ class AdditiveModel:
             CorrespondenceError: the meshes differ in vertices or triangles.
             InputError: too few of them, or an expression without its person's neutral.
         """
+        meshes = [without_estimates(mesh) for mesh in meshes]
         faces = common_faces(meshes)
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
         row = np.array([people.index(subjects[i]) for i in expressive])

@@ -188,6 +188,24 @@ def complete(
     return Completed(guess, shown, found)
 
 
+def with_estimates(shapes: FloatArray, names: Sequence[str], gauge: Gauge = "shape") -> FloatArray:
+    """Return shapes in their own poses and sizes with missing vertices at their conditional means (see `complete`).
+
+    Args:
+        shapes: (N, V, 3) in any poses, each vertex in at least one shape; not-a-number where missing.
+        names: of the shapes, for messages.
+        gauge: as of `align_in_place`.
+
+    Returns:
+        (N, V, 3), with the vertices that are not missing unchanged.
+
+    Raises:
+        InputError: too little of a shape is observed to align it.
+    """
+    found = complete(shapes, names, gauge)
+    return _in_own_pose(shapes, found.shown, found.shapes, found.found)
+
+
 def _mean_filled(shapes: FloatArray, shown: BoolArray, names: Sequence[str], gauge: Gauge) -> FloatArray:
     """Return the shapes, each in its own pose, with the mean where they show nothing.
 

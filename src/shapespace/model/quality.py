@@ -22,7 +22,7 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_boundary
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_vertices, part_of
+from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
 from shapespace.late import late
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
@@ -459,7 +459,8 @@ def measure_quality(
         InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
     """
     settings = settings or QualitySettings()
-    meshes: Sequence[Mesh] = [] if isinstance(target, ShapeModel) else _checked(target)
+    meshes = [] if isinstance(target, ShapeModel) else _checked([without_estimates(mesh) for mesh in target])
+    unseen = [without_estimates(mesh) for mesh in unseen]
     vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
     if scans is not None and len(scans) != len(meshes):
         raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
@@ -525,7 +526,7 @@ def _of_meshes(
     )
 
 
-def _checked(meshes: Sequence[Mesh]) -> Sequence[Mesh]:
+def _checked(meshes: list[Mesh]) -> list[Mesh]:
     if len(meshes) < _FEWEST:
         raise InputError(
             f"Quality is measured on shapes left out, which takes at least three meshes, not {len(meshes)}."

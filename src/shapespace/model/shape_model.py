@@ -19,6 +19,7 @@ from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import without_estimates
 from shapespace.late import OpenViewer, late
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
@@ -176,8 +177,8 @@ class ShapeModel:
 
         Args:
             meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
-                and items that loads a mesh when it is asked for it. Vertices that are not-a-number are
-                missing: a model of vertices learns from those that are there, one of B-splines from filled ones.
+                and items that loads a mesh when it is asked for it. Vertices that are not-a-number or not
+                observed are missing: a model of vertices learns from the others, one of B-splines from filled ones.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out
                 vertices; None for every mode that varies.
             gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
@@ -227,7 +228,7 @@ class ShapeModel:
                 _refuse_far_landmarks(landmarks or {}, len(meshes[0].vertices))
             about = {"landmarks": landmarks or {}, "provenance": provenance, "licence": licence}
             return cls._of_streamed(stream, modes, seed, keep_shapes, tell, about)
-        meshes = [meshes[index] for index in range(len(meshes))]
+        meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
         faces = common_faces(meshes)
         if not kind.takes_holes and len(meshes) > 1:
             kept = Kept.of(meshes, min_seen)

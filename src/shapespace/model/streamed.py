@@ -30,6 +30,7 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.surface import without_estimates
 from shapespace.io.arrays import read_arrays, write_arrays
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory import available_bytes
@@ -463,7 +464,7 @@ class _Work:
         for index in range(max(start, self.before), stop):
             if index % _TOLD_EVERY == 0:
                 self.tell(f"reading mesh {index - self.before + 1} of {len(self.meshes)}")
-            mesh = self.meshes[index - self.before]
+            mesh = without_estimates(self.meshes[index - self.before])
             common_faces((self.first, mesh))
             _refuse_holes(mesh)
             if self.align:

@@ -27,7 +27,6 @@ CONFIDENCE = 0.5
 """The confidence unless another is given: below it the likeliest class is more likely wrong than right."""
 
 _FOLDS = 5
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,23 +247,18 @@ def write_answers(path: Path, answers: Sequence[Answer], classes: Sequence[str])
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
-    header = [_safe(cell) for cell in ("scan", "status", "prediction", *(f"p_{name}" for name in classes), "reason")]
+    header = ("scan", "status", "prediction", *(f"p_{name}" for name in classes), "reason")
     rows = [
         (
-            _safe(answer.scan),
+            answer.scan,
             answer.status,
-            _safe(answer.prediction),
+            answer.prediction,
             *(["" for _ in classes] if answer.probabilities is None else [f"{p:.6f}" for p in answer.probabilities]),
-            _safe(answer.reason),
+            answer.reason,
         )
         for answer in answers
     ]
     write_rows(path, header, rows)
-
-
-def _safe(text: str) -> str:
-    # A spreadsheet would run a cell that starts like a formula.
-    return ("'" if text.startswith(_FORMULA) else "") + text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _stacked(scans: Sequence[ScanCoefficients]) -> FloatArray:

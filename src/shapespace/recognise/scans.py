@@ -22,7 +22,6 @@ NEUTRAL = "neutral"
 """The label of neutral faces, unless another is given."""
 
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
-_FORMULA = ("'=", "'+", "'-", "'@", "'\t", "'\r")
 _LARGEST_BYTES = 2**28
 _TABLE_AGAIN = "run shapespace fit to write it again, or take the column checksum out if that was meant"
 
@@ -146,13 +145,8 @@ def _from_row(row: Mapping[str, str], modes: int, where: str) -> ScanCoefficient
             z = read_only(np.asarray([float(row[f"z{k}"]) for k in range(1, modes + 1)]))
         except ValueError as error:
             raise FileFormatError(f"{where}: a coefficient is not a number; fit the scan again.") from error
-    scan = ScanCoefficients(_plain(row["scan"]), status, _plain(row["reason"]), z, row["model_hash"])
+    scan = ScanCoefficients(row["scan"], status, row["reason"], z, row["model_hash"])
     return _checked(scan, where)
-
-
-def _plain(text: str) -> str:
-    # The writer puts an apostrophe before what a spreadsheet would run.
-    return text[1:] if text.startswith(_FORMULA) else text
 
 
 def _checked(scan: ScanCoefficients, where: str) -> ScanCoefficients:

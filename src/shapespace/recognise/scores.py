@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import softmax
 
+from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.recognise.classifiers import likeliest_temperature
 from shapespace.recognise.learn import confusion_matrix, precision_recall_fscore_support
@@ -96,7 +97,11 @@ def subject_bootstrap(
     seed: int = 0,
     level: float = 0.95,
 ) -> tuple[float, float]:
-    """Return the bootstrap percentile interval of the macro accuracy, drawing whole people with replacement."""
+    """Return the bootstrap percentile interval of the macro accuracy, drawing whole people with replacement.
+
+    Near 0 and 1 it is at least as wide as the exact interval without an error among as many people as show the rarest
+    class.
+    """
     names, truth = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
     people, owner = np.unique(np.asarray(subjects, dtype=str), return_inverse=True)
     right = np.asarray(predicted, dtype=str) == names[truth]
@@ -109,6 +114,7 @@ def subject_bootstrap(
     total = drawn @ counts
     shares = np.divide(drawn @ hits, total, out=np.full(total.shape, np.nan), where=total > 0)
     low, high = np.quantile(np.nanmean(shares, axis=1), [(1 - level) / 2, (1 + level) / 2])
+    low, high = widen_share(low, high, int((counts > 0).sum(axis=0).min()), level)
     return float(low), float(high)
 
 

@@ -13,7 +13,14 @@ from msgspec import structs
 
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import boundary_edges, face_vectors, faces_of, rms_size, without_vertices
+from shapespace.geometry.surface import (
+    boundary_edges,
+    face_vectors,
+    faces_of,
+    rms_size,
+    without_estimates,
+    without_vertices,
+)
 from shapespace.io.files import read_error, sha256_of_file
 from shapespace.io.meshes import read_mesh
 from shapespace.report.saved import Folder
@@ -118,13 +125,13 @@ class Corresponded:
         return [record for record in self.records.values() if record.status != "corresponding"]
 
     def surface(self, name: str) -> Mesh:
-        """Return the surface of the scan `name` in its own frame and unit, not-a-number where it shows nothing.
+        """Return the surface of the scan `name` in its own frame and unit, not-a-number where it is not observed.
 
         Raises:
             FileError: it cannot be read.
             FileFormatError: it is damaged, or not on the template of this folder.
         """
-        mesh = self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}")
+        mesh = without_estimates(self.folder.mesh(f"{name}{CorrespondRecord.SURFACE}"))
         if mesh.faces is None or not np.array_equal(mesh.faces, faces_of(self._mean)):
             raise FileFormatError(
                 f"{name}{CorrespondRecord.SURFACE} is not on the template of this folder; {CORRESPOND_AGAIN}."

@@ -21,7 +21,7 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], given: Path | None) ->
         FileFormatError: the table is damaged.
     """
     if given is not None:
-        return read_labels(given), f"Labels are from {given.name}."
+        return read_labels(given, of_any=True), f"Labels are from {given.name}."
     places = [folder.root / LABELS_FILE]
     for fit in fits:
         path = fit.record.scan.path

@@ -27,13 +27,16 @@ from shapespace.late import late
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.methods import methods_of
+from shapespace.statistics.observed import weights_of
 from shapespace.statistics.sides import Sides, find_sides, given_sides
-from shapespace.types import FloatArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
 LEVEL = 0.95
 _BLOCK = 100
 _FEWEST = 3
+_MOSTLY = 0.5
+"""Share of the shapes of a subject."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,8 @@ class Asymmetry:
         directional_p: (M,) family-wise, by flipping signs.
         permutations: how many.
         seed: of them.
+        observed: (n, M) bool, False where a subject's vertex, or its mirror image, is an estimate in most of its
+            shapes; None if all are observed.
     """
 
     cohort: Cohort
@@ -120,6 +125,18 @@ class Asymmetry:
     directional_p: FloatArray
     permutations: int
     seed: int
+    observed: BoolArray | None = None
+
+    @property
+    def observed_share(self) -> FloatArray:
+        """(M,) share of the subjects that observe a vertex and its mirror image."""
+        return np.ones(len(self.mean)) if self.observed is None else self.observed.mean(axis=0)
+
+    @property
+    def blank(self) -> BoolArray | None:
+        """(M,) where maps of the group are blank, as too few subjects observe both sides; None for nowhere."""
+        blank = weights_of(self.observed_share) == 0
+        return blank if blank.any() else None
 
     @cached_property
     def maps(self) -> FloatArray:
@@ -207,6 +224,7 @@ def measure_asymmetry(
     names, codes = _subjects(cohort, subject)
     group = _group(cohort, names, codes, reference)
     symmetric, difference, mean = _split(cohort, sides)
+    pairs_observed = _pairs_observed(cohort, sides)
     counts = np.bincount(codes)
     normals = None if sides.faces is None else vertex_normals(Mesh(mean, sides.faces))
     rng = np.random.default_rng(seed)
@@ -221,10 +239,11 @@ def measure_asymmetry(
     steps = _Steps(permutations, on_step)
     anova = _anova(symmetric, difference, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
-    p = _family_wise(own, rng, steps)
+    observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
+    p = _family_wise(own, rng, steps, None if observed is None else weights_of(observed.mean(axis=0)))
     return Asymmetry(
         cohort, sides, names, counts, mean, normals, who.of(symmetric), own_difference, anova, scores,
-        vertex_scores, *z, group, read_only(directional), p, permutations, seed,
+        vertex_scores, *z, group, read_only(directional), p, permutations, seed, observed,
     )  # fmt: skip
 
 
@@ -308,8 +327,25 @@ def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatA
         scale_to_tangent(both)
     mean = both.mean(axis=0)
     difference = both[:n] - both[n:]
+    if cohort.analysed is not None:
+        # A vertex that nobody knows on both sides says nothing of how the sides differ.
+        known = cohort.analysed[sides.vertices]
+        known = known & np.logical_or(known[sides.corners], sides.weights == 0).all(axis=1)
+        difference[:, ~known] = 0.0
     both[:n] -= difference / 2.0
     return both[:n], difference, mean
+
+
+def _pairs_observed(cohort: Cohort, sides: Sides) -> BoolArray | None:
+    """Return (N, M) whether a shape observes a vertex and its mirror image; None if all are observed."""
+    if cohort.observed is None and cohort.analysed is None:
+        return None
+    own = np.ones((len(cohort), cohort.n_vertices), np.bool_) if cohort.observed is None else cohort.observed
+    if cohort.analysed is not None:
+        own = np.logical_and(own, cohort.analysed)
+    own = own[:, sides.vertices]
+    image = np.logical_or(own[:, sides.corners], sides.weights == 0).all(axis=2)
+    return np.logical_and(own, image)
 
 
 def _along(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
@@ -391,15 +427,21 @@ def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator
     return beyond / (1 + steps.each) if steps.each else None
 
 
-def _family_wise(own: FloatArray, rng: np.random.Generator, steps: _Steps) -> FloatArray:
-    """Return p (M,) of the mean of fields (n, M) or (n, M, 3), by the permutation maximum over random signs."""
+def _family_wise(
+    own: FloatArray, rng: np.random.Generator, steps: _Steps, weight: FloatArray | None = None
+) -> FloatArray:
+    """Return p (M,) of the mean of fields (n, M) or (n, M, 3), by the permutation maximum over random signs.
+
+    The statistic of a vertex is multiplied by its `weight` (M,), where there is one.
+    """
     n, m = own.shape[:2]
     flat, square = own.reshape(n, -1), (own**2).reshape(n, m, -1).sum(axis=(0, 2))
 
     def statistic(signs: FloatArray) -> FloatArray:
         between = (signs @ flat / n) ** 2
         between = n * between.reshape(len(signs), m, -1).sum(axis=2)
-        return between / np.maximum(square - between, 1e-30 + 1e-12 * square)
+        ratio = between / np.maximum(square - between, 1e-30 + 1e-12 * square)
+        return ratio if weight is None else ratio * weight
 
     observed = statistic(np.ones((1, n)))[0]
     beyond = np.ones(m)

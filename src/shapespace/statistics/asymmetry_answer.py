@@ -21,7 +21,8 @@ from shapespace.schemas import (
 from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
 from shapespace.statistics.methods_answer import methods_parts
-from shapespace.types import FloatArray, Mesh
+from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
+from shapespace.types import BoolArray, FloatArray, Mesh
 
 _ALPHA = 0.05
 _SHOWN = 2
@@ -46,7 +47,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         *methods_parts(found.methods),
     ]
     fitted = cohort.fitted
-    return Answer(
+    answer = Answer(
         question="asymmetry",
         title="How symmetric?",
         summary=_summary(found, order),
@@ -67,6 +68,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
         methods=found.methods,
     )
+    return with_shape_data(answer, cohort)
 
 
 def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
@@ -243,12 +245,12 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
     half = found.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
         "vertices": found.mean,
-        "directional_mm": found.directional,
+        "directional_mm": blank_where(found.directional, found.blank),
         "directional_p": found.directional_p,
         "shown": found.directional_p <= _ALPHA,
-        "fluctuating_mm": found.fluctuating,
+        "fluctuating_mm": blank_where(found.fluctuating, found.blank),
         "subjects": np.array(found.subjects),
-        "maps_mm": found.maps.astype(np.float32),
+        "maps_mm": blank_where(found.maps, _unobserved(found)).astype(np.float32),
         "symmetric": found.symmetric.astype(np.float32),
         "asymmetric": (found.difference / 2.0).astype(np.float32),
         "vertex_of_cohort": found.sides.vertices,
@@ -262,11 +264,12 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if unshown else "shown",
             note="Mean over the subjects, along the normals." + (
-                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}."),
+                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}.") + _told_grey(found),
         ),
         SurfaceMapPart(
             title="Fluctuating asymmetry", arrays=_FILE, values="fluctuating_mm", signed=False,
-            note="Standard deviation over the subjects, about the directional asymmetry, with measurement error.",
+            note="Standard deviation over the subjects, about the directional asymmetry, with measurement error."
+            + _told_grey(found),
         ),
     ]  # fmt: skip
 
@@ -299,7 +302,8 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
         morph("What subjects differ by most", "pattern", found.mean, pattern, note, "two one way", "two the other")
     for rank, k in enumerate(shown, 1):
         name = found.subjects[k]
-        arrays[f"subject_{rank}_mm"] = found.maps[k]
+        hidden = _unobserved(found)
+        arrays[f"subject_{rank}_mm"] = blank_where(found.maps[k], None if hidden is None else hidden[k])
         parts.append(
             SurfaceMapPart(
                 title=f"{name}: the sides",
@@ -313,6 +317,14 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
     morph(f"{found.subjects[k]} and its mirror image", "subject", found.symmetric[k], found.difference[k] / 2.0,
           "The middle is the symmetric part.", "mirrored", "as it is")  # fmt: skip
     return arrays, parts
+
+
+def _unobserved(found: Asymmetry) -> BoolArray | None:
+    return None if found.observed is None else ~found.observed
+
+
+def _told_grey(found: Asymmetry) -> str:
+    return "" if found.blank is None else f" {told_blank(int(found.blank.sum()), len(found.blank))}"
 
 
 def _points(found: Asymmetry) -> TablePart:

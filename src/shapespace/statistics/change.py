@@ -36,6 +36,7 @@ from shapespace.statistics.change_maps import (
 from shapespace.statistics.change_repeat import Repeatability, Rescans
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
 from shapespace.statistics.dispersion import DispersionTest, dispersion_test
+from shapespace.statistics.observed import weights_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 WHOLE = "whole"
@@ -145,6 +146,7 @@ class _Draft:
     stable: BoolArray
     area_mm2: FloatArray
     before_mm3: float
+    observed: BoolArray | None
 
     def subject(self, group: str, repeatability: Repeatability | None) -> SubjectChange:
         sums = list(self.sums)
@@ -162,7 +164,7 @@ class _Draft:
             ]
         rate = sums[1] if len(sums) > 1 else None
         return SubjectChange(
-            self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3
+            self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3, self.observed,
         )  # fmt: skip
 
 
@@ -219,7 +221,7 @@ def _draft(
         )
     stable = found.weights > _COUNTED * area
     before_mm3 = volume_mm3(first, faces) if closed else float("nan")
-    return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3)
+    return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3, found.observed)
 
 
 def _regions(cohort: Cohort, settings: ChangeSettings) -> dict[str, IntArray]:
@@ -276,6 +278,15 @@ def _dispersion(
     )
 
 
+def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
+    """Return (V,) where maps of the group are blank: too few subjects observe the vertex, over all or in a group."""
+    every = np.ones(len(subjects[0].area_mm2), dtype=np.bool_)
+    observed = np.stack([every if one.observed is None else one.observed for one in subjects])
+    groups = np.array([one.group for one in subjects])
+    shares = [observed[groups == group].mean(axis=0) for group in dict.fromkeys(groups.tolist())]
+    return weights_of(np.min(shares, axis=0)) == 0
+
+
 def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     """Return the same with its tests over subjects."""
     settings, subjects = answer.settings, answer.subjects
@@ -285,6 +296,9 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
         return answer
     asked = [effect_of(subject, rate=settings.rate) for subject in subjects]
     maps = np.stack([one.along_mm for one in asked])
+    blank = _blank(subjects)
+    # Without variation a vertex is found nowhere, and takes no part in the maxima.
+    maps[:, blank] = 0.0
     volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
     vertices = list(answer.landmarks.values())
@@ -295,6 +309,7 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
     return replace(
         answer,
+        blank=blank if blank.any() else None,
         group=mean_test(maps, area, *run),
         group_volumes=mean_test(volumes, whole, *run),
         group_landmarks=mean_test(maps[:, vertices], few, *run) if vertices else None,

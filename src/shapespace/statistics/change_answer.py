@@ -23,6 +23,7 @@ from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
 from shapespace.statistics.change_group import LEVEL, MapTest
 from shapespace.statistics.methods_answer import dispersion_sentence, methods_parts, multiplicity_sentence
+from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
@@ -67,7 +68,7 @@ def answer_of(change: Found) -> Answer:
         )
     )  # fmt: skip
     stable = settings.stable
-    return Answer(
+    answer = Answer(
         "change",
         "What changed?",
         tuple(_summary(change)),
@@ -94,6 +95,7 @@ def answer_of(change: Found) -> Answer:
         model_hashes=() if change.cohort.fitted is None else (change.cohort.fitted.model.content_hash,),
         methods=change.methods,
     )
+    return with_shape_data(answer, change.cohort)
 
 
 def _summary(change: Found) -> list[str]:
@@ -168,14 +170,21 @@ def _per(change: Found) -> str:
 
 def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     unit = f"mm{_per(change)}"
-    arrays |= {"mean": test.effect, "mean_t": test.t, "mean_p": test.p, "mean_found": test.p <= _LEVEL}
+    arrays |= {
+        "mean": blank_where(test.effect, change.blank),
+        "mean_t": test.t,
+        "mean_p": test.p,
+        "mean_found": test.p <= _LEVEL,
+    }
+    grey = "" if change.blank is None else f" {told_blank(int(change.blank.sum()), len(change.blank))}"
     least = 1 / test.permutations
-    note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. " + (
+    marked = (
         f"No p can be below {least:.2g} with so few, so that nothing is marked."
         if least > _LEVEL
         else f"In full colour where the family-wise p is at most {_LEVEL:g}, by the maximum over vertices of |t| in "
         f"{test.permutations} sign flips{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
     )
+    note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. {marked}{grey}"
     parts: list[Part] = [
         SurfaceMapPart(
             title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
@@ -230,7 +239,11 @@ def _group_landmarks(change: Found, test: MapTest) -> tuple[Sequence[str], list[
 
 def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     first, second = change.groups
-    arrays |= {"difference": test.effect, "difference_p": test.p, "difference_found": test.p <= _LEVEL}
+    arrays |= {
+        "difference": blank_where(test.effect, change.blank),
+        "difference_p": test.p,
+        "difference_found": test.p <= _LEVEL,
+    }
     note = (
         f"Mean change of {second} ({test.n[1]} subjects) less that of {first} ({test.n[0]}). In full colour where the "
         f"family-wise p is at most {_LEVEL:g}, by {test.permutations} "
@@ -325,7 +338,7 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
         arrays |= {
             f"{key}_before": before.vertices,
             f"{key}_after": after.vertices,
-            f"{key}_change": subject.change.along_mm,
+            f"{key}_change": blank_where(subject.change.along_mm, subject.unobserved),
             f"{key}_beyond": subject.change.beyond,
         }
         parts.append(
@@ -384,7 +397,7 @@ def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
             one.visits[0].label,
             one.visits[-1].label,
             one.rms_mm,
-            float(one.change.along_mm[np.abs(one.change.along_mm).argmax()]),
+            _largest(one),
             one.beyond_share,
             float(one.change.volumes_mm3[0]),
             _or_none(one.change.volumes_stddev_mm3[0]),
@@ -452,10 +465,18 @@ def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[objec
     ]
 
 
+def _largest(subject: SubjectChange) -> float:
+    """Return the largest change, mm, of the vertices that are observed."""
+    along = subject.change.along_mm if subject.observed is None else subject.change.along_mm[subject.observed]
+    return float(along[np.abs(along).argmax()])
+
+
 def _maps(change: Found) -> dict[str, npt.NDArray[Any]]:
     found = {
         "subjects": np.array([one.name for one in change.subjects]),
-        "change_mm": np.stack([one.change.along_mm for one in change.subjects]).astype(np.float32),
+        "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
+            np.float32
+        ),
         "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
     }
     found["beyond"] = np.stack([one.change.beyond for one in change.subjects])

@@ -117,6 +117,8 @@ class SubjectChange:
         stable: (V,) bool, what carried the alignment of the last scan.
         area_mm2: (V,) of each vertex at the first visit.
         before_mm3: volume at the first visit; NaN of a surface that is not closed.
+        observed: (V,) bool, whether all scans of the subject observe a vertex; None if they observe all. Elsewhere the
+            change is between estimates, and does not count in `rms_mm` and `beyond_share`.
     """
 
     name: str
@@ -127,16 +129,27 @@ class SubjectChange:
     stable: BoolArray
     area_mm2: FloatArray
     before_mm3: float
+    observed: BoolArray | None = None
+
+    @property
+    def observed_area_mm2(self) -> FloatArray:
+        """(V,) `area_mm2`, 0 where a vertex is an estimate."""
+        return self.area_mm2 if self.observed is None else self.area_mm2 * self.observed
+
+    @property
+    def unobserved(self) -> BoolArray | None:
+        """(V,) where maps of the subject are blank; None for nowhere."""
+        return None if self.observed is None else ~self.observed
 
     @property
     def rms_mm(self) -> float:
         """RMS of the change over the surface."""
-        return float(np.sqrt(np.average(self.change.along_mm**2, weights=self.area_mm2)))
+        return float(np.sqrt(np.average(self.change.along_mm**2, weights=self.observed_area_mm2)))
 
     @property
     def beyond_share(self) -> float:
         """Share of the surface whose change exceeds its uncertainty; noise alone gives 0.05."""
-        return float(np.average(self.change.beyond, weights=self.area_mm2))
+        return float(np.average(self.change.beyond, weights=self.observed_area_mm2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +178,7 @@ class Found:
         unit: of time, as in `mm per year`; empty where times are words.
         closed: whether the surface is.
         model_only: whether the surfaces hold nothing but what the model of the fits can make.
+        blank: (V,) where maps of the group are blank, as too few subjects observe the vertex; None for nowhere.
     """
 
     cohort: Cohort
@@ -187,6 +201,7 @@ class Found:
     closed: bool
     model_only: bool
     dispersion: DispersionTest | None = None
+    blank: BoolArray | None = None
 
     @cached_property
     def methods(self) -> Methods:

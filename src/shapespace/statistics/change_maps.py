@@ -12,7 +12,7 @@ from shapespace.geometry.similarity import fit_similarity, small_poses
 from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
 from shapespace.statistics.change_align import align_by
 from shapespace.statistics.change_visits import Visit
-from shapespace.types import FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _RIGID = 6
 """Of the poses: turns and shifts."""
@@ -28,6 +28,7 @@ class Aligned:
         means: (T, V, 3) their mean at each visit.
         normals: (V, 3) of the first of these.
         weights: (V,) by which the last scan was aligned.
+        observed: (V,) bool, whether all scans observe a vertex; None if they observe all.
     """
 
     visits: tuple[Visit, ...]
@@ -35,6 +36,7 @@ class Aligned:
     means: FloatArray
     normals: FloatArray
     weights: FloatArray
+    observed: BoolArray | None = None
 
     @property
     def along_mm(self) -> FloatArray:
@@ -58,12 +60,15 @@ def aligned(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) ->
         for row in visit.rows:
             x = fixed
             if row != visits[0].rows[0]:
-                T, weights = align_by(cohort.vertices(row), fixed, area, stable)
+                # Estimates carry no alignment.
+                both = cohort.observed_in([visits[0].rows[0], row])
+                T, weights = align_by(cohort.vertices(row), fixed, area if both is None else area * both, stable)
                 x = T.apply(cohort.vertices(row))
             own.append(x)
         scans.append(np.stack(own))
     means = np.stack([own.mean(axis=0) for own in scans])
-    return Aligned(tuple(visits), tuple(scans), means, vertex_normals(Mesh(means[0], faces)), weights)
+    observed = cohort.observed_in([row for visit in visits for row in visit.rows])
+    return Aligned(tuple(visits), tuple(scans), means, vertex_normals(Mesh(means[0], faces)), weights, observed)
 
 
 def faces_in(cohort: Cohort) -> IntArray:

@@ -37,6 +37,7 @@ from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.methods_answer import dispersion_sentence
+from shapespace.statistics.observed import information, weights_of
 from shapespace.types import FloatArray, read_only
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -284,7 +285,7 @@ def compare(
         cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.squares, random
     )
     strata = made.every
-    families = list(_families(design, made))
+    families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
     owners = subjects if repeated else None
@@ -462,13 +463,14 @@ def _remainder(stratum: Stratum) -> Remainder:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """A contrast of a stratum, in whose reduced model some terms are."""
+    """A contrast of a stratum, in whose reduced model some terms are, with the weight (V,) of each vertex."""
 
     low: str
     high: str
     stratum: Stratum
     beside: tuple[Term, ...]
     contrast: FloatArray
+    weight: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -509,6 +511,27 @@ def _families(design: Design, strata: Strata) -> Iterator[_Family]:
         for stratum in strata.every:
             if any(both <= term.variables for term in stratum.terms):
                 yield _Family(name, (_Ends(*words, stratum, tuple(stratum.without(both)), change[1] - change[0]),))
+
+
+def _weighted(cohort: Cohort, design: Design, family: _Family) -> _Family:
+    """Return a family with the share of the information on each contrast that the observations of a vertex carry.
+
+    The scans of a subject count one by one, also where a test combines them.
+    """
+    contrasts: list[FloatArray] = []
+    for one in design.variables:
+        if one.name == family.name:
+            contrasts = [design.contrast(one.column, low, high) for low, high in _pairs(one)]
+    for one, other in _interacting(design):
+        if f"{one.name}:{other.name}" == family.name:
+            (low, high), values = _pairs(one)[0], _pairs(other)[0]
+            first, second = (design.contrast(one.column, low, high, {other.column: value}) for value in values)
+            contrasts = [second - first]
+    known = information(cohort, design.matrix, np.stack(contrasts))
+    if known is None:
+        return family
+    weights = weights_of(known)
+    return replace(family, ends=tuple(replace(e, weight=w) for e, w in zip(family.ends, weights, strict=True)))
 
 
 def _within_ends(within: Within, one: Variable, low: str | float, high: str | float) -> _Ends:
@@ -612,11 +635,12 @@ def _tested_together(
     changes = directions @ stratum.shapes
     if not options.maps:
         return f, changes, [None] * len(family)
-    return (
-        f,
-        changes,
-        effect_maps(cohort, stratum, residual, products, along, changes, options.bump_width_mm, level=options.level),
-    )
+    weights = [ends.weight for ends in family if ends.weight is not None]
+    maps = effect_maps(
+        cohort, stratum, residual, products, along, changes, options.bump_width_mm,
+        np.stack(weights) if weights else None, level=options.level,
+    )  # fmt: skip
+    return f, changes, maps
 
 
 def _tested_unequal(
@@ -643,7 +667,8 @@ def _tested_unequal(
         maps += (
             effect_maps(
                 cohort, stratum, estimate.flips.residual, estimate.flips.fitted, estimate.along, changes[-1][None],
-                options.bump_width_mm, estimates=[estimate], level=options.level,
+                options.bump_width_mm, None if ends.weight is None else ends.weight[None], estimates=[estimate],
+                level=options.level,
             )
             if options.maps
             else [None]

@@ -26,6 +26,7 @@ from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.compare import Comparison, Effect
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
+from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHOWN_SHARE = 0.05
@@ -47,7 +48,7 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         *methods_parts(comparison.methods),
     ]
     fitted = comparison.cohort.fitted
-    return Answer(
+    answer = Answer(
         question="compare",
         title=f"Shape {comparison.design.formula.strip()}",
         summary=tuple(_summary(comparison)),
@@ -74,6 +75,7 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
         methods=comparison.methods,
     )
+    return with_shape_data(answer, comparison.cohort)
 
 
 def _summary(comparison: Comparison) -> Iterator[str]:
@@ -89,6 +91,8 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     for effect in comparison.effects:
         if effect.map is not None:
             yield _of_map(comparison, effect, effect.map)
+            if effect.map.blank is not None:
+                yield f"{effect.label}: {told_blank(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
                 yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
     yield from comparison.warnings
@@ -227,6 +231,8 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     )
     if effect.map is not None:
         kept = _arrays(comparison, effect)
+        blank = effect.map.blank
+        note = _PALE if blank is None else f"{_PALE} {told_blank(int(blank.sum()), len(blank))}"
         for title, values, mask in (
             (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
             (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
@@ -241,7 +247,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
                     mask=mask,
                     signed=values != "length_mm",
                     unit=_lengths(comparison).of_map,
-                    note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {_PALE}" if effect.exploratory else _PALE,
+                    note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {note}" if effect.exploratory else note,
                 )
     if comparison.cohort.faces is not None:
         times = _times(comparison, effect)
@@ -317,13 +323,15 @@ def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[
     made = effect.map
     if made is None:
         return out
-    out |= {"change_mm": made.change_mm, "length_mm": made.length_mm}
+    out |= {"change_mm": made.change_mm, "length_mm": blank_where(made.length_mm, made.blank)}
+    if made.weight is not None:
+        out["information"] = made.weight
     named = {"length": made.any_way}
     if made.along is not None and made.normal_mm is not None:
-        out["normal_mm"] = made.normal_mm
+        out["normal_mm"] = blank_where(made.normal_mm, made.blank)
         named["normal"] = made.along
     if made.bump is not None and made.bump_mm is not None:
-        out["bump_mm"] = made.bump_mm
+        out["bump_mm"] = blank_where(made.bump_mm, made.blank)
         named["bump"] = made.bump
     for name, test in named.items():
         out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}

@@ -21,7 +21,7 @@ from shapespace.late import other_package
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
 from shapespace.statistics.dispersion import Estimate
-from shapespace.types import FloatArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
 _VERTICES = 512
 _BYTES = 48 * 2**20
@@ -68,6 +68,8 @@ class EffectMap:
         any_way: test of `change_mm`, in whatever direction.
         bump_mm: (V,) height of the bump there that explains the change best; None where none were sought.
         bump: test of `bump_mm`.
+        weight: (V,) by which F is multiplied, the share of the information that observations carry (`information`); 0
+            where the map is blank. None if all vertices are observed.
     """
 
     change_mm: FloatArray
@@ -77,6 +79,12 @@ class EffectMap:
     any_way: Tested
     bump_mm: FloatArray | None = None
     bump: Tested | None = None
+    weight: FloatArray | None = None
+
+    @property
+    def blank(self) -> BoolArray | None:
+        """(V,) where the map is blank, as too few shapes observe the vertex; None for nowhere."""
+        return None if self.weight is None or self.weight.all() else self.weight == 0
 
     def interval_mm(self, vertex: int) -> tuple[float, float]:
         """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
@@ -87,8 +95,9 @@ class EffectMap:
 
     @property
     def shown_mm(self) -> FloatArray:
-        """(V,) along the normal where there is one, else the length."""
-        return self.length_mm if self.normal_mm is None else self.normal_mm
+        """(V,) along the normal where there is one, else the length; 0 where blank."""
+        mm = self.length_mm if self.normal_mm is None else self.normal_mm
+        return mm if self.blank is None else np.where(self.blank, 0.0, mm)
 
     @property
     def shown(self) -> Tested:
@@ -104,6 +113,7 @@ def effect_maps(
     along: FloatArray,
     changes: FloatArray,
     bump_width_mm: float | None = None,
+    weights: FloatArray | None = None,
     *,
     estimates: Sequence[Estimate] | None = None,
     level: float = 0.05,
@@ -118,6 +128,7 @@ def effect_maps(
         along: (E, m) unit vectors: each effect in these columns.
         changes: (E, K) mm.
         bump_width_mm: standard deviation of the bumps; None seeks none.
+        weights: (E, V) by which F is multiplied; None for 1.
         estimates: E, whose statistics allow unequal variances; None takes the pooled variance of `residual`.
         level: of significance, and one minus the confidence of intervals.
     """
@@ -147,11 +158,14 @@ def effect_maps(
                     explained = np.einsum("epvc,epvc->epv", effect, effect)
                     left = squares - np.einsum("pmvc,pmvc->pv", drawn, drawn)
                     f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)
+                if weights is not None:
+                    f *= weights[:, None, part]
                 if start == 0:
                     observed[name][:, part] = f[:, 0]
                 as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - _TIE)).sum(axis=1)
                 for at in range(E):
-                    pooled[name][at] += np.bincount(_bin(f[at]).ravel(), minlength=_BINS)
+                    counted = f[at] if weights is None else f[at][:, weights[at, part] > 0]
+                    pooled[name][at] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
                 so_far = largest[name][:, start : start + chunk]
                 np.maximum(so_far, f.max(axis=2), out=so_far)
     made: list[EffectMap] = []
@@ -171,6 +185,7 @@ def effect_maps(
                 any_way=tests["any_way"],
                 bump_mm=own.get("bump"),
                 bump=tests.get("bump"),
+                weight=None if weights is None else read_only(weights[at]),
             )
         )
     return made

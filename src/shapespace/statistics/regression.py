@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
@@ -17,7 +19,16 @@ from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.methods import methods_of
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
-from shapespace.statistics.smoothers import CHOICES, Choice, Decomposed, IndexArray, errors_of, folds_of, nested
+from shapespace.statistics.smoothers import (
+    CHOICES,
+    Choice,
+    Decomposed,
+    IndexArray,
+    errors_of,
+    folds_of,
+    nested,
+    weighted_mean,
+)
 from shapespace.types import FloatArray, Mesh, read_only
 
 FEWEST, SMALL = 10, 100
@@ -47,7 +58,7 @@ class Regression:
         subjects: (N,) names.
         predicted: (N,) by nested cross-validation: neither the regression nor its choice saw the subject.
         low, high: (N,) intervals, made likewise.
-        baseline: (N,) the mean of the training set.
+        baseline: (N,) the mean of the training set, to which each subject contributes once.
         measures: by the names in `MEASURES`; `r2` against the baseline, `slope` and `intercept` of the observed on the
             predicted, `coverage` and `width` of the intervals. Each subject counts once.
         baseline_rmse: of predicting the mean,
@@ -63,6 +74,7 @@ class Regression:
         permutations: how many.
         draws: of subjects, for intervals of figures.
         seed: of folds, permutations and draws.
+        subject: column of the subjects, as given; None for the default.
     """
 
     cohort: Cohort
@@ -88,6 +100,7 @@ class Regression:
     permutations: int
     draws: int
     seed: int
+    subject: str | None = None
 
     @property
     def n_subjects(self) -> int:
@@ -122,8 +135,8 @@ class Regression:
 
     def shape_at(self, value: float) -> FloatArray:
         """Return the mean shape (V, 3), mm, at a value of the target, by regression of shape on the target."""
-        middle = float(np.average(self.observed, weights=self.predictor.share))
-        own = np.average(self.cohort.coefficients, axis=0, weights=self.predictor.share)
+        middle = float(weighted_mean(self.observed, self.predictor.share))
+        own = weighted_mean(self.cohort.coefficients, self.predictor.share)
         return self.cohort.vertices(own + (value - middle) * self.pattern)
 
     @cached_property
@@ -132,7 +145,7 @@ class Regression:
         moved = (self.pattern @ self.cohort.basis).reshape(-1, 3)
         if self.cohort.faces is None:
             return np.linalg.norm(moved, axis=1)
-        mean = self.cohort.vertices(self.cohort.coefficients.mean(axis=0))
+        mean = self.cohort.vertices(weighted_mean(self.cohort.coefficients, self.predictor.share))
         return np.einsum("vd,vd->v", moved, vertex_normals(Mesh(mean, self.cohort.faces)))
 
     def answer(self, new: tuple[Cohort, Predictions] | None = None) -> Answer:
@@ -186,8 +199,7 @@ def regress(
             f"{cohort.table.where}: {len(names)} subjects are too few to learn {target} from in {folds} folds; "
             f"{max(FEWEST, folds)} are the least."
         )
-    counts = np.bincount(codes)
-    share = 1.0 / counts[codes]
+    share = share_of(subjects)
     X = cohort.coefficients
     rng = np.random.default_rng(seed)
     outer = folds_of(codes, folds, rng)
@@ -201,9 +213,9 @@ def regress(
 
     errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
     predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], level)
-    centred = y - np.average(y, weights=share)
+    centred = y - weighted_mean(y, share)
     pattern = (share * centred) @ X / float((share * centred**2).sum())
-    low_at, high_at = (float(v) for v in np.percentile(y, _EDGES))
+    low_at, high_at = _percentiles(y, codes, share, _EDGES)
     return Regression(
         cohort=cohort,
         target=target,
@@ -228,19 +240,35 @@ def regress(
         permutations=permutations,
         draws=draws,
         seed=seed,
+        subject=subject,
     )
 
 
-def compare_with(predictions: Predictions, observed: FloatArray) -> tuple[float, float, float]:
-    """Return R2 (against the mean of the new ones), RMSE and coverage of predictions where the target is known."""
+def compare_with(
+    predictions: Predictions, observed: FloatArray, share: FloatArray | None = None
+) -> tuple[float, float, float]:
+    """Return R2 (against the mean of the new shapes), RMSE and coverage of predictions where the target is known.
+
+    Args:
+        predictions: of n shapes.
+        observed: (n,) their targets.
+        share: (n,) weight of each shape, 1 / the number of scans of its subject; None for one scan of each.
+    """
+    share = np.ones(len(observed)) if share is None else share
     off = observed - predictions.value
-    spread = float(((observed - observed.mean()) ** 2).sum())
+    spread = float(share @ (observed - weighted_mean(observed, share)) ** 2)
     inside = (observed >= predictions.low) & (observed <= predictions.high)
     return (
-        1.0 - float((off**2).sum()) / spread if spread > 0 else float("nan"),
-        float(np.sqrt((off**2).mean())),
-        float(inside.mean()),
+        1.0 - float(share @ off**2) / spread if spread > 0 else float("nan"),
+        _rms(off, share),
+        float(share @ inside / share.sum()),
     )
+
+
+def share_of(subjects: Sequence[str]) -> FloatArray:
+    """Return (N,) the weight of each scan: 1 / the number of scans of its subject."""
+    counts = Counter(subjects)
+    return np.array([1.0 / counts[name] for name in subjects])
 
 
 class _Steps:
@@ -288,13 +316,14 @@ def _intervals(
     low, high = np.empty_like(y), np.empty_like(y)
     for fold, own in enumerate(inner):
         test, train = outer == fold, outer != fold
-        residuals, ways, _, _ = _left_out(X[train], y[train], own, CHOICES[int(chosen[fold])], X[test])
+        choice = CHOICES[int(chosen[fold])]
+        residuals, ways, _, _ = _left_out(X[train], y[train], share[train], own, choice, X[test])
         low[test], high[test] = cv_plus(ways, residuals, own, share[train], level)
     return low, high
 
 
 def _left_out(
-    X: FloatArray, y: FloatArray, folds: IndexArray, choice: Choice, new: FloatArray
+    X: FloatArray, y: FloatArray, share: FloatArray, folds: IndexArray, choice: Choice, new: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return residuals (N,) without each row's fold, predictions (n, F) of `new`, weights (F, K), intercepts (F,)."""
     residuals = np.empty_like(y)
@@ -302,7 +331,7 @@ def _left_out(
     intercepts: list[float] = []
     for fold in range(int(folds.max()) + 1):
         test = folds == fold
-        beta, intercept = Decomposed.of(X[~test]).weights(y[~test], choice)
+        beta, intercept = Decomposed.of(X[~test], share[~test]).weights(y[~test], choice)
         residuals[test] = np.abs(y[test] - X[test] @ beta - intercept)
         weights.append(beta)
         intercepts.append(intercept)
@@ -314,12 +343,12 @@ def _predictor(
     cohort: Cohort, target: str, y: FloatArray, share: FloatArray, outer: IndexArray, choice: Choice, level: float
 ) -> tuple[Predictor, Choice, float]:
     X = cohort.coefficients
-    whole = Decomposed.of(X)
+    whole = Decomposed.of(X, share)
     if choice.space == "whitened":
         choice = Choice("whitened", min(choice.amount, len(whole.singular)))
     beta, intercept = whole.weights(y, choice)
-    residuals, _, weights, intercepts = _left_out(X, y, outer, choice, X[:1])
-    middle = X.mean(axis=0)
+    residuals, _, weights, intercepts = _left_out(X, y, share, outer, choice, X[:1])
+    middle = whole.middle
     all_beta, all_intercepts = np.vstack([beta, weights]), np.concatenate([[intercept], intercepts])
     farthest = float(np.sqrt(((X - middle) ** 2).sum(axis=1).max() / cohort.n_vertices))
     predictor = Predictor(
@@ -378,7 +407,10 @@ def _measures(
         ends = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
         return Measure(float(values[0]), float(ends[0]), float(ends[1]))
 
-    return {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+    measured = {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
+    inside = measured["coverage"]
+    ends = widen_share(np.array(inside.low), np.array(inside.high), n, level)
+    return {**measured, "coverage": Measure(inside.value, *map(float, ends))}
 
 
 def _p_of(
@@ -393,34 +425,73 @@ def _p_of(
     rng: np.random.Generator,
     steps: _Steps,
 ) -> float | None:
-    """Return how often R2 is as high with the targets of subjects dealt out anew, choice and all."""
+    """Return the share of permutations, that observed among them, whose R2 is at least as high, each with its own
+    choice."""
     if not permutations:
         return None
     beyond = 1
     for start in range(0, permutations, _BLOCK):
-        orders = [_dealt(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))]
-        targets = np.stack([y[order] for order in orders], axis=1)
+        targets = np.stack([_permuted(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))], axis=1)
         done = nested(X, targets, share, outer, inner, on_fold=steps.fold)
         r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
         beyond += int((r2 >= observed - 1e-12).sum())
     return beyond / (1 + permutations)
 
 
-def _dealt(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> IndexArray:
-    """Return rows (N,) whose targets take the place of each row's: those of a subject with as many rows together.
-
-    Where they differ within a subject they are dealt out anew within it too, or of subjects who all have the same ones
-    every order would be that observed.
-    """
-    order = np.arange(len(codes))
+def _permuted(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the targets (N,) permuted between subjects; see `permutation_scheme`."""
     counts = np.bincount(codes)
     rows = [np.flatnonzero(codes == subject) for subject in range(len(counts))]
+    if not any(np.ptp(y[own]) for own in rows):
+        return y[[own[0] for own in rows]][rng.permutation(len(rows))][codes]
+    order = np.arange(len(codes))
     for count in np.unique(counts):
         alike = np.flatnonzero(counts == count)
         for to, source in zip(alike, rng.permutation(alike), strict=True):
             given = rows[int(source)]
+            # Where all subjects have the same targets, exchanges between subjects alone would change nothing.
             order[rows[to]] = rng.permutation(given) if np.ptp(y[given]) else given
-    return order
+    return y[order]
+
+
+def permutation_scheme(subjects: Sequence[str], y: FloatArray) -> str:
+    """Return in a sentence which targets are exchanged under the null hypothesis of no relation with shape.
+
+    Args:
+        subjects: (N,) whose each row is.
+        y: (N,) targets.
+    """
+    own: dict[str, list[float]] = {}
+    for name, value in zip(subjects, y.tolist(), strict=True):
+        own.setdefault(name, []).append(value)
+    if all(len(set(values)) == 1 for values in own.values()):
+        return f"The permutations exchange the targets of all {len(own)} subjects."
+    partners = Counter(len(values) for values in own.values())
+    alone = sum(partners[len(values)] == 1 for values in own.values())
+    rest = f"; {alone} of {len(own)} subjects have no such partner" if alone else ""
+    return (
+        "The target varies within subjects: the permutations exchange the targets of subjects with the same number of "
+        f"scans, and the targets within each subject{rest}."
+    )
+
+
+def _percentiles(
+    y: FloatArray, codes: IndexArray, share: FloatArray, percent: tuple[float, float]
+) -> tuple[float, float]:
+    """Return percentiles of a target to which each subject contributes once, linear between its distinct values.
+
+    With one value for each subject they are those of `np.percentile`.
+    """
+    weights: dict[tuple[float, int], float] = {}
+    for value, subject, one in zip(y.tolist(), codes.tolist(), share.tolist(), strict=True):
+        weights[value, subject] = weights.get((value, subject), 0.0) + one
+    own = sorted(weights)
+    weight = np.array([weights[key] for key in own])
+    place = np.cumsum(weight) - 0.5 * (weight + 1.0)
+    at = np.array(percent) / 100.0 * (weight.sum() - 1.0)
+    values = np.array([value for value, _ in own])
+    low, high = (float(np.interp(one, place, values)) for one in at)
+    return low, high
 
 
 def _rms(values: FloatArray, share: FloatArray) -> float:

@@ -6,12 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.methods_answer import methods_parts
+from shapespace.statistics.observed import blank_where, weights_of, with_shape_data
 from shapespace.statistics.predictor import Predictions, Predictor
-from shapespace.statistics.regression import SMALL, Measure, Regression, compare_with
+from shapespace.statistics.regression import (
+    SMALL,
+    Measure,
+    Regression,
+    compare_with,
+    permutation_scheme,
+    share_of,
+)
 from shapespace.types import Mesh
 
 _FILE = "regression.npz"
@@ -37,7 +45,7 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         for name, at in (("low", found.low_at), ("high", found.high_at))
     }
     fitted = found.cohort.fitted
-    return Answer(
+    answer = Answer(
         question="regress",
         title=f"{found.target} from shape",
         summary=_summary(found, new),
@@ -54,11 +62,12 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
         methods=found.methods,
     )  # fmt: skip
+    return with_shape_data(answer, found.cohort)
 
 
 def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> Answer:
     """Return the answer of a predictor that was learned earlier."""
-    return Answer(
+    answer = Answer(
         question="regress",
         title=f"{learned.target} from shape",
         summary=(
@@ -71,6 +80,7 @@ def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> A
         settings={"target": learned.target, "gauge": learned.gauge, "level": learned.level},
         model_hashes=(learned.model_hash,) if learned.model_hash else (),
     )
+    return with_shape_data(answer, cohort)
 
 
 def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
@@ -83,6 +93,13 @@ def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple
         f"the subjects left out; the observed rises by {m['slope'].value:.2f} ({_span(m['slope'])}) for one predicted.",
         f"It goes by {found.choice.words()}, {found.effective:.1f} degrees of freedom for {found.n_subjects} subjects.",
     ]
+    if len(found.cohort) > found.n_subjects:
+        sentences.append(
+            f"{len(found.cohort)} scans of {found.n_subjects} subjects: in means, fit, figures and intervals each scan "
+            "has the weight 1 / number of scans of its subject."
+        )
+    if found.p is not None:
+        sentences.append(permutation_scheme(found.subjects, found.observed))
     if found.small:
         sentences.insert(1, f"{found.n_subjects} subjects are a small sample (fewer than {SMALL}): another would "
                             "give other figures, and the intervals tell how far.")  # fmt: skip
@@ -91,7 +108,8 @@ def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple
         sentences.append(f"{len(told.names)} new shapes are predicted. {_outside(found.predictor, told)}")
         known = _observed(cohort, found.target)
         if known is not None and len(known) > 1:
-            r2, rmse, coverage = compare_with(told, known)
+            column = found.subject if found.subject in cohort.table.columns else None
+            r2, rmse, coverage = compare_with(told, known, share_of(subjects_of(cohort, column)))
             sentences.append(
                 f"Their {found.target} is known: RMSE {rmse:.3g}, R² {r2:.2f}, and {100 * coverage:.0f} % lie in the "
                 f"{level} intervals."
@@ -133,7 +151,8 @@ def _measures(found: Regression) -> TablePart:
         rows.append(("p of R², by permutation", found.p, None, None))
     return TablePart(
         title="On subjects left out", columns=columns, rows=tuple(rows),
-        note=f"Nested cross-validation in {found.folds} folds of subjects; {level} intervals by drawing subjects anew.",
+        note=f"Nested cross-validation in {found.folds} folds of subjects, each of whom counts once; {level} "
+        "intervals by drawing subjects anew.",
     )  # fmt: skip
 
 
@@ -156,7 +175,9 @@ def _calibration(found: Regression) -> CurvePart:
 
 def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
     low, high = found.shape_at(found.low_at), found.shape_at(found.high_at)
-    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0, "per_unit_mm": found.map}
+    blank = weights_of(found.cohort.observed_share) == 0
+    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
+    arrays["per_unit_mm"] = blank_where(found.map, blank)
     if found.cohort.faces is None:
         return arrays, []
     arrays["faces"] = found.cohort.faces

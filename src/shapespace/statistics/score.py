@@ -89,7 +89,8 @@ class Scores:
         beyond_farther: (M,) as `farther`, of that.
         size_mm: (M,) centroid sizes; NaN where not known.
         size_z: (M,) sizes in standard deviations of the reference's; NaN where not known.
-        z: (M, V) displacement along the mean's normals in standard deviations, outwards positive.
+        z: (M, V) displacement along the mean's normals in standard deviations, outwards positive; not-a-number where a
+            subject's vertex is an estimate.
         z_limit: |z| below which 95 % of the reference's people stay everywhere when left out; NaN for fewer than 19.
         nearest: for each subject those of the reference nearest to it.
         outside: for each subject sentences on how it lies outside what reference or model know; none where it does not.
@@ -132,8 +133,8 @@ class Scores:
 
     @property
     def beyond_2(self) -> FloatArray:
-        """(M,) Share of the vertices beyond 2 standard deviations."""
-        return read_only((np.abs(self.z) > 2).mean(axis=1))
+        """(M,) Share of the observed vertices beyond 2 standard deviations."""
+        return read_only((np.abs(self.z) > 2).sum(axis=1) / np.maximum(np.isfinite(self.z).sum(axis=1), 1))
 
     @property
     def methods(self) -> Methods:
@@ -515,6 +516,9 @@ def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | N
         largest = np.maximum(largest, np.abs(left_out).max(axis=1))
     by_person = np.sort(np.array([largest[people == k].mean() for k in range(count)]))
     at = int(np.ceil((1 - LEVEL) * (count + 1)))
+    for k in range(len(subjects)):
+        mask = subjects.observed_in([k])
+        z[k] = z[k] if mask is None else np.where(mask, z[k], np.nan)
     return read_only(z), float(by_person[at - 1]) if at <= count else float("nan")
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.methods_answer import methods_parts
+from shapespace.statistics.observed import with_shape_data
 from shapespace.statistics.score import SMALL, Scores
 
 _MOST_MAPS, _MOST_MORPHS, _MOST_TOLD, _BINS = 12, 3, 12, 24
@@ -32,7 +33,7 @@ def answer_of_scores(scores: Scores) -> Answer:
     ]
     fitted = scores.subjects.fitted
     many = len(scores.names) != 1
-    return Answer(
+    answer = Answer(
         question="score",
         title=f"{f'{len(scores.names)} subjects' if many else scores.names[0]} beside a reference of {scores.people}",
         summary=tuple(_sentence(scores, k) for k in shown[:_MOST_TOLD]),
@@ -51,6 +52,7 @@ def answer_of_scores(scores: Scores) -> Answer:
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
         methods=scores.methods,
     )
+    return with_shape_data(answer, scores.subjects)
 
 
 def _shown(scores: Scores) -> list[int]:
@@ -142,7 +144,7 @@ def _maps(scores: Scores, shown: list[int]) -> list[Part]:
     for k in shown[:_MOST_MAPS]:
         beyond = ""
         if math.isfinite(scores.z_limit):
-            share = float((np.abs(scores.z[k]) > scores.z_limit).mean())
+            share = float((np.abs(scores.z[k]) > scores.z_limit).sum() / max(np.isfinite(scores.z[k]).sum(), 1))
             beyond = f"{100 * share:.1f} % of the vertices lie beyond {scores.z_limit:.1f} standard deviations."
         parts.append(
             SurfaceMapPart(

@@ -1,7 +1,9 @@
 """Ridge and principal component regression as filters of one decomposition, chosen by nested folds of subjects.
 
 Both are linear in the target: a training set is decomposed once, and that serves every penalty and every permutation of
-the targets (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, 2009, section 3.4).
+the targets (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, 2009, section 3.4). Rows have
+weights, 1 / the number of scans of their subject, so that each subject counts once in the means, the fit and the choice
+of the penalty. Weighted least squares is least squares on rows times the square root of their weight.
 """
 
 from __future__ import annotations
@@ -53,42 +55,52 @@ CHOICES = tuple(Choice("raw", p) for p in PENALTIES) + tuple(Choice("whitened", 
 
 @dataclass(frozen=True, eq=False)
 class Decomposed:
-    """A training set.
+    """The singular value decomposition of a weighted training set.
 
     Args:
-        middle: (K,) mean of its coefficients.
-        left: (n, r), singular: (r,), right: (r, K) of its centred coefficients.
+        middle: (K,) weighted mean of the coefficients.
+        left: (n, r), singular: (r,), right: (r, K) of the centred coefficients times the square root of `weight`.
+        weight: (n,) of the rows.
     """
 
     middle: FloatArray
     left: FloatArray
     singular: FloatArray
     right: FloatArray
+    weight: FloatArray
 
     @staticmethod
-    def of(X: FloatArray) -> Decomposed:
-        """Return it for coefficients (n, K)."""
-        middle = X.mean(axis=0)
-        left, singular, right = np.linalg.svd(X - middle, full_matrices=False)
+    def of(X: FloatArray, weight: FloatArray) -> Decomposed:
+        """Return the decomposition of coefficients (n, K) whose rows have weights (n,)."""
+        middle = weighted_mean(X, weight)
+        left, singular, right = np.linalg.svd(np.sqrt(weight)[:, None] * (X - middle), full_matrices=False)
         kept = singular > _NOTHING * max(float(singular[0]), 1e-300)
-        return Decomposed(middle, left[:, kept], singular[kept], right[kept])
+        return Decomposed(middle, left[:, kept], singular[kept], right[kept], weight)
 
     def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Choice]) -> FloatArray:
-        """Return what each choice predicts, (C, m, P), of coefficients (m, K) by targets (n, P) of the training set."""
-        mean = targets.mean(axis=0)
+        """Return the predictions (C, m, P) of each choice for coefficients (m, K), from targets (n, P) of the training
+        set."""
+        mean = weighted_mean(targets, self.weight)
         along = (X - self.middle) @ self.right.T / self.singular
-        of_targets = self.left.T @ (targets - mean)
+        of_targets = self.left.T @ (np.sqrt(self.weight)[:, None] * (targets - mean))
         return np.stack([mean + (along * choice.factors(self.singular)) @ of_targets for choice in choices])
 
     def weights(self, target: FloatArray, choice: Choice) -> tuple[FloatArray, float]:
         """Return weights (K,) and intercept of a prediction from coefficients, for a target (n,)."""
-        mean = float(target.mean())
-        beta = (choice.factors(self.singular) / self.singular * (self.left.T @ (target - mean))) @ self.right
+        mean = float(weighted_mean(target, self.weight))
+        of_target = self.left.T @ (np.sqrt(self.weight) * (target - mean))
+        beta = (choice.factors(self.singular) / self.singular * of_target) @ self.right
         return beta, mean - float(self.middle @ beta)
 
     def effective(self, choice: Choice) -> float:
         """Return the effective degrees of freedom of a choice, without the mean."""
         return float(choice.factors(self.singular).sum())
+
+
+def weighted_mean(values: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the mean over the rows of `values` (n, ...) with weights (n,)."""
+    # Division of the sums keeps the rounding of the plain mean where all weights are 1.
+    return (weight.reshape(-1, *(1,) * (values.ndim - 1)) * values).sum(axis=0) / weight.sum()
 
 
 def folds_of(codes: IndexArray, count: int, rng: np.random.Generator) -> IndexArray:
@@ -112,7 +124,7 @@ def errors_of(
     total = np.zeros((len(choices), targets.shape[1]))
     for fold in np.unique(folds):
         test = folds == fold
-        found = Decomposed.of(X[~test]).predict(X[test], targets[~test], choices)
+        found = Decomposed.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
         total += np.einsum("m,cmp->cp", weight[test], (found - targets[test]) ** 2)
     return total
 
@@ -123,7 +135,7 @@ class Nested:
 
     Args:
         predicted: (N, P) for each column of targets.
-        baseline: (N, P) the mean of the training set.
+        baseline: (N, P) the weighted mean of the training set.
         chosen: (F, P) index of the choice in each outer fold.
     """
 
@@ -146,7 +158,7 @@ def nested(
     Args:
         X: (N, K) coefficients.
         targets: (N, P).
-        weight: (N,) of rows in errors.
+        weight: (N,) of rows in means, fits and errors.
         outer: (N,) fold of each row.
         inner: for each outer fold, the folds (n,) of its training rows.
         choices: to choose from.
@@ -159,9 +171,9 @@ def nested(
         train = ~test
         errors = errors_of(X[train], targets[train], weight[train], own, choices)
         best = errors.argmin(axis=0)
-        found = Decomposed.of(X[train]).predict(X[test], targets[train], choices)
+        found = Decomposed.of(X[train], weight[train]).predict(X[test], targets[train], choices)
         predicted[test] = np.take_along_axis(found, best[None, None, :], axis=0)[0]
-        baseline[test] = targets[train].mean(axis=0)
+        baseline[test] = weighted_mean(targets[train], weight[train])
         chosen.append(best)
         if on_fold is not None:
             on_fold(fold + 1, len(inner))

@@ -9,7 +9,6 @@ import numpy as np
 
 from shapespace.io.tables import CHECKSUM
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
 _SHARES = ("model_seen_share", "scan_covered_share")
@@ -132,17 +131,6 @@ def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
         *_TOLD_OF_FITS,
     ]
     return [*columns, *known, CHECKSUM, "model_hash"]
-
-
-def safe_cells(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `row` for a CSV table, without what a spreadsheet would run."""
-    # Only names and reasons are text, and a cell that starts like a formula is one.
-    return {
-        key: ("'" if value[:1] in _FORMULA else "") + value.encode("utf-8", "backslashreplace").decode("utf-8")
-        if isinstance(value, str) and value
-        else value
-        for key, value in row.items()
-    }
 
 
 def store_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:

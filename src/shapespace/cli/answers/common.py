@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from shapespace.statistics.answer import Answer
 
 
-def add_cohort(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments that name a cohort, and where the answer is written."""
+def add_cohort(sub: argparse.ArgumentParser, surfaces: str = "auto") -> None:
+    """Add the arguments that name a cohort, and where the answer is written; `surfaces` is a default."""
     sub.add_argument("data", type=Path, metavar="DATA",
                      help="a CSV table whose column file, scan, name or id names a shape in each row; or a folder of "
                      "fits, whose metadata are the table")  # fmt: skip
@@ -24,8 +24,9 @@ def add_cohort(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--shapes", type=Path, metavar="DIR",
                      help="results of fits, or meshes in correspondence (default: the folder of DATA)")  # fmt: skip
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits, where it was moved")
-    sub.add_argument("--surfaces", choices=("coefficients", "fitted", "dense"), default="coefficients",
-                     help="what of a fit stands for its shape (default: coefficients)")  # fmt: skip
+    sub.add_argument("--surfaces", choices=("auto", "coefficients", "fitted", "dense"), default=surfaces,
+                     help="shapes of fits: auto takes dense surfaces where all fits have one, else coefficients "
+                     f"(default: {surfaces})")  # fmt: skip
     sub.add_argument("--doubtful", action="store_true", help="take doubtful fits too (default: left out and counted)")
     sub.add_argument("--drop-missing", action="store_true",
                      help="leave out shapes of which something is missing in the table (default: refused)")  # fmt: skip

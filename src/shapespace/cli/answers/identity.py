@@ -51,7 +51,7 @@ def run_identify(arguments: argparse.Namespace) -> int:
 
 
 def _add_who(sub: argparse.ArgumentParser) -> None:
-    add_cohort(sub)
+    add_cohort(sub, "coefficients")
     sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
     sub.add_argument("--gallery", metavar="EXPR",
                      help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all; of "
@@ -64,7 +64,7 @@ def _add_who(sub: argparse.ArgumentParser) -> None:
         "--folds", type=int, metavar="N", help="parts of the people, each tested by the others (default 4)"
     )
     sub.add_argument("--scores", type=_names, metavar="LIST",
-                     help="likelihood-ratio, cosine, mahalanobis or distance, first the one that is told of first "
+                     help="plda, cosine, mahalanobis or distance, first the one that is told of first "
                      "(default: all)")  # fmt: skip
     sub.add_argument("--modes", type=int, metavar="K", help="leading coefficients of identity (default: all)")
     sub.add_argument("--no-uncertainty", action="store_true", help="take all fits for exact")

@@ -39,6 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
+        if learned.model_hash and arguments.surfaces == "auto":
+            arguments.surfaces = "coefficients"
         cohort = cohort_of(arguments, learned.gauge, least=1)
         return finish(predicted_answer(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         options = CohortOptions(
             arguments.new_shapes, arguments.model, arguments.surfaces, arguments.gauge, arguments.doubtful, least=1
         )
-        fresh = read_cohort(arguments.predict, options)
+        fresh = read_cohort(arguments.predict, options, onto=cohort)
         there = subject is not None and subject in fresh.table.columns
         refuse_known(
             found.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where

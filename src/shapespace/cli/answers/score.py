@@ -10,7 +10,7 @@ from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, fini
 
 def add(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    add_cohort(sub)
+    add_cohort(sub, "coefficients")
     sub.add_argument("--reference", type=Path, required=True, metavar="DATA",
                      help="the population: a table or a folder of fits, without its doubtful fits")  # fmt: skip
     sub.add_argument("--reference-shapes", type=Path, metavar="DIR",

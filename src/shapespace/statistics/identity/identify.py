@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.late import late
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.rates import Figure, figure, people_drawn
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.statistics.identity.scores import score_name
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 FPIR = (1e-1, 1e-2)
@@ -37,6 +39,11 @@ class Searches:
     rank: IntArray
     own: FloatArray
     best_other: FloatArray
+
+    @property
+    def people(self) -> int:
+        """Number of enrolled people who are searched for, the independent units of error rates."""
+        return len(np.unique(self.person[self.enrolled]))
 
     @property
     def enrolled(self) -> BoolArray:
@@ -110,6 +117,7 @@ class Identification:
     options: IdentityOptions
 
     def __getitem__(self, name: str) -> Identified:
+        name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
     def answer(self) -> Answer:
@@ -202,8 +210,9 @@ def identified(name: str, searches: Searches, most: int, people: FloatArray) -> 
     cmc, fnir = searches.cmc(most), searches.fnir(rates)
     searched = len(searches.rank) if searches.enrolled.all() else int((~searches.enrolled).sum())
     band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
+    band = np.stack(widen_share(band[0], band[1], searches.people))
     missed = {
-        rate: figure(float(fnir[k]), drawn[:, most + k]) if searched * rate >= 1 else Figure(None)
+        rate: figure(float(fnir[k]), drawn[:, most + k], searches.people) if searched * rate >= 1 else Figure(None)
         for k, rate in enumerate(FPIR)
     }
-    return Identified(name, searches, figure(float(cmc[0]), drawn[:, 0]), cmc, band, missed)
+    return Identified(name, searches, figure(float(cmc[0]), drawn[:, 0], searches.people), cmc, band, missed)

@@ -8,6 +8,7 @@ from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, 
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.identify import Identification, Identified
 from shapespace.statistics.identity.told import (
+    INTERVALS,
     called,
     cells,
     hashes,
@@ -19,6 +20,7 @@ from shapespace.statistics.identity.told import (
     settings,
     who_was_tested,
 )
+from shapespace.statistics.observed import with_shape_data
 
 
 def answer_of_identification(found: Identification) -> Answer:
@@ -46,7 +48,7 @@ def answer_of_identification(found: Identification) -> Answer:
     notes = seen(
         [
             *trial.notes,
-            none_missed((first.rank_1.value or 0.0) < 1, int(trial.tested.sum())),
+            none_missed((first.rank_1.value or 0.0) < 1, first.searches.people),
             "There are too few searches for a false positive identification rate of "
             f"{', '.join(f'{rate:g}' for rate in lost)}."
             if lost
@@ -57,7 +59,7 @@ def answer_of_identification(found: Identification) -> Answer:
         ]
     )
     told = ("score", "figure", "value", "low", "high")
-    return Answer(
+    answer = Answer(
         question="recognise identify",
         title="Who is it? Identification",
         summary=summary,
@@ -77,6 +79,7 @@ def answer_of_identification(found: Identification) -> Answer:
         settings=settings(found.options),
         model_hashes=hashes(trial),
     )
+    return with_shape_data(answer, trial.cohort)
 
 
 def _rows(one: Identified) -> list[Sequence[object]]:
@@ -125,7 +128,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
                 f"{found.enrolled} people are enrolled"
                 + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
                 + " A person's score is that of the scan of them that is most like the probe; ties count against the"
-                " right one. Intervals hold 95 % of what is found when people are drawn anew with replacement.",
+                f" right one. {INTERVALS}",
             ),
         ),
     )  # fmt: skip

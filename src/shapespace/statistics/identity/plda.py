@@ -1,4 +1,4 @@
-"""The likelihood ratio of two scans being of one person, by normal within- and between-person covariance.
+"""PLDA: a score of two scans being of one person, by normal within- and between-person covariance.
 
 A scan is x = m + y + w: y ~ N(0, B) who it is, w ~ N(0, W) what else it shows and the error of its fit. W differs from
 scan to scan with what each fit states of its error. This is the two-covariance model of PLDA: Brummer and de Villiers,
@@ -56,12 +56,12 @@ class TwoCovariance:
             InputError: fewer than three people, or nobody of them has two scans.
             ShapespaceError: scikit-learn is not installed.
         """
-        shrunk = other_package("sklearn.covariance", "The likelihood ratio", "'shapespace[statistics]'").ledoit_wolf
+        shrunk = other_package("sklearn.covariance", "The PLDA score", "'shapespace[statistics]'").ledoit_wolf
         names, whose = np.unique(np.asarray(training.subjects), return_inverse=True)
         counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
         if len(names) < 3 or counts.max(initial=0.0) < 2:
             raise InputError(
-                f"The likelihood ratio learns from people who are not tested, and there are {len(names)}, of whom "
+                f"The PLDA score learns from people who are not tested, and there are {len(names)}, of whom "
                 f"{int((counts > 1).sum())} have two scans; give three people or more and several scans of each, or "
                 "leave it out of --scores."
             )
@@ -83,8 +83,11 @@ class TwoCovariance:
         arrays = (mean, basis, np.maximum(values, 0.0), noise, scale)
         return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
 
-    def log_ratio(self, gallery: Samples, probes: Samples) -> FloatArray:
-        """Return (G, P) log likelihood ratios, natural, of one person against two.
+    def score(self, gallery: Samples, probes: Samples) -> FloatArray:
+        """Return (G, P) scores: the model's log likelihood, natural, of one person less that of two.
+
+        They are likelihood ratios only as far as the normal model and its covariances are right, which few people to
+        learn from do not ensure; `calibrated` makes likelihood ratios of them.
 
         The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
         the coordinates of `basis` is used.

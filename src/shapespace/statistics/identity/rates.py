@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
 from shapespace.types import BoolArray, FloatArray, IntArray
 
@@ -36,6 +37,11 @@ class Pairs:
     def same(self) -> BoolArray:
         """(M,) whether both are of one person."""
         return self.one == self.other
+
+    @property
+    def genuine_people(self) -> int:
+        """Number of people with a pair of their own, the independent units of error rates."""
+        return len(np.unique(self.one[self.same]))
 
     def take(self, chosen: BoolArray) -> Pairs:
         """Return the chosen ones, (M,)."""
@@ -109,7 +115,10 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure with the ends of its interval of 95 % over people; None where the data cannot say."""
+    """A figure with the ends of its 95 % interval over people; None where the data are too few.
+
+    The interval of a share is never narrower than the exact one without an error, see `widen_share`.
+    """
 
     value: float | None
     low: float | None = None
@@ -125,13 +134,21 @@ def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
     return out
 
 
-def figure(value: float | None, drawn: Sequence[float] | FloatArray) -> Figure:
-    """Return a figure with the interval that figures of resampled people span."""
+def figure(value: float | None, drawn: Sequence[float] | FloatArray, people: int | None = None) -> Figure:
+    """Return a figure with the interval that figures of resampled people span.
+
+    Args:
+        value: of all people.
+        drawn: the figure of each draw of people; NaN where a draw has none.
+        people: number of people whose errors a share counts, for its ends near 0 and 1; None for other figures.
+    """
     known = np.asarray([one for one in drawn if np.isfinite(one)])
-    if value is None or not len(known):
+    if value is None or not (len(known) or (people and value in (0.0, 1.0))):
         return Figure(value)
     tail = 50.0 * (1.0 - _LEVEL)
-    low, high = np.percentile(known, [tail, 100.0 - tail])
+    low, high = np.percentile(known if len(known) else [value], [tail, 100.0 - tail])
+    if people is not None:
+        low, high = widen_share(low, high, people, _LEVEL)
     return Figure(value, float(low), float(high))
 
 

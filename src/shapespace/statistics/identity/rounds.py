@@ -14,7 +14,7 @@ from shapespace.cohort.table import Table, named
 from shapespace.errors import InputError
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.statistics.identity.samples import Samples, samples_of
-from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores
+from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores, score_name
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
@@ -38,7 +38,7 @@ class IdentityOptions:
         modes: leading coefficients of identity that are used; None for all.
         curve: numbers of modes for which the equal error rate is found as well.
         by: a column of which each value has its own figures.
-        uncertainty: whether the likelihood ratio goes by what each fit states of its own error.
+        uncertainty: whether the PLDA score uses the error that each fit states.
         draws: of people, for intervals.
         seed: of folds and draws.
         drop_missing: leave out scans of which a column that is used says nothing.
@@ -58,6 +58,9 @@ class IdentityOptions:
     draws: int = 1000
     seed: int = 0
     drop_missing: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scores", tuple(map(score_name, self.scores)))
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeAlias
+from warnings import warn
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -18,8 +19,8 @@ Scorer: TypeAlias = Callable[[Samples, Samples], FloatArray]
 """(gallery, probes) -> (G, P) scores, alike if the two change places."""
 
 
-def _likelihood_ratio(training: Samples) -> Scorer:
-    return TwoCovariance.learn(training).log_ratio
+def _plda(training: Samples) -> Scorer:
+    return TwoCovariance.learn(training).score
 
 
 def _cosine(_: Samples) -> Scorer:
@@ -41,14 +42,30 @@ def _directions(x: FloatArray) -> FloatArray:
 
 SCORES: Mapping[str, Callable[[Samples], Scorer]] = MappingProxyType(
     {
-        "likelihood-ratio": _likelihood_ratio,
+        "plda": _plda,
         "cosine": _cosine,
         "mahalanobis": _mahalanobis,
         "distance": _distance,
     }
 )
-"""What tells how alike two scans are: by the two-covariance model, by the angle and by the distance of whitened
-coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm."""
+"""Scores of how alike two scans are: by the two-covariance model (PLDA), by the angle and by the distance of whitened
+coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm. No score is a likelihood
+ratio."""
+
+
+_FORMER = {"likelihood-ratio": "plda"}
+
+
+def score_name(name: str) -> str:
+    """Return the present name of a score; a former one warns."""
+    if name not in _FORMER:
+        return name
+    warn(
+        f"The score {name!r} is now called {_FORMER[name]!r}, since only calibrated scores are likelihood ratios.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    return _FORMER[name]
 
 
 def refuse_unknown_scores(names: Sequence[str]) -> None:

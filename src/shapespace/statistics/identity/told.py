@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from shapespace.cohort.proportions import zero_bound
 from shapespace.schemas import Series
 from shapespace.statistics.answer import Rows
 from shapespace.statistics.identity.rates import Figure
@@ -16,12 +17,17 @@ from shapespace.types import FloatArray
 
 _POINTS = 300
 CALLED = {
-    "likelihood-ratio": "likelihood ratio",
+    "plda": "PLDA score",
     "cosine": "cosine",
     "mahalanobis": "whitened distance",
     "distance": "plain distance",
 }
 """What scores are called in words."""
+INTERVALS = (
+    "95 % intervals are percentiles over draws of people with replacement; near 0 and 1 they are at least as wide as "
+    "the exact interval of Clopper and Pearson for no error among as many people."
+)
+"""What the intervals of error rates are, for reports."""
 
 
 def called(name: str) -> str:
@@ -38,8 +44,8 @@ def in_percent(one: Figure) -> str:
 
 
 def interval(one: Figure) -> tuple[float, float] | None:
-    """Return the ends of an interval; None where there is none, or where no draw of people differs."""
-    return None if one.low is None or one.high is None or one.low == one.high else (one.low, one.high)
+    """Return the ends of an interval; None where there is none."""
+    return None if one.low is None or one.high is None else (one.low, one.high)
 
 
 def cells(one: Figure) -> list[object]:
@@ -92,12 +98,12 @@ def scans_told(trial: Trial) -> Rows:
 
 
 def none_missed(errors: bool, people: int) -> str:
-    """Return what no error among some people is worth, by the rule of three."""
+    """Return a sentence on the exact upper bound where no error was found among some people."""
     return (
         ""
         if errors
-        else f"No error among {people} people does not mean none: up to {min(300 / people, 100):.1f} % of people may "
-        "be ones with whom errors happen (95 %, rule of three)."
+        else f"No error among {people} people does not mean that there are none: up to {100 * zero_bound(people):.1f} "
+        "% of people may be ones with whom errors happen (95 %, Clopper-Pearson, with people as the units)."
     )
 
 

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.proportions import widen_share
 from shapespace.late import late
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
 from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
 from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.statistics.identity.scores import score_name
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 FAR = (1e-1, 1e-2, 1e-3)
@@ -93,6 +95,7 @@ class Verification:
     options: IdentityOptions
 
     def __getitem__(self, name: str) -> Verified:
+        name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
     def answer(self) -> Answer:
@@ -193,6 +196,7 @@ def verified(
     eer, tar = _told(roc, pairs, drawn[:, 1:])
     usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
     band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
+    band = np.stack(widen_share(band[0], band[1], pairs.genuine_people))
     by: dict[str, Part] = {}
     for value, own in (chosen or {}).items():
         part = pairs.take(own)
@@ -214,10 +218,12 @@ def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float
     """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {
-        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k]) if impostors * far >= 1 else Figure(None)
+        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people)
+        if impostors * far >= 1
+        else Figure(None)
         for k, far in enumerate(FAR)
     }
-    return figure(roc.eer, drawn[:, 0]), tar
+    return figure(roc.eer, drawn[:, 0], pairs.genuine_people), tar
 
 
 def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:

@@ -9,6 +9,7 @@ import numpy as np
 from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.told import (
+    INTERVALS,
     called,
     cells,
     hashes,
@@ -22,6 +23,7 @@ from shapespace.statistics.identity.told import (
     who_was_tested,
 )
 from shapespace.statistics.identity.verify import FAR, GRID, Verification, Verified
+from shapespace.statistics.observed import with_shape_data
 
 _LEAST_RATE = 1e-4
 _BINS = 40
@@ -34,7 +36,6 @@ def answer_of_verification(found: Verification) -> Answer:
     pairs = found.pairs
     genuine = int(pairs.same.sum())
     impostor = len(pairs) - genuine
-    tested = int(trial.tested.sum())
     summary = seen(
         [
             f"By {called(first.name)} the equal error rate is {in_percent(first.eer)}, over {genuine} pairs of one "
@@ -53,7 +54,7 @@ def answer_of_verification(found: Verification) -> Answer:
     notes = seen(
         [
             *trial.notes,
-            none_missed((first.eer.value or 0.0) > 0, tested),
+            none_missed((first.eer.value or 0.0) > 0, pairs.genuine_people),
             f"{impostor} pairs of two make {', '.join(f'{impostor * far:.1f}' for far in thin)} false accepts at "
             f"a rate of {', '.join(f'{far:g}' for far in thin)}, and 30 are wanted for a rate to be trusted; below one "
             "nothing is stated."
@@ -72,7 +73,7 @@ def answer_of_verification(found: Verification) -> Answer:
         **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
     }
     told = ("score", "figure", "value", "low", "high")
-    return Answer(
+    answer = Answer(
         question="recognise verify",
         title="Who is it? Verification",
         summary=summary,
@@ -86,6 +87,7 @@ def answer_of_verification(found: Verification) -> Answer:
         settings=settings(found.options),
         model_hashes=hashes(trial),
     )
+    return with_shape_data(answer, trial.cohort)
 
 
 def _cost(one: Verified) -> str:
@@ -132,8 +134,8 @@ def _parts(found: Verification) -> tuple[Part, ...]:
             title="How it was measured",
             text=(
                 who_was_tested(found.trial, found.trained_on),
-                "Intervals hold 95 % of what is found when people are drawn anew with replacement. Likelihood ratios "
-                "are calibrated by a logistic regression on pairs of people of other groups. Whether the shape model "
+                f"{INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by "
+                "a logistic regression on pairs of people of other groups. Whether the shape model "
                 "was built from people tested here cannot be seen from its file; it must not have been.",
             ),
         )

@@ -1,0 +1,187 @@
+"""Shapes with missing vertices in a cohort: estimates by PCA with missing data, with the mask of observed vertices.
+
+The estimates depend on the shapes alone, never on the table, so that permutations of its rows stay exchangeable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from shapespace.cohort.table import named
+from shapespace.errors import InputError
+from shapespace.geometry.procrustes import Gauge, centroid_size
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.model.missing import MIN_SEEN, complete
+from shapespace.model.ppca import ppca
+from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
+
+_FEWEST_SHAPES = 2
+"""Shapes that must observe a vertex: one shows no variation."""
+_FEWEST_VERTICES = 3
+"""Vertices of a shape that determine its pose."""
+_MODES_A_SHAPE, _MOST_MODES = 0.7, 60
+"""As of `complete`: the prior removes modes without evidence."""
+_POSES, _SETTLED = 50, 1e-9
+_ANCHOR = 1e-9
+"""Weight of the centroid where vertices without any position are filled: it makes isolated parts determinate."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompletedShapes:
+    """Aligned shapes in which missing vertices are estimates.
+
+    Args:
+        shapes: (N, V, 3) mm; vertices that are not analysed have one position in all shapes.
+        sizes_mm: (N,) centroid sizes of the analysed vertices, before alignment.
+        observed: (N, V).
+        analysed: (V,) False for vertices that too few shapes observe.
+    """
+
+    shapes: FloatArray
+    sizes_mm: FloatArray
+    observed: BoolArray
+    analysed: BoolArray
+
+
+def completed_shapes(
+    shapes: FloatArray,
+    observed: BoolArray,
+    names: Sequence[str],
+    gauge: Gauge,
+    faces: IntArray | None,
+    *,
+    align: bool,
+) -> CompletedShapes:
+    """Align shapes by generalised Procrustes with missing vertices at their conditional means (see `complete`).
+
+    Vertices that fewer than `MIN_SEEN` of the shapes, or fewer than two, observe carry no variation.
+
+    Args:
+        shapes: (N, V, 3) mm; where not observed any value, NaN included.
+        observed: (N, V).
+        names: N.
+        gauge: as of `align_in_place`.
+        faces: (F, 3) triangles; None for points.
+        align: False takes the shapes as they stand.
+
+    Raises:
+        InputError: too little of a shape is observed to align it, or no vertex is observed often enough.
+    """
+    analysed = observed.sum(axis=0) >= max(MIN_SEEN * len(shapes) * (1 - 1e-12), _FEWEST_SHAPES)
+    known = observed & analysed
+    _refuse_unobserved(known, names)
+    masked = np.where(known[:, :, None], shapes, np.nan)[:, analysed]
+    found = complete(masked, names, gauge, align=align)
+    # Estimates do not take part in the poses of the originals, from which size and other vertices come.
+    poses = [
+        fit_similarity(own[there], aligned[there], with_scale=align and gauge == "shape") if align else None
+        for own, aligned, there in zip(masked, found.shapes, found.shown, strict=True)
+    ]
+    scales = np.array([1.0 if T is None else T.scale for T in poses])
+    sizes = np.array([centroid_size(shape) for shape in found.shapes]) / scales
+    out = np.empty_like(shapes)
+    out[:, analysed] = found.shapes
+    if not analysed.all():
+        moved = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, shapes, strict=True)])
+        out[:, ~analysed] = _one_position(moved, found.shapes.mean(axis=0), analysed, faces)
+    return CompletedShapes(out, sizes, known, analysed)
+
+
+def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
+    if not known.any():
+        raise InputError(
+            f"No vertex is observed by {100 * MIN_SEEN:g} % of the shapes and two of them, so nothing can be compared; "
+            "give shapes with fewer missing vertices."
+        )
+    few = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
+    if few:
+        raise InputError(f"{named(few)}: hardly a vertex is observed; leave it out.")
+
+
+def _one_position(moved: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
+    """Return one position (M, 3) for each vertex that is not analysed: the mean of those known, or a smooth filling.
+
+    Args:
+        moved: (N, V, 3) shapes as given, aligned.
+        mean: (A, 3) of the analysed vertices.
+        analysed: (V,).
+        faces: (F, 3).
+    """
+    there: BoolArray = np.logical_and.reduce(np.isfinite(moved), axis=2)
+    count = there.sum(axis=0)
+    position = np.where(there[:, :, None], moved, 0.0).sum(axis=0) / np.maximum(count, 1)[:, None]
+    position[analysed] = mean
+    empty = (count == 0) & ~analysed
+    if empty.any():
+        position[empty] = _harmonic(position, empty, faces, mean.mean(axis=0))
+    return position[~analysed]
+
+
+def _harmonic(position: FloatArray, empty: BoolArray, faces: IntArray | None, centre: FloatArray) -> FloatArray:
+    """Return the positions (E, 3) of `empty` vertices at the mean of their neighbours."""
+    n = len(position)
+    edges = np.zeros((0, 2), dtype=np.int32) if faces is None else np.vstack([faces[:, [0, 1]], faces[:, [1, 2]],
+                                                                            faces[:, [2, 0]]])  # fmt: skip
+    ends = np.vstack([edges, edges[:, ::-1]])
+    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
+    laplacian = (diags(np.asarray(links.sum(axis=1)).ravel() + _ANCHOR) - links).tocsr()
+    right = -(laplacian[empty][:, ~empty] @ position[~empty]) + _ANCHOR * centre
+    return np.asarray(spsolve(laplacian[empty][:, empty].tocsc(), right), dtype=np.float64).reshape(-1, 3)
+
+
+def completed_by(
+    population: FloatArray,
+    mean: FloatArray,
+    shapes: FloatArray,
+    observed: BoolArray,
+    names: Sequence[str],
+    gauge: Gauge,
+) -> FloatArray:
+    """Return shapes in their own poses with missing vertices at conditional means given a population.
+
+    Args:
+        population: (N, V, 3) complete aligned shapes, mm.
+        mean: (V, 3) of them.
+        shapes: (M, V, 3) in any poses.
+        observed: (M, V).
+        names: M.
+        gauge: `shape` aligns with scale.
+
+    Raises:
+        InputError: hardly a vertex of a shape is observed.
+    """
+    _refuse_unobserved(observed, names)
+    every = np.ones(population.shape[:2], dtype=np.bool_)
+    modes = max(1, min(round(_MODES_A_SHAPE * len(population)), _MOST_MODES, len(population) - 2))
+    found = ppca(population.copy(), every, modes)
+    out = shapes.copy()
+    for at, (shape, there) in enumerate(zip(shapes, observed, strict=True)):
+        if there.all():
+            continue
+        W = found.W[there][:, :, :modes].reshape(-1, modes)
+        precision = W.T @ W + found.noise * np.eye(modes)
+        T = fit_similarity(shape[there], mean[there], with_scale=gauge == "shape")
+        y = np.zeros(modes)
+        for _ in range(_POSES):
+            placed = T.apply(shape[there])
+            y = np.linalg.solve(precision, W.T @ (placed - found.W[there][:, :, modes]).reshape(-1))
+            whole = found.W @ np.append(y, 1.0)
+            whole[there] = placed
+            previous, T = T, _pose(whole, mean, gauge) @ T
+            if _moved(previous, T, shape[there]) <= _SETTLED * centroid_size(mean):
+                break
+        out[at, ~there] = T.inverse().apply(found.W[~there] @ np.append(y, 1.0))
+    return out
+
+
+def _pose(whole: FloatArray, mean: FloatArray, gauge: Gauge) -> Similarity:
+    return fit_similarity(whole, mean, with_scale=gauge == "shape")
+
+
+def _moved(one: Similarity, other: Similarity, points: FloatArray) -> float:
+    return float(np.abs(one.apply(points) - other.apply(points)).max())

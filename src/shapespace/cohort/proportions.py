@@ -1,0 +1,40 @@
+"""Intervals of shares near 0 and 1, where drawing subjects anew finds no spread.
+
+The bootstrap of a share without a single error is the interval [0, 0]. The exact interval of Clopper and Pearson
+("The use of confidence or fiducial limits", Biometrika 26, 1934) for 0 errors among n independent units ends at
+1 - (alpha / 2)^(1 / n); the rule of three, 3 / n, is its one-sided approximation. The units are subjects, since pairs
+and scans of one subject depend on each other. The share of errors is at most the share of subjects with whom errors
+happen, where each subject counts alike, so the bound is valid for it too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shapespace.types import FloatArray
+
+
+def zero_bound(subjects: int, level: float = 0.95) -> float:
+    """Return the upper end of the exact interval of a share, where none of `subjects` has an error.
+
+    Args:
+        subjects: number of independent units; with none of them nothing is known, and the bound is 1.
+        level: of the two-sided interval.
+    """
+    return 1.0 - float((0.5 * (1.0 - level)) ** (1.0 / subjects)) if subjects > 0 else 1.0
+
+
+def widen_share(
+    low: FloatArray | float, high: FloatArray | float, subjects: int, level: float = 0.95
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of intervals of shares, at least as far from 0 and 1 as the exact ones without an error.
+
+    Some errors are no better known than none: the upper end is at least `zero_bound`, the lower at most 1 less that.
+
+    Args:
+        low, high: any shape, ends by drawing subjects anew; NaN stays.
+        subjects: number of independent units.
+        level: of the intervals.
+    """
+    bound = zero_bound(subjects, level)
+    return np.asarray(np.minimum(low, 1.0 - bound)), np.asarray(np.maximum(high, bound))
