@@ -107,13 +107,13 @@ _EXPLORATORY = "exploratory, since its term is not significant: "
 def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
     """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
     level = comparison.options.level
-    held = f"family-wise error {100 * level:g} % within this map"
-    found = shown.shown.p_family <= level
-    if not found.any():
-        return f"{effect.label}: no vertex differs ({held})."
+    scope = f"family-wise error {100 * level:g} % within this map"
+    significant = shown.shown.p_family <= level
+    if not significant.any():
+        return f"{effect.label}: no vertex differs ({scope})."
     return (
-        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * found.mean():.1f} % of the vertices "
-        f"differ ({held}), the clearest by {_clearest(comparison, shown)}."
+        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
+        f"differ ({scope}), the clearest by {_clearest(comparison, shown)}."
     )
 
 
@@ -130,12 +130,12 @@ def _clearest(comparison: Comparison, shown: EffectMap) -> str:
 
 def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: FloatArray) -> str:
     level, at = comparison.options.level, int(bump.f.argmax())
-    held = f"family-wise error {100 * level:g} % within this map"
+    scope = f"family-wise error {100 * level:g} % within this map"
     if bump.p_family[at] > level:
-        return f"{effect.label}: no bump is found beyond the variation between shapes ({held})."
+        return f"{effect.label}: no bump is found beyond the variation between shapes ({scope})."
     return (
         f"{effect.label}: a bump of {_lengths(comparison).text(bump_mm[at], '+')} or more is found"
-        f"{_near(comparison.cohort, at)} ({held})."
+        f"{_near(comparison.cohort, at)} ({scope})."
     )
 
 

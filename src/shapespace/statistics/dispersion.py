@@ -349,7 +349,7 @@ def welch_flips(
         yield from (scale * rng.choice((-1.0, 1.0), n) for _ in range(permutations - 1))
 
     observed = np.zeros(maps.shape[1])
-    found: list[tuple[float, float]] = []
+    arrangements: list[tuple[float, float]] = []
     drawn = draws()
     while block := list(itertools.islice(drawn, _BATCH)):
         factors = np.stack(block)
@@ -357,14 +357,14 @@ def welch_flips(
         variance = np.zeros_like(means[0])
         for k, (mean_k, count) in enumerate(zip(means, counts, strict=True)):
             own_squares = np.repeat(scaled[k][None], len(block), axis=0)
-            if not found:
+            if not arrangements:
                 own_squares[0] = squares[k]
             within = np.maximum(own_squares - count * mean_k**2, _FLOOR * own_squares)
             variance += within / (count - 1.0) / count
         difference = means[1] - means[0]
         t = np.divide(difference, np.sqrt(variance), out=np.zeros_like(difference), where=variance > 0)
         whole = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
-        if not found:
+        if not arrangements:
             observed = t[0]
-        found += zip(np.abs(t).max(axis=1).tolist(), whole.tolist(), strict=True)
-    return observed, np.array(found).T, every
+        arrangements += zip(np.abs(t).max(axis=1).tolist(), whole.tolist(), strict=True)
+    return observed, np.array(arrangements).T, every

@@ -65,8 +65,8 @@ def box_cox_exponent(values: FloatArray) -> float:
         return float(np.log(powers.var()))
 
     with np.errstate(over="ignore"):
-        found = minimize_scalar(
+        optimum = minimize_scalar(
             log_variance, bounds=_LAMBDA_BOUNDS, method="bounded", options={"xatol": _LAMBDA_TOLERANCE}
         )
-    exponent = float(found.x)
+    exponent = float(optimum.x)
     return 0.0 if abs(exponent) < _LAMBDA_ZERO else exponent

@@ -20,7 +20,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         subjects: number of subjects.
         **known: further fields of `Methods`, or others than those of the cohort.
     """
-    own: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "shapes": len(cohort),
         "vertices": cohort.n_vertices,
         "gauge": cohort.gauge,
@@ -30,7 +30,7 @@ def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
         "dimensions": int(np.linalg.matrix_rank(cohort.coefficients - cohort.coefficients.mean(axis=0))),
         "unit": cohort.unit,
     }
-    return Methods(subjects=subjects, **{**own, **known})
+    return Methods(subjects=subjects, **{**facts, **known})
 
 
 def sample_sizes(
@@ -43,7 +43,7 @@ def sample_sizes(
         variables: name and the class of each shape.
         cells: whether to count combinations of two variables or more.
     """
-    found: list[SampleSize] = []
+    sizes: list[SampleSize] = []
     sets: list[tuple[tuple[str, Sequence[str]], ...]] = [(one,) for one in variables]
     if cells and len(variables) > 1:
         sets.append(tuple(variables))
@@ -52,11 +52,11 @@ def sample_sizes(
         for subject, *classes in zip(subjects, *(values for _, values in chosen), strict=True):
             members.setdefault(tuple(classes), []).append(subject)
         names = tuple(name for name, _ in chosen)
-        found += [
+        sizes += [
             SampleSize(variables=names, classes=classes, subjects=len(set(own)), shapes=len(own))
             for classes, own in sorted(members.items())
         ]
-    return tuple(found)
+    return tuple(sizes)
 
 
 def dispersion_record(test: DispersionTest, level: float) -> Dispersion:

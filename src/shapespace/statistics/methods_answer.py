@@ -154,18 +154,18 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
         for group, count, stddev in zip(one.groups, one.counts, one.stddev, strict=True)
     )
     where = f" {one.stratum}" if one.stratum else ""
-    told = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
+    details = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
     if one.equal:
-        return f"Dispersion: unequal dispersion is not shown ({told})."
+        return f"Dispersion: unequal dispersion is not shown ({details})."
     if unequal_variances:
-        return f"Dispersion is unequal ({told}); the tests of means allow for it."
+        return f"Dispersion is unequal ({details}); the tests of means allow for it."
     effect = {
         True: "smaller classes are more variable, so p values of means are too small and differences are found that do "
         "not exist",
         False: "smaller classes are less variable, so p values of means are too large and differences are missed",
         None: "p values of means also respond to differences of dispersion",
     }[one.smaller_is_more_variable]
-    return f"Warning: dispersion is unequal ({told}): {effect}. Use --unequal-variances (unequal_variances=True)."
+    return f"Warning: dispersion is unequal ({details}): {effect}. Use --unequal-variances (unequal_variances=True)."
 
 
 def effect_size_sentence(kind: str) -> str:
