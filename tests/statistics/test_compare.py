@@ -648,6 +648,12 @@ def test_unequal_dispersion_warns_unless_the_test_allows_it_and_stands_in_the_an
     assert equal.methods.dispersions[0].equal and not [one for one in equal.warnings if "ispersion" in one]
 
 
+def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:
+    shapes = unequal_groups().take(range(2, 24))
+    found = compare(shapes, "~ sex", CompareOptions(permutations=40, maps=False, unequal_variances=True))
+    assert found.warnings[0].startswith("Warning: sex has a class of 4 subjects")
+
+
 def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_variances() -> None:
     rng = np.random.default_rng(0)
     subjects = [f"s{k}" for k in range(14) for _ in range(4)]

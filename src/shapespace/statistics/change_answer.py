@@ -22,7 +22,12 @@ from shapespace.schemas import (
 from shapespace.statistics.answer import Answer, Rows
 from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
 from shapespace.statistics.change_group import LEVEL, MapTest
-from shapespace.statistics.methods_answer import dispersion_sentence, methods_parts, multiplicity_sentence
+from shapespace.statistics.methods_answer import (
+    dispersion_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import Mesh
 
@@ -124,7 +129,11 @@ def _summary(change: Found) -> list[str]:
             f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
         )
         unequal = change.settings.unequal_variances
-        told += [dispersion_sentence(one, unequal, "mm") for one in change.methods.dispersions if not one.equal]
+        told += [
+            dispersion_sentence(one, unequal, "mm")
+            for one in change.methods.dispersions
+            if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
+        ]
     if change.repeatability is None:
         told.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:

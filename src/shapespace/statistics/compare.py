@@ -36,7 +36,7 @@ from shapespace.statistics.compare_within import Strata, Within, strata_of
 from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
-from shapespace.statistics.methods_answer import dispersion_sentence
+from shapespace.statistics.methods_answer import dispersion_sentence, is_dispersion_warning
 from shapespace.statistics.observed import information, weights_of
 from shapespace.types import FloatArray, read_only
 
@@ -312,7 +312,7 @@ def compare(
         *(
             dispersion_sentence(one, options.unequal_variances, cohort.unit)
             for one in methods.dispersions
-            if not one.equal and not options.unequal_variances
+            if is_dispersion_warning(one, unequal_variances=options.unequal_variances)
         ),
         *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design),
     )  # fmt: skip

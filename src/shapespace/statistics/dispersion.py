@@ -30,7 +30,7 @@ from shapespace.types import FloatArray
 Codes: TypeAlias = npt.NDArray[np.intp]
 
 FEWEST_OF_GROUP = 5
-"""Subjects of a class below which the level of the test with unequal variances was not measured (docs/compare.md)."""
+"""Subjects of a class below which the test with unequal variances exceeds 7 % false positives (docs/compare.md)."""
 _TIE = 1e-9
 _FULL_LEVERAGE = 1e-8
 """Rows with 1 - leverage below this are fitted exactly, and have no residual."""
