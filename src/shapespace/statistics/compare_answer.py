@@ -83,7 +83,7 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.options.effect_size]
     for test in comparison.tests:
         told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
-        where = f" {test.stratum}" if test.stratum else ""
+        where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
         else:

@@ -30,6 +30,8 @@ from shapespace.types import FloatArray
 
 _ESTIMABLE = 1e-6
 """Share of a column's standard deviation below which a subject's own variation of it is rounding."""
+_SHARES = np.append(np.linspace(0.0, 0.95, 20), 0.99)
+"""Of the variance of a typical subject's response, that of its estimate; 1 would trust one subject without limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +41,12 @@ class Responses:
     Args:
         subjects: (s,) which subjects these are.
         values: (s, d, K) mm; d orthonormal contrasts.
-        weights: (s,) roots of the weights of subjects, 1 for all where they have the same conditions.
+        variances: (s,) of the estimates by unit variance of the cells, mean of the contrasts; by the median of all.
     """
 
     subjects: Rows
     values: FloatArray
-    weights: FloatArray
+    variances: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,12 +206,13 @@ class Within:
             )
         columns = np.arange(matrix.shape[1], dtype=np.intp)
         refuse_aliased(matrix, columns, terms, self.design, where)
-        weighted = responses.weights[:, None] * matrix
+        roots = np.sqrt(_weights(responses, matrix))
+        weighted = roots[:, None] * matrix
         whole: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
         constant = np.zeros((s, d))
-        constant[:, 0] = responses.weights
+        constant[:, 0] = roots
         stratum = Stratum(
-            where, (responses.weights[:, None, None] * responses.values).reshape(s * d, -1), whole,
+            where, (roots[:, None, None] * responses.values).reshape(s * d, -1), whole,
             np.repeat(columns, d), terms, np.zeros(s, dtype=np.intp), 0, 2, scheme="subjects", width=d,
             units=responses.subjects, n_units=self.count, constant=constant.ravel(),
         )  # fmt: skip
@@ -249,9 +252,35 @@ class Within:
         information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
         metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
         own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
-        weight = 2.0 / (1.0 + own / np.median(own))
         shown = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
-        return Responses(np.array(chosen, dtype=np.intp), shown, np.sqrt(weight))
+        return Responses(np.array(chosen, dtype=np.intp), shown, own / np.median(own))
+
+
+def _weights(responses: Responses, matrix: FloatArray) -> FloatArray:
+    """Return the (s,) weights of subjects in a model (s, q) of their responses, 1 for all where they are as precise.
+
+    The variance of a response is that between subjects plus that of its estimate. The share of the latter is the one of
+    `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), the same for all
+    coordinates.
+    """
+    v = responses.variances
+    if np.ptp(v) <= _ESTIMABLE:
+        return np.ones(len(v))
+    y = responses.values.reshape(len(v), -1)
+    gram = y @ y.T
+    free = len(v) - matrix.shape[1]
+    best, chosen = np.inf, v
+    for share in _SHARES:
+        variance = 1.0 - share + share * v
+        roots = 1.0 / np.sqrt(variance)
+        q, r = np.linalg.qr(roots[:, None] * matrix)
+        white = roots[:, None] * gram * roots
+        left = float(np.trace(white) - np.trace(q.T @ white @ q))
+        cost = np.log(variance).sum() + 2.0 * np.log(np.abs(np.diag(r))).sum() + free * np.log(max(left, 1e-300))
+        if cost < best:
+            best, chosen = float(cost), variance
+    weights = 1.0 / chosen
+    return weights / weights.mean()
 
 
 def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:

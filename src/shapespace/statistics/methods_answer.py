@@ -156,8 +156,8 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
     details = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
     if unequal_variances and min(one.counts) < FEWEST_OF_GROUP:
         return (
-            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; with fewer than "
-            f"{FEWEST_OF_GROUP} the test with unequal variances has too many false positives, 8 % instead of 5 % with 4 "
+            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; below "
+            f"{FEWEST_OF_GROUP} the test with unequal variances has too many false positives, 8 % instead of 5 % for 4 "
             f"({details})."
         )
     if one.equal:
