@@ -193,6 +193,6 @@ def multiplicity_sentence(methods: Methods) -> str:
     if not methods.corrected_over:
         return "Multiple testing: no p value is corrected for the number of tests, maps or analyses."
     return (
-        f"Multiple testing: p values are corrected only over {', and over '.join(methods.corrected_over)}. Nothing is "
+        f"Multiple testing: p values are corrected only over {'; over '.join(methods.corrected_over)}. Nothing is "
         "corrected over the number of terms, maps or analyses."
     )
