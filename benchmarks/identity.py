@@ -24,6 +24,7 @@ import numpy as np
 from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, study_config
 
 from shapespace.model.additive import AdditiveModel
+from shapespace.statistics.identity.calibration import cllr
 from shapespace.statistics.identity.identify import Searches, identified, joined, search
 from shapespace.statistics.identity.rates import Figure, Pairs, Sweep, people_drawn
 from shapespace.statistics.identity.samples import Samples
@@ -142,6 +143,9 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
             told.score[~pairs.same].std()
         )
         out[name]["margin"] = least
+        if name.startswith("plda"):
+            # The score is a difference of log likelihoods, so its cost as it stands can be compared.
+            out[name]["cllr_of_the_score"] = cllr(told.score, pairs.same)
     out["pairs"] = {"people": len(people), "genuine": int(pairs.same.sum()), "impostor": int((~pairs.same).sum())}
     return out
 

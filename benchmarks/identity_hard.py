@@ -183,7 +183,10 @@ def main() -> int:
         found[case.name] = {"fits": counts, "scores": scores}
     print(table(found))
     for name, one in found.items():
-        print(f"{name}: fits {one['fits']}, pairs {one['scores']['pairs']}", file=sys.stderr)
+        scores = one["scores"]
+        calibrated, score = scores["plda"]["cllr"][0], scores["plda"]["cllr_of_the_score"]
+        print(f"{name}: fits {one['fits']}, pairs {scores['pairs']}")
+        print(f"{name}: Cllr of PLDA scores as they stand {score:.2f}, calibrated {calibrated:.2f} bits")
     if chosen.json:
         chosen.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0

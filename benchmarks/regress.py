@@ -123,6 +123,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=1000, help="for each row without a relation, four times as many "
                         "as with one (default 1000)")  # fmt: skip
+    parser.add_argument("--designs", type=int, nargs="*", default=list(range(len(DESIGNS))), help="rows, from 0")
     parser.add_argument("--jobs", type=int, default=1)
     chosen = parser.parse_args()
     null = [
@@ -134,7 +135,7 @@ def main() -> int:
         "|---|---|---|---|---|---|---|---|",
     ]
     with ProcessPoolExecutor(chosen.jobs) as pool:
-        for design in DESIGNS:
+        for design in (list(DESIGNS)[k] for k in chosen.designs):
             for varies in (False, True):
                 target = "varies within subjects" if varies else "one per subject"
                 for is_signal in (False, True):

@@ -25,6 +25,7 @@ NAVIGATION = {
         "docs/tutorial-faces",
         "docs/tutorial-spleens",
         "docs/tutorial-volumes",
+        "docs/tutorial-bones",
         "docs/correspondence",
         "docs/tutorial-recognition",
         "docs/tutorial-groups",

@@ -223,6 +223,10 @@ class Similarity:
         return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
 
 
+MAX_MEMORY_BYTES = 2**32
+"""Memory that a label volume and its surface may take by default (4 GiB): a CT of the trunk with one organ takes 2."""
+
+
 @dataclass(frozen=True, eq=False)
 class LabelVolume:
     """Labels in voxels, and where these lie in the patient.

@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 
 from conftest import Outcome, Run, World, leftovers
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.batch import fit_work
+from shapespace.batch.fit_work import Job, fit_file
+from shapespace.commands import fit
+from shapespace.errors import FileError, FileFormatError
+from shapespace.io.meshes import probe_mesh, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 
@@ -123,13 +127,18 @@ def test_check_says_what_is_wrong_without_failing_itself(kind: str, run: Run, sc
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("ending", [".ply", ".obj"])
-def test_vertices_that_are_not_finite_never_reach_a_result(
+def test_vertices_that_are_not_finite_are_removed_and_named_or_refused(
     value: float, ending: str, run: Run, world: World, scan_mesh: Mesh, tmp_path: Path
 ) -> None:
     bad = tmp_path / f"bad{ending}"
     write_mesh(bad, _with_bad_vertex(scan_mesh, value))
-    refused(run("fit", world.model, bad, "-o", tmp_path / "out"), bad)
-    assert run("check", bad, "--json").facts[0]["non_finite_vertices"] == 1
+    refused(run("fit", world.model, bad, "-o", tmp_path / "strict", "--strict"), bad)
+    outcome = run("fit", world.model, bad, "-o", tmp_path / "out", "--max-iterations", "3")
+    assert outcome.code == 0 and "1 vertex with coordinates that are NaN or infinite, used by" in outcome.out
+    assert np.isfinite(read_mesh(tmp_path / "out" / "bad.fitted.ply").vertices).all()
+    (facts,) = run("check", bad, "--json").facts
+    assert facts["non_finite_vertices"] == 1 and facts["usable"]
+    assert not run("check", bad, "--json", "--strict").facts[0]["usable"]
 
 
 def test_all_bad_scans_in_one_batch_are_rows_and_the_good_ones_go_on(
@@ -150,6 +159,64 @@ def test_all_bad_scans_in_one_batch_are_rows_and_the_good_ones_go_on(
     assert all((row["b1"] == "") == (row["status"] == "failed") for row in rows)
     assert [p.name for p in (tmp_path / "out").glob("*.ply")] == ["scan_0.fitted.ply"]
     assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["read whole", "by head and size"])
+def test_scans_that_cannot_be_read_are_reported_before_the_first_fit(
+    whole: bool, run: Run, world: World, scan_mesh: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not whole:
+        monkeypatch.setattr(fit, "FULL_CHECK_BYTES", 0)
+    cut = tmp_path / "z_cut.ply"
+    cut.write_bytes(world.scan.read_bytes()[:-500])
+    empty = tmp_path / "y_empty.obj"
+    empty.write_bytes(b"")
+    order: list[str] = []
+
+    def noted(job: Job, *rest: Any, **options: Any) -> Any:
+        order.append(job.name)
+        return fit_file(job, *rest, **options)
+
+    monkeypatch.setattr(fit_work, "fit_file", noted)
+    outcome = run(
+        "fit", world.model, *world.scans[:2], empty, cut, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1
+    )
+    assert outcome.code == 1
+    assert order == ["y_empty", "z_cut", "scan_0", "scan_1"]
+    assert [str(path) in line for path, line in zip((empty, cut), outcome.err.splitlines(), strict=False)] == [True] * 2
+    with (tmp_path / "out" / "coefficients.csv").open(newline="") as stream:
+        rows = {row["scan"]: row["status"] for row in csv.DictReader(stream)}
+    assert list(rows) == ["scan_0", "scan_1", "y_empty", "z_cut"]
+    assert [rows[name] for name in ("y_empty", "z_cut")] == ["failed", "failed"]
+
+
+def test_several_scans_with_vertices_that_are_not_finite_are_named_at_the_end(
+    run: Run, world: World, scan_mesh: Mesh, tmp_path: Path
+) -> None:
+    bad = tmp_path / "bad.ply"
+    write_mesh(bad, _with_bad_vertex(scan_mesh, np.nan))
+    outcome = run("fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1)
+    assert "1 scan has vertices with coordinates that are NaN or infinite" in outcome.err.splitlines()[-1]
+    assert "(bad)" in outcome.err and outcome.code == 0
+    outcome = run(
+        "fit", world.model, world.scan, bad, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1, "--strict"
+    )
+    assert outcome.code == 1 and "--strict" in outcome.err and str(bad) in outcome.err
+
+
+@pytest.mark.parametrize("ending", [".ply", ".stl", ".obj"])
+def test_a_probe_passes_whole_files_and_refuses_cut_ones(ending: str, scan_mesh: Mesh, tmp_path: Path) -> None:
+    path = tmp_path / f"a{ending}"
+    write_mesh(path, scan_mesh)
+    content = path.read_bytes()
+    probe_mesh(path)
+    path.write_bytes(content[: len(content) // 2] if ending != ".obj" else b" \n")
+    with pytest.raises(FileFormatError, match=r"cut short|it is empty"):
+        probe_mesh(path)
+    with pytest.raises(FileFormatError, match="not a mesh format"):
+        probe_mesh(tmp_path / "a.xcf")
+    with pytest.raises(FileError, match="no such file"):
+        probe_mesh(tmp_path / f"none{ending}")
 
 
 def test_the_surface_search_refuses_a_point_cloud(run: Run, world: World, scan_mesh: Mesh, tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def test_a_bad_volume_among_others_is_set_aside_by_name(run: Run, tmp_path: Path
     assert not leftovers(tmp_path)
 
 
+def test_memory_is_limited_as_asked(run: Run, tmp_path: Path) -> None:
+    path = nifti(tmp_path / "a.nii.gz")
+    outcome = run("surface", path, "-o", tmp_path / "out", "--max-memory", "100M")
+    assert outcome.code == 2 and "over the limit of 0.098 GiB" in outcome.sentence()
+    assert run("surface", path, "-o", tmp_path / "out", "--max-memory", "0.3GiB").code == 0
+    for wrong in ("4", "G", "-1G", "0G", "1e9G", "4 gigabytes"):
+        outcome = run("surface", path, "-o", tmp_path / "out", f"--max-memory={wrong}")
+        assert outcome.code == 2 and "must be a size such as 8G or 500M" in outcome.err
+
+
 @pytest.mark.parametrize(
     ("voxels", "said"),
     [

@@ -15,7 +15,7 @@ from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size
 from shapespace.io.files import write_text
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
@@ -249,6 +249,22 @@ def test_surfaces_of_fits_are_the_same_shapes_in_another_frame(fits: Path) -> No
     assert steps[-1] == (7, 7) and fitted.fitted is not None and fitted.landmarks == dict(model().landmarks)
     with pytest.raises(InputError, match=r"holds no dense surface of scan0.*with --dense"):
         read_cohort(fits, CohortOptions(surfaces="dense"))
+
+
+def test_dense_surfaces_are_the_default_where_all_fits_have_one(fits: Path) -> None:
+    share = read_cohort(fits).source.explained_variance_ratio
+    assert read_cohort(fits).source == ShapeSource("coefficients", MODES, share)
+    assert read_cohort(fits, CohortOptions(surfaces="fitted")).source == ShapeSource("fitted", MODES, share)
+    rng = np.random.default_rng(0)
+    for k in (0, 1, 2, 3, 4, 5, 6, 8):  # the fit of scan7 failed
+        mesh = read_mesh(fits / f"scan{k}.fitted.ply")
+        detailed = mesh.with_vertices(mesh.vertices + 0.5 * rng.standard_normal(mesh.vertices.shape))
+        write_mesh(fits / f"scan{k}.dense.ply", detailed)
+    assert read_cohort(fits).source.kind == "coefficients"  # scan9 has none
+    write_mesh(fits / "scan9.dense.ply", read_mesh(fits / "scan9.fitted.ply"))
+    dense = read_cohort(fits)
+    assert dense.source == ShapeSource("dense") and dense.fitted is not None
+    assert read_cohort(fits, CohortOptions(surfaces="coefficients")).source.kind == "coefficients"
 
 
 def test_surfaces_of_an_unknown_unit_have_no_size_to_compare(fits: Path) -> None:

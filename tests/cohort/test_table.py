@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapespace.cohort.classes import notes_on_classes
 from shapespace.cohort.table import Table, named, numbers_as_text, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import write_text
@@ -153,3 +154,34 @@ def test_what_a_spreadsheet_would_run_loses_its_apostrophe_and_columns_of_lists_
 
 def test_names_are_told_until_they_are_many() -> None:
     assert named(["a", "b", "c"]) == "a, b, c" and named(["a", "b", "c", "d"]) == "a, b, c and 1 more"
+
+
+def test_the_shapes_in_each_class_are_counted_and_likely_misspellings_named() -> None:
+    cells = ("Wild",) * 9 + ("Lab",) * 8 + ("wild", "Wil d", "Labx")
+    notes = notes_on_classes("origin", cells)
+    assert notes[0] == "Shapes in each class of origin: Wild 9, Lab 8, wild 1, Wil d 1, Labx 1."
+    assert notes[1].startswith("origin has 3 classes with one shape ('wild', 'Wil d', 'Labx')")
+    assert [note for note in notes if "case or white space" in note] == [
+        f"origin has the classes 'Wild' (9) and {other} (1), which differ only in case or white space; correct the "
+        "table if they are the same."
+        for other in ("'wild'", "'Wil d'")
+    ]
+    assert len(notes) == 4, "short words that differ in a letter are other words"
+
+
+@pytest.mark.parametrize("other", ["femal", "femalee", "femole", "fmeale", "Females"])
+def test_long_words_that_differ_in_one_letter_are_named(other: str) -> None:
+    notes = notes_on_classes("sex", ("female",) * 5 + (other,) * 5)
+    assert f"'female' (5) and {other!r} (5), which differ only in one letter" in notes[-1] and len(notes) == 2
+
+
+@pytest.mark.parametrize(
+    "cells", [("1", "2") * 5, ("male", "female") * 5, ("upper1", "upper2") * 5, ("anna", "hanna", "")]
+)
+def test_numbers_other_words_numbered_words_and_names_are_no_misspellings(cells: tuple[str, ...]) -> None:
+    assert all(note.startswith("Shapes in each class") for note in notes_on_classes("x", cells))
+
+
+def test_names_that_differ_in_case_are_named_and_not_counted() -> None:
+    (note,) = notes_on_classes("subject", ("anna", "Anna", "bert", "carl"))
+    assert "'anna' (1) and 'Anna' (1), which differ only in case" in note

@@ -185,6 +185,7 @@ def has_examples(document: Path, *, needing_data: bool) -> bool:
 
 
 LONG = (
+    "tutorial-bones.md",
     "tutorial-faces.md",
     "tutorial-identity.md",
     "tutorial-recognition.md",

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import time
 import zipfile
 from pathlib import Path
@@ -257,6 +258,19 @@ def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the
     rows = [{"world_particles_1": "big.particles"}] * 4_000
     with pytest.raises(ShapespaceError, match="unfold to more than"):
         ShapeWorks().read(swproj(tmp_path, rows))
+
+
+def test_a_shared_string_of_five_thousand_digits_is_a_damaged_workbook(tmp_path: Path) -> None:
+    path = xlsx(tmp_path, project(tmp_path, meshes=False))
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    sheet = max((name for name in parts if "worksheets/" in name), key=lambda name: len(parts[name]))
+    parts[sheet] = re.sub(rb"<v>[0-9]+</v>", b"<v>" + b"9" * 5000 + b"</v>", parts[sheet])
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    with pytest.raises(ModelFileError, match=r"there is no shared string '9+'.*no project of ShapeWorks"):
+        ShapeWorks().read(path)
 
 
 def test_a_workbook_without_data_is_no_project(tmp_path: Path) -> None:

@@ -137,14 +137,33 @@ def test_missing_points_of_a_depth_camera_are_dropped():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_surface_with_points_that_are_not_finite_is_refused(value: float):
-    vertices = sphere().vertices.copy()
-    vertices[7, 1] = value
-    mesh = Mesh(vertices, sphere().faces, name="ball.ply")
-    assert "refused" in levels(mesh)
-    assert not examine(mesh).usable
-    with pytest.raises(MeshError, match=r"ball\.ply.*NaN or infinite.*\.$"):
-        repair(mesh)
+def test_vertices_that_are_not_finite_go_with_their_triangles_or_are_refused(value: float):
+    ball = sphere()
+    vertices = ball.vertices.copy()
+    vertices[[7, 9], 1] = value
+    used = np.isin(ball.faces, (7, 9)).any(axis=1)
+    number = np.arange(len(vertices)).astype(np.uint8)
+    mesh = Mesh(vertices, ball.faces, {"tip": vertices[0]}, "ball.ply", np.tile(number[:, None], 3))
+    repaired, findings = repair(mesh)
+    (said,) = [finding for finding in findings if finding.level == "fixed"]
+    assert f"2 vertices with coordinates that are NaN or infinite, used by {used.sum()} triangles" in said.what
+    assert np.array_equal(repaired.vertices, np.delete(ball.vertices, [7, 9], axis=0))
+    assert np.array_equal(repaired.vertices[repaired.faces], ball.vertices[ball.faces[~used]])
+    assert np.array_equal(repaired.colours[:, 0], np.delete(number, [7, 9]))
+    assert repaired.landmarks.keys() == {"tip"}
+    report = examine(mesh)
+    assert report.usable and report.non_finite_vertices == 2 and report.boundary_edges > 0
+    assert not examine(mesh, strict=True).usable
+    with pytest.raises(MeshError, match=r"ball\.ply.*NaN or infinite.*--strict.*\.$"):
+        repair(mesh, strict=True)
+
+
+def test_a_surface_of_which_nothing_finite_is_left_is_refused():
+    ball = sphere()
+    for finite in (0, 3):
+        vertices = np.where(np.arange(len(ball.vertices))[:, None] < finite, ball.vertices, np.nan)
+        with pytest.raises(MeshError, match=r"ball\.ply: (there are no points|it has only 3|it has no triangle)"):
+            repair(Mesh(vertices, ball.faces, name="ball.ply"))
 
 
 def test_a_closed_surface_that_is_inside_out_is_turned():

@@ -1,5 +1,6 @@
 """The surface of labels lies where the object is, is a closed sheet, and says what was left out."""
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -234,3 +235,40 @@ def test_labels_are_found_whatever_their_range(kind: Any) -> None:
     for at, label in enumerate(wanted):
         labels[at, 0, 0] = label
     assert labels_in(labels) == wanted
+
+
+def _sheets(side: int) -> LabelVolume:
+    """Thin sheets one above the other, joined in the middle: much surface for their voxels."""
+    labels = np.zeros((side, side, side), dtype=np.uint8, order="F")
+    for begin in (4, 5):
+        labels[4:-4, 4:-4, begin:-4:4] = 1
+    labels[side // 2 : side // 2 + 3, side // 2 : side // 2 + 3, 4:-4] = 1
+    return LabelVolume(labels, np.eye(4), "sheets.nrrd")
+
+
+def test_memory_is_estimated_from_the_box_and_the_border_and_refused_before_it_is_taken() -> None:
+    ball = LabelVolume(np.asfortranarray(np.ones((120, 120, 120), dtype=np.uint8)), np.eye(4), "ball.nrrd")
+    # A box of 130 voxels a side takes 70 MB and 134 MB besides, and its border of 86,000 vertices 35 MB.
+    assert surface_of_volume(_sheets(40), smooth=0, max_memory_bytes=200_000_000).voxels
+    for volume, limit, most in ((ball, 190_000_000, 10_000_000), (_sheets(100), 250_000_000, 120_000_000)):
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError, match=r"takes about 0\.\d+ GiB of memory, over the limit .*--max-memory"):
+                surface_of_volume(volume, max_memory_bytes=limit)
+            assert tracemalloc.get_traced_memory()[1] < most
+        finally:
+            tracemalloc.stop()
+
+
+def test_shapes_of_volumes_that_are_long_in_one_direction_are_looked_at_in_parts() -> None:
+    for shape in ((2_000_003, 1, 1), (1, 1, 2_000_003), (3, 700_001, 1)):
+        labels = np.zeros(shape, dtype=np.int64)
+        labels[-1, -1, -1], labels[0, 0, 0] = -7, 2**62
+        tracemalloc.start()
+        try:
+            assert labels_in(labels) == (-7, 2**62)
+            assert tracemalloc.get_traced_memory()[1] < 40_000_000
+        finally:
+            tracemalloc.stop()
+    with pytest.raises(InputError, match="as pictures have"):
+        labels_in(np.arange(200_000).reshape(200, 1000, 1) * 70_000)

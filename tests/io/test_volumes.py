@@ -189,6 +189,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "huge offset": (lambda d: patched(write_nifti(d / "a.nii"), 108, struct.pack("<f", 1e18)), "can hold"),
     "offset in the header": (lambda d: patched(write_nifti(d / "a.nii"), 108, struct.pack("<f", 8)), "within the"),
     "huge nrrd": (lambda d: _put(d / "a.nrrd", _nrrd_text(99999, b"gzip")), "over the bound"),
+    "bzip2 bomb": (lambda d: _put(d / "a.nrrd", _nrrd_text(1280, b"bzip2") + bz2.compress(bytes(100_000))), "can hold"),
     "nrrd of no size": (lambda d: _put(d / "a.nrrd", _nrrd_text(0, b"raw")), "there are none"),
     "nrrd of a size beyond all": (lambda d: _put(d / "a.nrrd", _nrrd_text(10**30, b"raw")), "cannot"),
 }  # fmt: skip
@@ -245,6 +246,47 @@ def test_what_grows_beyond_its_header_takes_no_more_memory_than_declared(pack: A
         assert tracemalloc.get_traced_memory()[1] < 5_000_000
     finally:
         tracemalloc.stop()
+
+
+def _refused(read: Callable[[], object], most_bytes: int) -> str:
+    """Return the sentence with which `read` refuses, in as little memory as that."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            read()
+        assert tracemalloc.get_traced_memory()[1] < most_bytes
+    finally:
+        tracemalloc.stop()
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.nrrd"])
+@pytest.mark.parametrize("kind", [np.uint8, np.float64])
+def test_a_volume_over_the_limit_of_memory_is_refused_before_it_is_taken(name: str, kind: Any, tmp_path: Path) -> None:
+    labels = np.zeros((300, 300, 200))
+    labels[2:9, 2:9, 2:9] = 1
+    path = tmp_path / name
+    if name.endswith(".nrrd"):
+        write_nrrd(path, labels, encoding="bzip2")
+    else:
+        write_nifti(path, labels, kind=kind)
+    sentence = _refused(lambda: read_volume(path, max_memory_bytes=50_000_000), 4_000_000)
+    assert str(path) in sentence and "300 x 300 x 200 voxels" in sentence and "--max-memory" in sentence
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.float64])
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+def test_reading_takes_the_memory_of_the_labels_alone(name: str, kind: Any, tmp_path: Path) -> None:
+    labels = np.zeros((100, 100, 200), dtype=np.int16)
+    labels[2:90, 2:90, 2:90] = 300 if kind != np.uint8 else 3
+    path = write_nifti(tmp_path / name, labels, kind=kind)
+    tracemalloc.start()
+    try:
+        read = read_volume(path)
+        assert tracemalloc.get_traced_memory()[1] < read.labels.nbytes + 12_000_000
+    finally:
+        tracemalloc.stop()
+    assert (read.labels == labels).all()
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

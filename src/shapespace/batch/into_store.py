@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -56,6 +56,7 @@ def fit_into_store(
     executor: Executor | None = None,
     again: bool = False,
     stages: bool = False,
+    first: Collection[str] = (),
     on_plan: Callable[[Plan], None] | None = None,
     on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
 ) -> Counter[str]:
@@ -72,6 +73,7 @@ def fit_into_store(
         executor: see `batch.executors`; None fits one after the other here.
         again: fit also scans whose results still hold.
         stages: also keep the surfaces at each stage.
+        first: names of jobs that are done before the others.
         on_plan: called once with what is to be done.
         on_done: called with each job and its record; of one that was kept only its status and reason.
 
@@ -98,6 +100,7 @@ def fit_into_store(
             before += there is not None and there.status != "failed"
             tasks.append(FitTask(job, config, stages, resume=not again))
         del stored
+        tasks.sort(key=lambda task: task.job.name not in first)
         if on_plan is not None:
             on_plan(Plan(counts.total(), before, len(tasks) - before))
         work = FitWork.of(model, model_file, folder)

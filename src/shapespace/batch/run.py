@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +73,7 @@ def fit_files(
     executor: Executor | None = None,
     resume: bool = False,
     stages: bool = False,
+    first: Collection[str] = (),
     on_plan: Callable[[Plan], None] | None = None,
     on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
     on_state: Callable[[IcpState], None] | None = None,
@@ -92,6 +93,7 @@ def fit_files(
         resume: keep results that are there already for the same scan, model and settings. Where such a fit has to be
             done again, for the stages say, it has the dense surface and the stages that it had.
         stages: also write the surfaces at each stage, for figures.
+        first: names of jobs that are done before the others.
         on_plan: called once with what is to be done.
         on_done: called with each job and its record.
         on_state: called with each state of the loop when fits run here.
@@ -116,6 +118,7 @@ def fit_files(
                 except (KeyError, TypeError, AttributeError, ValueError):  # damaged
                     task = FitTask(job, config, stages, resume=False)
             tasks.append(task)
+        tasks.sort(key=lambda task: task.job.name not in first)
         kept.table.catch_up([task.job.name for task in tasks])
         if on_plan is not None:
             before = sum(has_surface(task.job, folder) for task in tasks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any, cast
 
@@ -88,8 +89,8 @@ def _add_demo(commands: Any) -> None:
 
 
 def _add_data(commands: Any) -> None:
-    sub = commands.add_parser("data", help="open data sets, simulated faces and organs").add_subparsers(
-        required=True, metavar="list|get|faces|organs"
+    sub = commands.add_parser("data", help="open data sets, simulated faces, organs and bones").add_subparsers(
+        required=True, metavar="list|get|faces|organs|bones"
     )
     listing = _add(sub, "list", "open data sets: licence, size, hash", "shapespace data list")
     listing.set_defaults(run=run.data_list)
@@ -124,6 +125,14 @@ def _add_data(commands: Any) -> None:
     organs.add_argument("--seed", type=_natural, default=0, metavar="S")
     organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
     organs.set_defaults(run=run.data_organs)
+    bones = _add(sub, "bones", "write raw scans (PLY) of simulated bones of two groups, with bones.csv",
+                 "shapespace data bones -o bones --count 16")  # fmt: skip
+    bones.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    bones.add_argument("--count", type=_positive, default=16, metavar="N", help="of both groups in turn (default 16)")
+    bones.add_argument("--seed", type=_natural, default=0, metavar="S")
+    bones.add_argument("--effect", type=float, default=4.0, metavar="MM",
+                       help="how much longer the snouts of the second group are (default 4)")  # fmt: skip
+    bones.set_defaults(run=run.data_bones)
 
 
 def _add_surface(commands: Any) -> None:
@@ -139,6 +148,9 @@ def _add_surface(commands: Any) -> None:
                      help="standard deviation of the smoothing in voxels (default 1.3; 0: none)")  # fmt: skip
     sub.add_argument("--keep-pieces", action="store_true",
                      help="all pieces and cavities (default: the largest piece, cavities filled)")  # fmt: skip
+    sub.add_argument("--max-memory", type=_memory_bytes, metavar="SIZE",
+                     help="memory that a volume and its surface may take, such as 8G or 500M; one that takes more is "
+                          "refused before it is read (default 4G, at most four fifths of the free memory)")  # fmt: skip
     sub.set_defaults(run=run.surface)
 
 
@@ -147,7 +159,14 @@ def _add_check(commands: Any) -> None:
                "shapespace check scan.obj")  # fmt: skip
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _add_recursive(sub)
+    _add_strict(sub)
     sub.set_defaults(run=run.check)
+
+
+def _add_strict(sub: Any, more: str = "") -> None:
+    sub.add_argument("--strict", action="store_true",
+                     help="refuse scans with coordinates that are NaN or infinite, instead of removing the triangles "
+                          f"that use them{more}")  # fmt: skip
 
 
 def _add_correspond(commands: Any) -> None:
@@ -170,6 +189,7 @@ def _add_correspond(commands: Any) -> None:
     sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
                      help="of the template where a scan is chosen (default 10000)")  # fmt: skip
     sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")
+    _add_strict(sub)
     _add_where(sub, "scans")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.correspond, goes_on="; the same command goes on from there")
@@ -299,7 +319,7 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--store", action="store_true",
                      help="keep results in few files, as is done by itself from 10,000 scans on")  # fmt: skip
-    sub.add_argument("--strict", action="store_true", help="exit with 1 when a fit is doubtful")
+    _add_strict(sub, "; exit with 1 when a fit is doubtful")
     sub.add_argument("--seed", type=_natural, default=0, metavar="S")
     sub.set_defaults(run=run.fit, goes_on="; the same command goes on from there")
 
@@ -325,7 +345,7 @@ def _add_report(commands: Any) -> None:
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
     sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="where the model is now, if it was moved")
     sub.add_argument("--labels", type=Path, metavar="FILE",
-                     help="CSV of file and label (default: labels.csv in DIR or beside the scans)")  # fmt: skip
+                     help="table of scans and labels (default: labels.csv in DIR or beside the scans)")  # fmt: skip
     sub.add_argument("--no-open", action="store_true", help="do not open the report in a browser")
     sub.set_defaults(run=run.report)
 
@@ -381,7 +401,7 @@ def _add_recognise_train(commands: Any) -> None:
                "--classifier mean-direction")  # fmt: skip
     sub.add_argument("results", type=Path, metavar="RESULTS", help="a folder that fit wrote, or its coefficients.csv")
     sub.add_argument("--labels", type=Path, required=True, metavar="FILE",
-                     help="CSV of file and label, and of subject if known")  # fmt: skip
+                     help="table of scans and their labels, and subjects if known")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.skops")
     sub.add_argument("--classifier", default="lda", metavar="NAME",
                      help="mean-direction, knn, lda (default), qda, logistic or svm")  # fmt: skip
@@ -523,6 +543,14 @@ def _stddev(text: str) -> float:
     if not value > 0:
         raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
     return value
+
+
+def _memory_bytes(text: str) -> int:
+    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)
+    value = float(found[1]) * 1024 ** (1 + "KMGT".index(found[2].upper())) if found else 0.0
+    if not value:
+        raise argparse.ArgumentTypeError(f"must be a size such as 8G or 500M, not {text!r}")
+    return int(value)
 
 
 def _smoothing(text: str) -> float:

@@ -120,6 +120,19 @@ def data_organs(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def data_bones(arguments: argparse.Namespace) -> int:
+    """Write simulated bones of two groups."""
+    from shapespace.commands.data import write_simulated_bones
+
+    out, count = arguments.output, arguments.count
+    write_simulated_bones(out, count=count, seed=arguments.seed, effect_mm=arguments.effect, quiet=arguments.quiet)
+    if arguments.json:
+        show_json({"folder": str(out), "bones": count})
+    else:
+        show(f"{count} bones in {out}")
+    return 0
+
+
 def surface(arguments: argparse.Namespace) -> int:
     """Surfaces of labels in volumes."""
     from shapespace.commands.surface import write_surfaces
@@ -131,6 +144,7 @@ def surface(arguments: argparse.Namespace) -> int:
         smooth=arguments.smooth,
         keep_pieces=arguments.keep_pieces,
         recursive=arguments.recursive,
+        max_memory_bytes=arguments.max_memory,
         quiet=arguments.quiet,
         say=warn,
     )
@@ -166,7 +180,7 @@ def check(arguments: argparse.Namespace) -> int:
     """What is in each mesh, and what fitting will do about it."""
     from shapespace.commands.look import check
 
-    reports = check(arguments.files, recursive=arguments.recursive, say=warn)
+    reports = check(arguments.files, recursive=arguments.recursive, strict=arguments.strict, say=warn)
     if arguments.json:
         show_json(reports)
     else:
@@ -222,6 +236,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         arguments.landmarks,
         _where(arguments),
         arguments.recursive,
+        arguments.strict,
     )
     summary, records = correspond_files(files, arguments.output, settings, quiet=arguments.quiet, say=warn)
     if arguments.json:
@@ -366,6 +381,7 @@ def fit(arguments: argparse.Namespace) -> int:
         landmark_stddev_mm=arguments.landmark_sd,
         crop=arguments.crop,
         region=_region(arguments.region),
+        strict=arguments.strict,
     )
     settings = BatchSettings(
         config,

@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.cohort.classes import class_notes
 from shapespace.cohort.incomplete import completed_by, completed_shapes
 from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
@@ -230,7 +231,7 @@ class Cohort:
         )
 
     def complete(self, columns: Sequence[str], *, drop_missing: bool = False) -> Cohort:
-        """Return the cohort of the shapes of which all `columns` are known.
+        """Return the cohort of the shapes of which all `columns` are known, with notes on the classes of these.
 
         Args:
             columns: of the table.
@@ -241,7 +242,8 @@ class Cohort:
         """
         missing = self.table.missing(columns)
         if not missing:
-            return self
+            new = [note for note in class_notes(self.table, columns) if note not in self.notes]
+            return replace(self, notes=(*self.notes, *new)) if new else self
         who = named([self.names[row] for row in missing])
         if not drop_missing:
             raise InputError(
@@ -252,7 +254,8 @@ class Cohort:
             raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
         lost = set(missing)
         note = f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing ({who})."
-        return self.take([row for row in range(len(self)) if row not in lost], note)
+        kept = self.take([row for row in range(len(self)) if row not in lost], note)
+        return kept.complete(columns)
 
     @staticmethod
     def of_shapes(

@@ -65,8 +65,8 @@ def read_cohort(
     without a row.
 
     Args:
-        data: a CSV table whose column `file`, `scan`, `name` or `id` names a shape in each row (coefficients.csv is
-            one), or a folder of results of fits, whose metadata are the table.
+        data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
+            (coefficients.csv is one), or a folder of results of fits, whose metadata are the table.
         options: which shapes; None for the defaults.
         onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
         on_shape: called with (done, total) as surfaces are read.

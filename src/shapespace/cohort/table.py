@@ -73,7 +73,7 @@ class Table:
             InputError: there is no such column, or most of its cells are numbers and some are not.
         """
         cells = {row: cell for row, cell in zip(self.rows, self.texts(column), strict=True) if cell}
-        odd = [row for row, cell in cells.items() if not _is_number(cell)]
+        odd = [row for row, cell in cells.items() if not is_number(cell)]
         if len(odd) * 2 >= len(cells):
             return "text"
         if odd:
@@ -91,7 +91,7 @@ class Table:
         """
         cells = self.texts(column)
         for row, cell in zip(self.rows, cells, strict=True):
-            if cell and not _is_number(cell):
+            if cell and not is_number(cell):
                 raise InputError(f"{self.where}: {column!r} is {cell[:40]!r} at {row}, which is no number.")
         return read_only([float(cell) if cell else math.nan for cell in cells])
 
@@ -165,7 +165,8 @@ def plain_cell(cell: str) -> str:
     return "" if text.lower() in MISSING else text
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a finite number."""
     try:
         return math.isfinite(float(cell)) and "_" not in cell
     except ValueError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -33,10 +33,10 @@ from shapespace.correspondence.rounds import (
     first_template,
 )
 from shapespace.correspondence.scans import copies, unit_ratios
-from shapespace.errors import MeshError, ShapespaceError
+from shapespace.errors import ShapespaceError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
-from shapespace.geometry.doctor import repair
+from shapespace.geometry.doctor import NON_FINITE, repair
 from shapespace.geometry.surface import face_areas, without_estimates
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.json_files import read_json
@@ -49,6 +49,8 @@ from shapespace.types import Mesh
 from shapespace.version import __version__
 
 _KEPT = ".rounds"
+_BROKEN = "broken: "
+"""How the reason of a scan begins that cannot be used at all."""
 _UNREADABLE = "unreadable"
 _WITH_OTHER_FILES = (".gltf",)
 """Endings of meshes whose vertices may lie in other files."""
@@ -72,6 +74,7 @@ class CorrespondFiles:
         landmarks: a folder of files that are named as the scans, or None.
         where: scans are registered.
         recursive: take scans in folders below those given too.
+        strict: exclude scans with triangles that use vertices with non-finite coordinates.
     """
 
     scans: Sequence[str | Path]
@@ -80,6 +83,7 @@ class CorrespondFiles:
     landmarks: Path | None = None
     where: Where = field(default_factory=Where)
     recursive: bool = False
+    strict: bool = False
 
 
 def correspond_files(
@@ -125,7 +129,8 @@ def _corresponding(
     if (finished := _finished(jobs, folder, inputs_hash)) is not None:
         say(f"{folder} already contains the results of these scans and settings; nothing is computed.")
         return finished
-    read = _read_all(jobs, marks, quiet=quiet)
+    read = _read_all(jobs, marks, strict=files.strict, quiet=quiet)
+    _say_excluded(read.unread, len(jobs), say)
     scans, notes = read.scans, read.notes
     template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
     marks.tell(say)
@@ -183,7 +188,8 @@ def _inputs_hash(
         scans.append([job.name, content, landmarks_hash(job.scan, job.landmarks), dict(job.metadata)])
     template = None if files.template is None else [_hash_of(files.template), landmarks_hash(files.template, None)]
     model = None if files.model is None else _hash_of(files.model)
-    content = json.dumps([scans, template, model, asdict(settings), __version__], sort_keys=True, default=str)
+    inputs = [scans, template, model, asdict(settings), files.strict, __version__]
+    content = json.dumps(inputs, sort_keys=True, default=str)
     return hashlib.sha256(content.encode()).hexdigest()
 
 
@@ -252,7 +258,16 @@ class _Read:
     unread: dict[str, str] = field(default_factory=dict[str, str])
 
 
-def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Read:
+def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
+    """Name the scans that are excluded, with the reason, before anything long begins."""
+    for name, reason in reasons.items():
+        say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
+    if reasons:
+        say(f"{len(reasons)} of {scans} {'scan is' if scans == 1 else 'scans are'} excluded before the first round.")
+
+
+def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet: bool) -> _Read:
+    """Read and repair every scan; those that cannot be used are in `unread`, with the reason."""
     read = _Read()
     with progress(len(jobs), "reading", "scan", quiet=quiet) as bar:
         for job in jobs:
@@ -260,22 +275,23 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, quiet: bool) -> _Rea
                 with job.readable() as file:
                     mesh, content_hash = read_mesh(file), sha256_of_file(file)
                 mesh = marks.onto(mesh, job.scan, job.landmarks)
-            except ShapespaceError as error:
-                read.unread[job.name] = f"broken: {error}"
-            else:
-                own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
-                read.scans[job.name], read.notes[job.name] = _looked_at(own)
                 read.hashes[job.name] = content_hash
+                own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
+                read.scans[job.name], read.notes[job.name] = _looked_at(own, strict=strict)
+            except ShapespaceError as error:
+                read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
     return read
 
 
-def _looked_at(scan: Mesh) -> tuple[Mesh, list[str]]:
-    try:
-        mesh, findings = repair(scan)
-    except MeshError:
-        return scan, []  # it is set aside with that reason
-    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note"]
+def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
+    """Return the repaired scan, and what the user should know of it.
+
+    Raises:
+        MeshError: it cannot be used.
+    """
+    mesh, findings = repair(scan, strict=strict)
+    notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
     return without_astray(mesh), [*notes, *_told_astray(mesh)]
 
 

@@ -83,6 +83,25 @@ def write_simulated_faces(
     return total
 
 
+def write_simulated_bones(folder: Path, *, count: int, seed: int, effect_mm: float, quiet: bool) -> None:
+    """Write raw scans of simulated bones of two groups, and their table.
+
+    Raises:
+        InputError: a count or an effect out of range.
+        FileError: the folder cannot be written.
+    """
+    from shapespace.datasets.bones import write_bones
+    from shapespace.datasets.faces import LICENSE
+
+    with progress(count, "writing", "bone", quiet=quiet) as bar:
+
+        def one_more() -> None:
+            bar.update()
+
+        write_bones(folder, count=count, seed=seed, effect_mm=effect_mm, progress=one_more)
+    write_about(folder, f"{count} simulated bones of shapespace in two groups, seed {seed}", LICENSE)
+
+
 def write_simulated_organs(folder: Path, *, count: int, seed: int, volumes: bool, quiet: bool) -> None:
     """Write raw surfaces, or label volumes, of simulated organs.
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from shapespace.batch.fit_work import Job
@@ -17,15 +19,20 @@ from shapespace.batch.run import Plan, fit_files, make_jobs
 from shapespace.batch.where import Where
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
-from shapespace.errors import InputError
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
+from shapespace.geometry.doctor import NON_FINITE
 from shapespace.io.fiducials import FIDUCIAL_ENDINGS
 from shapespace.io.files import make_folder, remove_file, write_bytes
+from shapespace.io.meshes import probe_mesh, read_mesh
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.manifest import read_manifest
 
+FULL_CHECK_BYTES = 2**28
+"""Scans of so many bytes together are read whole before the first fit (256 MiB: about 5 s of binary PLY)."""
+_LISTED = 10
 _SURFACES = (".fitted.ply", ".dense.ply")
 
 
@@ -92,6 +99,7 @@ def fit_scans(
     stored = settings.store or len(work) >= FROM or read_manifest(folder) is not None
     if stored and not settings.store:
         say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
+    first = find_suspects(work, quiet=quiet)
     executor = settings.where.executor(len(work), quiet=quiet)
     with (
         progress(len(work), "fitting", "scan", quiet=quiet) as bar,
@@ -101,13 +109,16 @@ def fit_scans(
         if stored:
             found = fit_into_store(
                 work, model, model_path, folder, settings.config, executor=executor, again=settings.again,
-                stages=settings.stages, on_plan=watch.plan, on_done=watch.done,
+                stages=settings.stages, first=first, on_plan=watch.plan, on_done=watch.done,
             )  # fmt: skip
+            watch.say_removed()
             return counts | found, {}
         records = fit_files(
             work, model, model_path, folder, settings.config, executor=executor, resume=not settings.again,
-            stages=settings.stages, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
+            stages=settings.stages, first=first, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
         )  # fmt: skip
+        if len(work) > 1:
+            watch.say_removed()
     for record in records:
         counts[record["status"]] += 1
     return counts, {job.name: record for job, record in zip(work, records, strict=True)}
@@ -119,6 +130,17 @@ class _Watch:
 
     bar: tqdm[Any]
     say: Callable[[str], None]
+    removed: list[str] = field(default_factory=list[str])
+    """Names of scans from which triangles were removed, for vertices with non-finite coordinates."""
+
+    def say_removed(self) -> None:
+        if self.removed:
+            named = ", ".join(self.removed[:_LISTED]) + (", ..." if len(self.removed) > _LISTED else "")
+            what = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
+            self.say(
+                f"{what} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "
+                "refuses such scans."
+            )
 
     def state(self, state: IcpState) -> None:
         self.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
@@ -129,12 +151,41 @@ class _Watch:
 
     def done(self, job: Job, record: Mapping[str, Any]) -> None:
         self.bar.update()
+        if any(NON_FINITE in note for note in record.get("notes", ())):
+            self.removed.append(job.name)
         if record["status"] == "converged" or record["reason"] == "kept":
             return
         self.bar.clear()
         # The reason of a failure names the file already.
         failed = record["status"] == "failed"
         self.say(record["reason"] if failed else f"{job.called}: {record['status']}: {record['reason']}")
+
+
+def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:
+    """Return the names of jobs whose scans probably cannot be read, so that they are done, and reported, first.
+
+    Scans of up to `FULL_CHECK_BYTES` together are read whole; of more, each is checked by its first 64 KiB and its
+    size. Scans at addresses are not fetched twice, and are not checked. One scan alone is not checked.
+    """
+    here = [job for job in jobs if not job.address]
+    if len(jobs) < 2 or not here:
+        return set()
+    total = 0
+    for job in here:
+        with suppress(OSError):
+            total += job.scan.stat().st_size
+    suspects: set[str] = set()
+    with progress(len(here), "checking", "scan", quiet=quiet) as bar:
+        for job in here:
+            try:
+                if total > FULL_CHECK_BYTES:
+                    probe_mesh(job.scan)
+                elif not np.isfinite(read_mesh(job.scan).vertices).all(axis=1).any():
+                    suspects.add(job.name)
+            except (ShapespaceError, MemoryError):
+                suspects.add(job.name)
+            bar.update()
+    return suspects
 
 
 def _landmarks(landmarks: Path | None, scans: int) -> tuple[Path | None, LandmarkFiles]:

@@ -24,7 +24,9 @@ from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
 
 
-def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def check(
+    paths: Sequence[Path], *, recursive: bool, strict: bool = False, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """Return what is in each mesh file, what is wrong with it, and what fitting will do about it.
 
     A file that cannot be read, or takes more memory than there is, is reported with an error, and the next one read.
@@ -32,6 +34,7 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
     Args:
         paths: files and folders.
         recursive: whether to take what lies in folders below these too.
+        strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
         say: told what was not taken.
     """
     reports: list[dict[str, Any]] = []
@@ -40,7 +43,7 @@ def check(paths: Sequence[Path], *, recursive: bool, say: Callable[[str], None])
         say(sentence)
     for path in found.files:
         try:
-            report = examine(read_mesh(path))
+            report = examine(read_mesh(path), strict=strict)
         except ShapespaceError as error:
             reports.append({"file": str(path), "usable": False, "error": naming(path, str(error))})
             continue

@@ -13,6 +13,7 @@ from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.results import read_record
 from shapespace.batch.where import Where
+from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
 from shapespace.io.labels import read_labels
@@ -98,7 +99,8 @@ def recognise_train(
     )  # fmt: skip
     make_folder(output.absolute().parent)
     saved.save(output)
-    return saved.facts(), [*problems, *notes]
+    classes = notes_on_classes("label", [scan.label for scan in scans])
+    return saved.facts(), [*problems, *notes, *classes]
 
 
 def recognise_predict(

@@ -16,10 +16,13 @@ from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file
 from shapespace.io.folders import mesh_files
+from shapespace.io.memory import available_bytes
 from shapespace.io.meshes import write_mesh
 from shapespace.io.volumes import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
+from shapespace.types import MAX_MEMORY_BYTES
 
 _MANY = 4
+_MOST_OF_MEMORY = 0.8
 _OTHER_SIZE = 0.02
 _OTHER_VOLUME = 4.0
 
@@ -32,6 +35,7 @@ def write_surfaces(
     smooth: float = SMOOTH,
     keep_pieces: bool = False,
     recursive: bool = False,
+    max_memory_bytes: int | None = None,
     quiet: bool = False,
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
@@ -46,6 +50,8 @@ def write_surfaces(
         smooth: as for `surface_of_volume`.
         keep_pieces: as for `surface_of_volume`.
         recursive: take volumes in folders below those given too.
+        max_memory_bytes: a volume that takes more memory, with its surface, is refused before it is read; None for
+            `MAX_MEMORY_BYTES`, or four fifths of the free memory if that is less.
         quiet: no progress.
         say: told what was not taken, and which volumes cannot be used.
 
@@ -61,12 +67,19 @@ def write_surfaces(
     make_folder(folder)
     files = list({path.resolve(): path for path in found.files}.values())
     records: list[dict[str, Any]] = []
+    limit = _default_limit() if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
         for path, name in zip(files, _names(files), strict=True):
             target = folder / f"{name}.ply"
             facts: dict[str, Any] = {"name": name, "volume": str(path)}
             try:
-                made = surface_of_volume(read_volume(path), labels, smooth=smooth, keep_pieces=keep_pieces)
+                made = surface_of_volume(
+                    read_volume(path, max_memory_bytes=limit),
+                    labels,
+                    smooth=smooth,
+                    keep_pieces=keep_pieces,
+                    max_memory_bytes=limit,
+                )
             except (ShapespaceError, MemoryError) as error:
                 short = f"{path}: there is not enough memory for it; crop or resample it, as by 3D Slicer."
                 reason = short if isinstance(error, MemoryError) else naming(path, str(error))
@@ -81,6 +94,11 @@ def write_surfaces(
             bar.update()
     _name_the_odd([record for record in records if "error" not in record])
     return records
+
+
+def _default_limit() -> int:
+    free = available_bytes()
+    return MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
 
 
 def _names(files: Sequence[Path]) -> list[str]:

@@ -10,6 +10,7 @@ import gzip
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -95,7 +96,15 @@ class Organ:
         return np.asarray(self.bend * x**2 / self.half_mm[0], dtype=np.float64)
 
 
-def raw_surface(organ: Organ, rng: np.random.Generator, points: int = _POINTS) -> Mesh:
+class Star(Protocol):
+    """An object whose surface is met once in each direction from its middle."""
+
+    def surface(self, directions: FloatArray) -> FloatArray:
+        """Return the points (M, 3), mm, of the surface in `directions` (M, 3) of unit length."""
+        ...
+
+
+def raw_surface(organ: Star, rng: np.random.Generator, points: int = _POINTS) -> Mesh:
     """Return `organ` as a scan: triangles and pose of its own, and noise; mm."""
     directions = _spread(points) @ Rotation.random(random_state=rng).as_matrix().T
     faces = ConvexHull(directions).simplices.astype(np.int32)

@@ -45,7 +45,7 @@ _ALL_BUT_THE_RIM = 0.95
 _VANISHED = 0.05
 """Share of the start's scale below which nothing is left to fit."""
 
-OPTIONS = ("landmark_stddev_mm", "crop", "region")
+OPTIONS = ("landmark_stddev_mm", "crop", "region", "strict")
 """Settings that a record tells only where they are given."""
 
 OnState: TypeAlias = Callable[[IcpState], None]
@@ -73,6 +73,8 @@ class FitConfig:
         crop: what of the scan is fitted, such as `sphere:0,0,0,90`, see `fit.crop.Crop`; empty for all of it.
         region: the part of the model that fit, distances and verdict are held to: a name of `ShapeModel.regions`, or
             vertices; None for all of it.
+        strict: whether a scan with triangles that use vertices with non-finite coordinates is refused; otherwise these
+            triangles are removed, and a note says so.
 
     Raises:
         InputError: a name that does not exist, numbers below one, or a dense stage after a method that has none.
@@ -89,6 +91,7 @@ class FitConfig:
     landmark_stddev_mm: float | None = None
     crop: str = ""
     region: str | tuple[int, ...] | None = None
+    strict: bool = False
 
     def __post_init__(self) -> None:
         for value, choices, what in (
@@ -138,6 +141,8 @@ class FitConfig:
             common["crop"] = self.crop
         if self.region is not None:
             common["region"] = self.region if isinstance(self.region, str) else _told_vertices(self.region)
+        if self.strict:
+            common["strict"] = True
         return {
             "method": method.name, **common, "dense_settings": asdict(self.dense_settings),
             method.name: asdict(method),  # type: ignore[call-overload]
@@ -300,7 +305,7 @@ def _place(
     if config.crop:
         scan, cropped = Crop.of(config.crop).cut(scan, whole, landmarks, config.unit)
         said.append(cropped)
-    scan, findings = repair(scan)
+    scan, findings = repair(scan, strict=config.strict)
     mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
     T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))

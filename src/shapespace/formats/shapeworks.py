@@ -374,5 +374,4 @@ def _sheet(content: bytes, path: Path) -> list[Row]:
         table = sheet_rows(content, "data")
     except ValueError as error:
         raise ModelFileError(f"{path} {error}, so it is no project of ShapeWorks; {_AGAIN}.") from error
-    heads = table[0] if table else {}
-    return [{heads[at]: text for at, text in cells.items() if at in heads} for cells in table[1:]]
+    return [{table[0][at]: text for at, text in cells.items() if at in table[0]} for cells in table[1:]]

@@ -12,6 +12,9 @@ from shapespace.errors import MeshError
 from shapespace.geometry.surface import without_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
+NON_FINITE = "coordinates that are NaN or infinite"
+"""How findings name vertices that have no place."""
+
 # Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
 _DEGENERATE = 1e-12
 # Smallest over largest spread below which points lie on a plane, and second over largest for a line.
@@ -92,7 +95,7 @@ class MeshReport:
         return all(finding.level != "refused" for finding in self.findings)
 
 
-def examine(mesh: Mesh) -> MeshReport:
+def examine(mesh: Mesh, *, strict: bool = False) -> MeshReport:
     """Return what is in `mesh`, what is wrong with it and what fitting does about it; nothing is refused here.
 
     Edges, pieces and winding are those of the repaired mesh, since without merging equal vertices a soup of
@@ -100,19 +103,21 @@ def examine(mesh: Mesh) -> MeshReport:
 
     Args:
         mesh: any mesh, also one without points or with NaN in it.
+        strict: whether triangles that use vertices with non-finite coordinates are a reason to refuse the mesh.
     """
-    return _Doctor(mesh).report()
+    return _Doctor(mesh, strict=strict).report()
 
 
-def repair(mesh: Mesh) -> tuple[Mesh, tuple[Finding, ...]]:
+def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ...]]:
     """Fix what can be fixed safely and refuse what cannot be fitted.
 
-    Exactly equal vertices are merged; triangles without area and repeated triangles are dropped; vertices that
-    no triangle uses, and missing points (NaN) of a point cloud, are dropped; winding is made consistent and
-    turned outward. Several pieces, non-manifold edges and a far origin are kept and noted.
+    Vertices with non-finite coordinates are removed, with the triangles that use them. Exactly equal vertices are
+    merged. Triangles without area, repeated triangles, and vertices that no triangle uses are dropped. Winding is made
+    consistent and turned outward. Several pieces, non-manifold edges and a far origin are kept and noted.
 
     Args:
         mesh: a scan as read. The numbering of its vertices does not survive; its landmarks and name do.
+        strict: refuse a mesh with triangles that use vertices with non-finite coordinates, instead of removing them.
 
     Returns:
         The repaired mesh (`mesh` itself where there was nothing to do), and the findings.
@@ -120,7 +125,7 @@ def repair(mesh: Mesh) -> tuple[Mesh, tuple[Finding, ...]]:
     Raises:
         MeshError: it cannot be fitted; the one sentence names it and says what to do.
     """
-    doctor = _Doctor(mesh)
+    doctor = _Doctor(mesh, strict=strict)
     for finding in doctor.findings:
         if finding.level == "refused":
             raise MeshError(f"{mesh.name}: {finding.what[0].lower()}{finding.what[1:-1]}; {finding.action}")
@@ -130,8 +135,9 @@ def repair(mesh: Mesh) -> tuple[Mesh, tuple[Finding, ...]]:
 class _Doctor:
     """One pass over a mesh that repairs as it goes and counts what it met."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, *, strict: bool) -> None:
         self.mesh = mesh
+        self.strict = strict
         self.findings: list[Finding] = []
         self.vertices = mesh.vertices
         self.colours = mesh.colours
@@ -173,17 +179,25 @@ class _Doctor:
         self.findings.append(Finding("note", what, action))
 
     def _drop_non_finite(self, finite: BoolArray) -> bool:
-        """Drop points that are not finite if no triangle needs them; return whether the rest can go on."""
+        """Remove vertices that are not finite, and triangles that use them; return whether the rest can go on."""
         bad = int((~finite).sum())
         self.non_finite = bad
         if not bad:
             return True
-        what = f"{_some(bad, 'vertex', 'vertices')} with coordinates that are NaN or infinite"
-        if self.faces is not None and not finite[self.faces].all():
-            self._refuse(f"It has {what}, and triangles that use them.", "export the scan again without them.")
+        what = f"It has {_some(bad, 'vertex', 'vertices')} with {NON_FINITE}"
+        whole = None if self.faces is None else np.asarray(finite[self.faces].all(axis=1))
+        lost = 0 if whole is None else int((~whole).sum())
+        if whole is None or not lost:
+            self._keep_vertices(finite)
+            self._fixed(f"{what}.", "They are missing points that no triangle uses, and are dropped.")
+            return True
+        what += f", used by {_some(lost, 'triangle', 'triangles')}."
+        if self.strict:
+            self._refuse(what, "export the scan again without them, or leave out --strict to remove them.")
             return False
+        self._keep_triangles(whole)
         self._keep_vertices(finite)
-        self._fixed(f"It has {what}.", "They are missing points that no triangle uses, and are dropped.")
+        self._fixed(what, "They are removed together, which leaves a hole.")
         return True
 
     def _keep_vertices(self, keep: BoolArray) -> None:

@@ -8,8 +8,10 @@ by more than half a voxel (after R. T. Whitaker, "Reducing Aliasing Artifacts in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -20,7 +22,7 @@ from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, IntArray, LabelVolume, Mesh
+from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh
 
 SMOOTH = 1.3
 """Standard deviation of the smoothing by default, in voxels."""
@@ -37,7 +39,14 @@ _FINER = (0.5, 0.25)
 _ROUNDS = 3
 _FEWEST = 8
 _HALVINGS, _STEP = 20, 0.1
-_MOST_VOXELS = 1 << 27
+_BLOCK = 1 << 20
+"""Voxels of the volume that are looked at together."""
+_MOST_LABELS = 1 << 16
+"""A volume with more labels than this is a picture."""
+_BASE_BYTES = 1 << 27
+_VOXEL_BYTES, _VERTEX_BYTES = 32, 400
+"""Memory of smoothing and marching cubes: for each voxel of the box around the labels, and for each vertex of the
+surface. Upper bounds of the peaks of resident memory that benchmarks/volume_memory.py measures."""
 _LONG = 2.5
 _LISTED = 10
 
@@ -82,6 +91,7 @@ def surface_of_volume(
     *,
     smooth: float = SMOOTH,
     keep_pieces: bool = False,
+    max_memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> VolumeSurface:
     """Return the surface around labels, at sub-voxel accuracy.
 
@@ -90,24 +100,28 @@ def surface_of_volume(
         labels: one, or several that are taken as one object; "all" but 0; None for the only one there is.
         smooth: standard deviation of the smoothing in voxels, of their mean size where they are not cubes; 0 for none.
         keep_pieces: keep all pieces and cavities, instead of the largest piece without them.
+        max_memory_bytes: the volume and what is made of it may take so much memory; it is estimated from the size of
+            the box around the labels and the area of their border, before memory is allocated.
 
     Raises:
-        InputError: no such label, several where none was chosen, too few voxels or too many, or a bad `smooth`.
+        InputError: no such label, several where none was chosen, too few voxels, more memory than allowed, or a bad
+            `smooth`.
         ShapespaceError: the extra `volumes` is not installed.
     """
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
     chosen = _chosen(volume, labels)
-    inside = np.isin(volume.labels, chosen)
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
-    mask, corner = _cut_out(inside, np.ceil(3 * sigma).astype(int) + 3, volume.name)
+    memory = _Memory(volume.labels.nbytes, max_memory_bytes, volume.name)
+    mask, corner = _cut_out(volume.labels, chosen, np.ceil(3 * sigma).astype(int) + 3, memory)
     part = _Part.of(mask, keep_pieces=keep_pieces)
+    memory.check(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
         raise InputError(
             f"{volume.name}: {_named(chosen)} has only {part.voxels} "
             f"{'voxel' if part.voxels == 1 else 'voxels that hang together'}; a surface needs {_FEWEST}."
         )
-    at_border = _at_border(part.mask, corner, inside.shape)
+    at_border = _at_border(part.mask, corner, volume.labels.shape)
     field, share = _smoothed(part, volume.voxel_mm, sigma)
     vertices, faces = _triangles(field, volume.name)
     points = (vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -127,19 +141,88 @@ def surface_of_volume(
     )
 
 
+@dataclass(frozen=True)
+class _Memory:
+    """What a surface may take.
+
+    Args:
+        volume_bytes: of the volume.
+        limit_bytes: of the volume and all that is made of it.
+        name: of the volume.
+    """
+
+    volume_bytes: int
+    limit_bytes: int
+    name: str
+
+    def check(self, box: Sequence[int], vertices: int = 0) -> None:
+        """Refuse a box of voxels around the labels, and vertices of their border, that take too much memory.
+
+        Raises:
+            InputError: they do.
+        """
+        needed = self.volume_bytes + estimated_bytes(box, vertices)
+        if needed > self.limit_bytes:
+            size = " x ".join(map(str, box))
+            raise InputError(
+                f"{self.name}: the surface of its labels, in a box of {size} voxels, takes about "
+                f"{needed / 2**30:.2g} GiB of memory, over the limit of {self.limit_bytes / 2**30:.2g} GiB; crop or "
+                "resample it, as by 3D Slicer, or allow more (--max-memory)."
+            )
+
+
+def estimated_bytes(box: Sequence[int], vertices: int) -> int:
+    """Return an upper bound of the memory of smoothing and marching cubes, without the volume.
+
+    Args:
+        box: (3,) voxels along each axis of the box around the labels, with its margin.
+        vertices: of the surface, by the pairs of neighbouring voxels on both sides of its border.
+    """
+    return _BASE_BYTES + _VOXEL_BYTES * math.prod(map(int, box)) + _VERTEX_BYTES * vertices
+
+
+def _blocks(shape: tuple[int, ...]) -> Generator[tuple[slice, slice, slice]]:
+    """Yield slices of a volume that contain about `_BLOCK` voxels each, along its first axis first."""
+    steps: list[int] = []
+    left = _BLOCK
+    for length in shape:
+        steps.append(max(1, min(length, left)))
+        left //= steps[-1]
+    for z in range(0, shape[2], steps[2]):
+        for y in range(0, shape[1], steps[1]):
+            for x in range(0, shape[0], steps[0]):
+                yield slice(x, x + steps[0]), slice(y, y + steps[1]), slice(z, z + steps[2])
+
+
 def labels_in(labels: _Labels) -> tuple[int, ...]:
-    """Return the labels in (X, Y, Z) other than 0, from the lowest."""
-    low, high = int(labels.min()), int(labels.max())
-    if high - low >= 1 << 16:
-        return tuple(int(value) for value in np.unique(labels) if value)
-    counts = np.zeros(high - low + 1, dtype=np.int64)
-    for slab in np.moveaxis(labels, -1, 0):
-        counts += np.bincount((slab.astype(np.int64) - low).ravel(), minlength=len(counts))
-    return tuple(low + int(at) for at in np.flatnonzero(counts) if low + at)
+    """Return the labels in (X, Y, Z) other than 0, from the lowest.
+
+    Raises:
+        InputError: there are more than a segmentation has.
+    """
+    found: set[int] = set()
+    for block in _blocks(labels.shape):
+        values = labels[block]
+        if values.any():
+            low, high = int(values.min()), int(values.max())
+            if high - low < 2:
+                found.update((low, high))
+            elif high - low < _MOST_LABELS:
+                # Subtraction wraps round in uint64, so that it is right for labels below 0 too.
+                above = (values.astype(np.uint64) - np.uint64(low % 2**64)).astype(np.intp)
+                found.update(low + int(at) for at in np.flatnonzero(np.bincount(above.ravel())))
+            else:
+                found.update(np.unique(values).tolist())
+        if len(found) > _MOST_LABELS:
+            raise InputError(f"It has more than {_MOST_LABELS:,} labels, as pictures have; give the label map.")
+    return tuple(sorted(found - {0}))
 
 
 def _chosen(volume: LabelVolume, labels: int | Sequence[int] | Literal["all"] | None) -> tuple[int, ...]:
-    found = labels_in(volume.labels)
+    try:
+        found = labels_in(volume.labels)
+    except InputError as error:
+        raise InputError(f"{volume.name}: {error}") from error
     if not found:
         raise InputError(f"{volume.name}: all its voxels are 0; give a volume with a label.")
     listed = ", ".join(map(str, found[:_LISTED])) + (f", ... ({len(found)})" if len(found) > _LISTED else "")
@@ -164,19 +247,43 @@ def _named(labels: tuple[int, ...]) -> str:
     return f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels))}"
 
 
-def _cut_out(inside: BoolArray, margin: npt.NDArray[np.int_], name: str) -> tuple[BoolArray, FloatArray]:
-    """Return the box around what is `inside` with a margin on each axis, and (3,) where in the volume it begins."""
-    low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
+def _cut_out(
+    labels: _Labels, chosen: tuple[int, ...], margin: npt.NDArray[np.int_], memory: _Memory
+) -> tuple[BoolArray, FloatArray]:
+    """Return the box around the `chosen` labels with a margin on each axis, and (3,) where in the volume it begins."""
+    low, high = np.array(labels.shape, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    wanted = np.array(chosen, dtype=labels.dtype)
+    for block in _blocks(labels.shape):
+        if labels[block].any() and (inside := _is_one_of(labels[block], wanted)).any():
+            for axis in range(3):
+                along = np.flatnonzero(inside.any(axis=tuple(other for other in range(3) if other != axis)))
+                low[axis] = min(low[axis], block[axis].start + along[0])
+                high[axis] = max(high[axis], block[axis].start + along[-1] + 1)
+    memory.check((high - low + 2 * margin).tolist())
+    mask = np.zeros(high - low + 2 * margin, dtype=np.bool_)
+    corner = low - margin
+    for block in _blocks(labels.shape):
+        begin = [max(one.start, int(at)) for one, at in zip(block, low, strict=True)]
+        end = [min(one.stop, int(at)) for one, at in zip(block, high, strict=True)]
+        if all(a < b for a, b in zip(begin, end, strict=True)):
+            there = tuple(slice(a, b) for a, b in zip(begin, end, strict=True))
+            here = tuple(slice(a - int(at), b - int(at)) for a, b, at in zip(begin, end, corner, strict=True))
+            mask[here] = _is_one_of(labels[there], wanted)
+    return mask, corner.astype(np.float64)
+
+
+def _is_one_of(values: _Labels, wanted: _Labels) -> BoolArray:
+    # Several times as fast for one label, which is the usual case.
+    return values == wanted[0] if len(wanted) == 1 else np.isin(values, wanted)
+
+
+def count_crossings(mask: BoolArray) -> int:
+    """Return how many pairs of neighbours lie on both sides of the border: the vertices of marching cubes."""
+    count = 0
     for axis in range(3):
-        along = np.flatnonzero(inside.any(axis=tuple(other for other in range(3) if other != axis)))
-        low[axis], high[axis] = along[0], along[-1] + 1
-    if np.prod(high - low + 2 * margin) > _MOST_VOXELS:
-        size = " x ".join(map(str, high - low))
-        raise InputError(
-            f"{name}: the labels fill a box of {size} voxels, too many to smooth; resample it, as by 3D Slicer."
-        )
-    box = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    return np.pad(box, [(int(m), int(m)) for m in margin]), (low - margin).astype(np.float64)
+        along = np.moveaxis(mask, axis, 0)
+        count += sum(int(np.count_nonzero(a != b)) for a, b in pairwise(along))
+    return count
 
 
 def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:

@@ -192,8 +192,10 @@ def _prefix(stem: str) -> str:
 
 def _temporary_beside(path: Path) -> Path:
     _sweep_once(path.parent)
+    # Of the temporary file for a temporary one, the name says what it is for too.
+    stem = path.stem.split("-", 3)[-1] if path.name.startswith(_TEMPORARY) else path.stem
     try:
-        handle, name = tempfile.mkstemp(prefix=_prefix(path.stem[:40]), suffix=path.suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=_prefix(stem[:40]), suffix=path.suffix, dir=path.parent)
         os.close(handle)
     except OSError as error:
         raise write_error(path, error) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -11,7 +12,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError
 from shapespace.io.bnt import read_bnt
-from shapespace.io.files import read_bytes, write_bytes
+from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
 from shapespace.io.las import read_las
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
@@ -21,15 +22,17 @@ from shapespace.io.off import read_off, write_off
 from shapespace.io.packed import GZIP, unpacked
 from shapespace.io.parsing import plain_text
 from shapespace.io.pcd import read_pcd
-from shapespace.io.ply import read_ply, write_ply
+from shapespace.io.ply import probe_ply, read_ply, write_ply
 from shapespace.io.raw import read_raw
-from shapespace.io.stl import read_stl, write_stl
+from shapespace.io.stl import probe_stl, read_stl, write_stl
 from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
 from shapespace.io.xyz import read_xyz
 from shapespace.types import Mesh
 
 _PACKED = ".gz"
+_PROBED_BYTES = 2**16
+_PROBES: Mapping[str, Callable[[bytes, int, Path], None]] = {".ply": probe_ply, ".stl": probe_stl}
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,32 @@ def read_mesh(path: Path | str) -> Mesh:
     # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
     with np.errstate(invalid="ignore", over="ignore"):
         return read(data, path)
+
+
+def probe_mesh(path: Path) -> None:
+    """Check a mesh file by its first 64 KiB and its size, where reading all of it would take too long.
+
+    The file must open, have a known ending, not be empty and not be too long; PLY and binary STL must be as long as
+    their header declares. A file that passes may still be damaged further on.
+
+    Raises:
+        FileError: as `read_mesh`.
+        FileFormatError: as `read_mesh`.
+    """
+    ending = ending_of(path)
+    if ending not in READ_ONLY_FORMATS and ending not in NAMED_FORMATS:
+        _format(path, "read")
+    with open_file(path) as stream:
+        try:
+            size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
+        except OSError as error:
+            raise read_error(path, error) from error
+    if size > LARGEST_MESH_FILE_BYTES:
+        read_bytes(path, LARGEST_MESH_FILE_BYTES)  # refuses it
+    if not head.strip():
+        raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
+    if not head.startswith(GZIP) and ending in _PROBES:
+        _PROBES[ending](head, size, path)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:

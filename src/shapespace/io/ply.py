@@ -185,6 +185,26 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     return mesh_of(vertices, faces, path, colours, observed=observed)
 
 
+def probe_ply(head: bytes, size: int, path: Path) -> None:
+    """Check that a PLY file is as long as its header declares, where faces have three corners or more.
+
+    Args:
+        head: the first bytes of the file.
+        size: of the file in bytes.
+        path: its name, for messages.
+
+    Raises:
+        FileFormatError: it is not PLY, or cut short.
+    """
+    order, elements, at = _header(head, path)
+    for element in elements:
+        check_count(element.count, 1, size - at + 1, _plural(element.name), path)
+        corners = [p for p in element.properties if element.name == "face" and p.count is not None]
+        each = element.least_bytes(order == "") + sum(3 * (np.dtype(p.item).itemsize if order else 2) for p in corners)
+        check_count(element.count, each, size - at + 1, _plural(element.name), path)
+        at += element.count * each
+
+
 def _plural(name: str) -> str:
     return {"vertex": "vertices", "face": "faces"}.get(name, f"'{name[:40]}' elements")
 

@@ -59,6 +59,13 @@ def read_stl(data: bytes, path: Path) -> Mesh:
     return mesh_of(vertices, index.reshape(-1, 3), path)
 
 
+def probe_stl(head: bytes, size: int, path: Path) -> None:
+    """Check that a binary STL file is as long as its header declares; arguments and errors as of `probe_ply`."""
+    if head.lstrip()[:5].lower() != b"solid":
+        declared = int.from_bytes(head[80:84], "little") if len(head) >= 84 else 1
+        check_count(declared, 50, size - 84, "triangles", path)
+
+
 def _ascii_corners(data: bytes, path: Path) -> FloatArray:
     corners: list[FloatArray] = []
     count = facets = 0

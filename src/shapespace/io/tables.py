@@ -9,7 +9,7 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -32,6 +32,8 @@ _DELIMITERS = (",", ";", "\t")
 _INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
+_MOST_LACKING = 2**18
+"""Cells that all rows of a table together may be shorter than its header; they take memory that the file has not."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _OLD_EXCEL = b"\xd0\xcf\x11\xe0"
 _SEPARATOR = re.compile(r'"?sep=(.)"?')
@@ -54,7 +56,9 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def rows_text(rows: Iterable[Sequence[object]]) -> str:
     """Return rows as CSV text, each ended by a line feed; text that a spreadsheet would run gets an apostrophe."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_written(cell) for cell in row] for row in rows)
+    write_row = _row_writer(text)
+    for row in rows:
+        write_row([_written(cell) for cell in row])
     return text.getvalue()
 
 
@@ -69,11 +73,24 @@ def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence
     """Write the same to `stream`, a row at a time."""
     at = header.index(CHECKSUM)
     header = [str(_written(name)) for name in header]
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
+    write_row = _row_writer(stream)
+    write_row(header)
     for row in rows:
         cells = ["" if cell is None else str(_written(cell)) for cell in row]
-        writer.writerow([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+        write_row([*cells[:at], row_checksum(header, cells), *cells[at + 1 :]])
+
+
+def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
+    """Return what writes a row of CSV to `stream`."""
+    plain = csv.writer(stream, lineterminator="\n")
+    # The csv module leaves a lone carriage return without quotes, and reads it as the end of a line.
+    quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+
+    def write_row(row: Sequence[object]) -> None:
+        returns = any(isinstance(cell, str) and "\r" in cell for cell in row)
+        (quoted if returns else plain).writerow(row)
+
+    return write_row
 
 
 def _written(cell: object) -> object:
@@ -126,7 +143,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
         if len(set(known)) != len(known):
             raise ValueError("has two columns of one name")
         yield header
-        at = header.index(CHECKSUM) if CHECKSUM in header else None
+        at, lacking = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):
             if len(row) > len(raw) and not any(cell.strip() for cell in row[len(raw) :]):
                 del row[len(raw) :]
@@ -134,6 +151,9 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
                 raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns")
             if at is not None and row_checksum(raw, row) != row[at]:
                 raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
+            lacking += len(raw) - len(row)
+            if lacking > _MOST_LACKING:
+                raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
             yield [*map(as_written, row), *[""] * (len(raw) - len(row))]
     except csv.Error as error:
         raise ValueError(f"is not a CSV table ({error})") from error

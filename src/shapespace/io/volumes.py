@@ -1,7 +1,9 @@
 """Label volumes in: NIfTI (`.nii`, `.nii.gz`) and NRRD (`.nrrd`, header and data in one file), as RAS millimetres.
 
 nibabel and pynrrd read the headers; the voxels are decoded here, so that a header that declares more than its file
-holds, and a compressed stream that grows without end, are refused before memory is taken. No other file is opened.
+holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are refused before
+memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no further. No
+other file is opened.
 """
 
 from __future__ import annotations
@@ -10,27 +12,36 @@ import bz2
 import gzip
 import io
 import math
+import os
 import zlib
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileError, InputError, ShapespaceError
-from shapespace.io.files import read_bytes, read_error
+from shapespace.io.files import open_file, read_error
 from shapespace.io.parsing import CUT_SHORT, damaged
-from shapespace.types import FloatArray, LabelVolume
+from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume
 
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd")
 """The endings that `read_volume` takes."""
 
 _MOST_BYTES = 1 << 31
 _MOST_HEADER = 1 << 20
+_PIECE = 1 << 20
+_WORK_BYTES = 1 << 26
+"""Memory of reading besides the labels: libraries, and pieces of 1 MiB as float64 (64 MiB, measured 40)."""
 # No deflate stream grows by more than 1032 to 1.
-_MOST_GROWTH = 1032
+_DEFLATE_GROWTH = 1032
+_BZIP2_SPARE, _BZIP2_GROWTH = 1 << 28, 10_000
+"""bzip2 packs zeros almost without bound. Volumes over 256 MiB may not grow by more than this; the border of a label
+alone takes more than that."""
 _HEADS = {348: "Nifti1Header", 540: "Nifti2Header"}
 _SINGLE, _PAIR = (b"n+1", b"n+2"), (b"ni1", b"ni2")
 _MAGIC_AT = {348: 344, 540: 4}
@@ -113,11 +124,12 @@ def volume_name(path: Path) -> str:
     return path.name
 
 
-def read_volume(path: Path | str) -> LabelVolume:
+def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -> LabelVolume:
     """Read a label volume and where its voxels lie in the patient.
 
     Args:
         path: a file with one of the endings in `VOLUME_ENDINGS`, in any case.
+        max_memory_bytes: a volume that takes more memory is refused by its header, before memory is allocated.
 
     Returns:
         Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
@@ -127,7 +139,7 @@ def read_volume(path: Path | str) -> LabelVolume:
         ShapespaceError: the extra `volumes` is not installed.
         FileError: it does not exist, cannot be read, or is too large.
         FileFormatError: it is no such volume, cut short or damaged, or declares more than it holds.
-        InputError: it is not one volume of labels in a space of three dimensions.
+        InputError: it is not one volume of labels in a space of three dimensions, or takes too much memory.
     """
     path = Path(path)
     require_volumes_extra()
@@ -136,48 +148,122 @@ def read_volume(path: Path | str) -> LabelVolume:
         raise damaged(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
     if not name.endswith(VOLUME_ENDINGS):
         raise damaged(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
-    data = _bounded(path)
-    values, head = _read_nrrd(data, path) if name.endswith(".nrrd") else _read_nifti(data, path)
-    affine = _sound(head.affine, path)
-    return LabelVolume(_whole(_three(values, head.axes, path), path), affine, path.name, head.notes)
+    with open_file(path) as file, ExitStack() as stack:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            _check_size(size, path)
+            is_nrrd = name.endswith(".nrrd")
+            head, stream = (_open_nrrd if is_nrrd else _open_nifti)(file, size, stack, path)
+        except OSError as error:
+            raise read_error(path, error) from error
+        shape = _three(head, path)
+        affine = _sound(head.affine, path)
+        labels = _labels(stream, head, max_memory_bytes, path)
+    return LabelVolume(labels.reshape(shape, order="F"), affine, path.name, head.notes)
 
 
-def _bounded(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise read_error(path, error) from error
+def _check_size(size: int, path: Path) -> None:
     if size > _MOST_BYTES + _MOST_HEADER:
         raise FileError(
             f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer."
         )
-    data = read_bytes(path)
-    if not data:
+    if not size:
         raise damaged(path, "it is empty; export or copy it again")
-    return data
 
 
-def _read_nifti(data: bytes, path: Path) -> tuple[npt.NDArray[Any], _Head]:
-    zipped = data[:2] == b"\x1f\x8b"
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) if zipped else io.BytesIO(data) as stream:
-        start = _taken(stream, 540, path)
-        head = _nifti_head(start, path)
-        _check_declared(head, len(data), _MOST_GROWTH if zipped else 1, path)
-        rest = _taken(stream, head.start + head.bytes - len(start), path)
-        # The checksum of a stream is only looked at where it ends.
-        _taken(stream, 1, path)
-    content = memoryview(start + rest)[head.start :]
-    values = _voxels(content, head, path)
-    if (head.slope, head.shift) != (1.0, 0.0):
-        values = values * head.slope + head.shift
-    return values, head
+def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+    """Return the header of a NIfTI file, and a stream at its first voxel."""
+    zipped = file.read(2) == b"\x1f\x8b"
+    file.seek(0)
+    stream: IO[bytes] = cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file))) if zipped else file
+    with _unpacking(path):
+        head = _nifti_head(stream.read(540), path)
+        _check_declared(head, size * _DEFLATE_GROWTH if zipped else size, path)
+        stream.seek(head.start)
+    return head, stream
 
 
-def _taken(stream: Any, count: int, path: Path) -> bytes:
+@contextmanager
+def _unpacking(path: Path) -> Generator[None]:
     try:
-        return cast(bytes, stream.read(max(count, 0)))
+        yield
     except (OSError, EOFError, zlib.error) as error:
         raise damaged(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+
+
+def _labels(stream: IO[bytes], head: _Head, max_memory_bytes: int, path: Path) -> npt.NDArray[np.integer[Any]]:
+    """Return the labels as a flat array, decoded in pieces so that no more than the array is in memory at a time."""
+    whole = head.kind.kind in "iu" and (head.slope, head.shift) == (1.0, 0.0)
+    kind: np.dtype[Any] = head.kind.newbyteorder("=") if whole else np.dtype(np.int32)
+    count = math.prod(head.shape)
+    needed = count * kind.itemsize + _WORK_BYTES
+    if needed > max_memory_bytes:
+        raise InputError(
+            f"{path} has {' x '.join(map(str, head.shape))} voxels, which take {needed / 2**30:.2g} GiB of memory, "
+            f"over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow more (--max-memory)."
+        )
+    # Pages that stay zero, as most of a mask is, take no memory.
+    labels = np.zeros(count, dtype=kind)
+    values = _Values()
+    buffer = memoryview(bytearray(min(_PIECE, head.bytes)))
+    at = 0
+    with _unpacking(path):
+        while at < count:
+            wanted = min(len(buffer), (count - at) * head.kind.itemsize)
+            read = _filled(stream, buffer[:wanted])
+            if read < wanted:
+                there = at * head.kind.itemsize + read
+                raise damaged(path, f"it ends after {there:,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}")
+            piece: npt.NDArray[Any] = np.frombuffer(buffer[:wanted], dtype=head.kind)
+            if piece.any() or not whole:
+                labels[at : at + len(piece)] = piece if whole else values.rounded(piece * head.slope + head.shift, path)
+            at += len(piece)
+        # The checksum of a stream is only looked at where it ends.
+        stream.read(1)
+    values.check(path)
+    return labels
+
+
+def _filled(stream: IO[bytes], view: memoryview) -> int:
+    """Read into `view` until it is full or the stream ends, and return how many bytes were read."""
+    at = 0
+    while at < len(view) and (count := cast(Any, stream).readinto(view[at:])):
+        at += count
+    return at
+
+
+@dataclass
+class _Values:
+    """What has been seen of values that are stored as floats, or with a slope, and stand for labels."""
+
+    low: float = math.inf
+    high: float = -math.inf
+    off: float = 0.0
+
+    def rounded(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
+        """Return a piece of them as whole numbers; zeros where they are no labels, which `check` refuses."""
+        low, high = float(values.min()), float(values.max())
+        if not math.isfinite(low) or not math.isfinite(high):
+            raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
+        self.low, self.high = min(self.low, low), max(self.high, high)
+        found = np.rint(values)
+        self.off = max(self.off, float(np.abs(values - found).max()))
+        return found if self._are_labels() else np.zeros(len(values))
+
+    def _are_labels(self) -> bool:
+        return max(-self.low, self.high) < 2**31 and self.off <= _ROUNDING
+
+    def check(self, path: Path) -> None:
+        """Refuse values that are no labels.
+
+        Raises:
+            InputError: some are not whole numbers, or too large.
+        """
+        if not self._are_labels():
+            raise InputError(
+                f"{path} has values between {self.low:.4g} and {self.high:.4g} that are not whole numbers, such as "
+                "probabilities; make labels of them first, by a threshold say."
+            )
 
 
 def _nifti_head(start: bytes, path: Path) -> _Head:
@@ -231,17 +317,19 @@ def _quiet_qform(header: Any) -> tuple[Any, int]:
         return None, 0
 
 
-def _read_nrrd(data: bytes, path: Path) -> tuple[npt.NDArray[Any], _Head]:
+def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple[_Head, IO[bytes]]:
+    """Return the header of a NRRD file, and a stream at its first voxel."""
     import nrrd
 
+    data = file.read(_MOST_HEADER)
     if data[:4] != b"NRRD":
         raise damaged(path, "its header is not that of a NRRD volume; export it again as .nrrd")
-    ends = [(at, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (at := data.find(blank, 0, _MOST_HEADER)) >= 0]
+    ends = [(at, len(blank)) for blank in (b"\n\n", b"\r\n\r\n") if (at := data.find(blank)) >= 0]
     if not ends:
         raise damaged(path, f"its header has no end; {CUT_SHORT}")
-    stop, blank = min(ends)
+    start = sum(min(ends))
     try:
-        fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[: stop + blank])))
+        fields: dict[str, Any] = dict(nrrd.read_header(io.BytesIO(data[:start])))
     except Exception as error:
         # What pynrrd raises of a header that was tampered with is of any kind.
         raise damaged(path, f"its header is damaged ({_brief(error)}), so export it again") from error
@@ -251,22 +339,17 @@ def _read_nrrd(data: bytes, path: Path) -> tuple[npt.NDArray[Any], _Head]:
         raise damaged(path, "its header skips a part of the data, which is not read; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
-    content = memoryview(data)[stop + blank :]
+    file.seek(start)
     if encoding == "raw":
-        _check_declared(head, len(content), 1, path)
-    elif encoding in ("gzip", "gz"):
-        _check_declared(head, len(content), _MOST_GROWTH, path)
-        with gzip.GzipFile(fileobj=io.BytesIO(content)) as stream:
-            content = memoryview(_taken(stream, head.bytes, path))
-            _taken(stream, 1, path)
-    elif encoding in ("bzip2", "bz2"):
-        _check_declared(head, _MOST_BYTES, 1, path)
-        with bz2.BZ2File(io.BytesIO(content)) as stream:
-            content = memoryview(_taken(stream, head.bytes, path))
-            _taken(stream, 1, path)
-    else:
-        raise damaged(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
-    return _voxels(content, head, path), head
+        _check_declared(head, size - start, path)
+        return head, file
+    if encoding in ("gzip", "gz"):
+        _check_declared(head, _DEFLATE_GROWTH * (size - start), path)
+        return head, cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file)))
+    if encoding in ("bzip2", "bz2"):
+        _check_declared(head, _BZIP2_SPARE + _BZIP2_GROWTH * (size - start), path)
+        return head, stack.enter_context(bz2.BZ2File(file))
+    raise damaged(path, f"its encoding is '{encoding}', but only raw, gzip and bzip2 are read; save it again")
 
 
 def _nrrd_head(fields: dict[str, Any], path: Path) -> _Head:
@@ -327,7 +410,8 @@ def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
     return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
 
 
-def _check_declared(head: _Head, available: int, growth: int, path: Path) -> None:
+def _check_declared(head: _Head, most_bytes: int, path: Path) -> None:
+    """Refuse a header that declares no voxels of labels, or more than `most_bytes`, to which its file can unpack."""
     size = " x ".join(map(str, head.shape)) or "no"
     if head.kind.kind not in "iuf":
         raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
@@ -339,38 +423,18 @@ def _check_declared(head: _Head, available: int, growth: int, path: Path) -> Non
             f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
             "by 3D Slicer",
         )
-    if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > growth * available:
+    if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > most_bytes:
         raise damaged(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
 
 
-def _voxels(content: memoryview, head: _Head, path: Path) -> npt.NDArray[Any]:
-    if len(content) < head.bytes:
-        raise damaged(path, f"it ends after {len(content):,} of {head.bytes:,} bytes of voxels; {CUT_SHORT}")
-    return np.frombuffer(content[: head.bytes], dtype=head.kind).reshape(head.shape, order="F")
-
-
-def _three(values: npt.NDArray[Any], axes: tuple[int, ...], path: Path) -> npt.NDArray[Any]:
-    """Return `values` with the `axes` of space alone, where all others have the length 1."""
-    size = " x ".join(map(str, values.shape))
-    if values.ndim < 3 or len(axes) != 3:
-        raise InputError(f"{path} has {values.ndim} dimensions ({size}), which is no volume; give one of labels.")
-    if math.prod(values.shape) != math.prod(values.shape[axis] for axis in axes):
-        raise InputError(f"{path} has {values.ndim} dimensions ({size}), more than one volume; give one of labels.")
-    return values.reshape([values.shape[axis] for axis in axes], order="F")
-
-
-def _whole(values: npt.NDArray[Any], path: Path) -> npt.NDArray[np.integer[Any]]:
-    if values.dtype.kind in "iu":
-        return values.astype(values.dtype.newbyteorder("="), copy=False)
-    low, high = float(values.min()), float(values.max())
-    if not math.isfinite(low) or not math.isfinite(high):
-        raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
-    if max(-low, high) >= 2**31 or float(np.abs(values - np.rint(values)).max()) > _ROUNDING:
-        raise InputError(
-            f"{path} has values between {low:.4g} and {high:.4g} that are not whole numbers, such as probabilities; "
-            "make labels of them first, by a threshold say."
-        )
-    return np.rint(values).astype(np.int32)
+def _three(head: _Head, path: Path) -> tuple[int, ...]:
+    """Return the lengths of the three axes of space; all others must have the length 1."""
+    size = " x ".join(map(str, head.shape))
+    if len(head.shape) < 3 or len(head.axes) != 3:
+        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is no volume; give one of labels.")
+    if math.prod(head.shape) != math.prod(head.shape[axis] for axis in head.axes):
+        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), more than one volume; give one of labels.")
+    return tuple(head.shape[axis] for axis in head.axes)
 
 
 def _sound(affine: FloatArray, path: Path) -> FloatArray:

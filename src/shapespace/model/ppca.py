@@ -170,15 +170,21 @@ def _expect(
     whole = flat.T @ flat + weighted.sum(axis=0).reshape(k + 1, k + 1)
     unseen = (patterns.missing.T.astype(np.float64) @ weighted).reshape(n, k + 1, k + 1)
     y, covariance, bound = np.ones((n, k + 1)), np.zeros((n, k + 1, k + 1)), 0.0
+    of_whole: tuple[FloatArray, FloatArray, float] | None = None
     for i in range(n):
-        hidden = W[patterns.hidden[i]].reshape(-1, k + 1)
-        square = whole - hidden.T @ hidden - unseen[i]
-        root: FloatArray = np.asarray(np.linalg.cholesky(square[:k, :k] + noise * np.eye(k)), dtype=np.float64)
-        half = np.asarray(solve_triangular(root, np.eye(k), lower=True), dtype=np.float64)
-        inverse = half.T @ half
+        # Shapes without missing vertices share one system.
+        solved = None if len(patterns.hidden[i]) else of_whole
+        if solved is None:
+            hidden = W[patterns.hidden[i]].reshape(-1, k + 1)
+            square = whole - hidden.T @ hidden - unseen[i]
+            root: FloatArray = np.asarray(np.linalg.cholesky(square[:k, :k] + noise * np.eye(k)), dtype=np.float64)
+            half = np.asarray(solve_triangular(root, np.eye(k), lower=True), dtype=np.float64)
+            solved = square, half.T @ half, float(np.log(root.diagonal()).sum())
+            of_whole = of_whole if len(patterns.hidden[i]) else solved
+        square, inverse, log_root = solved
         y[i, :k] = inverse @ (flat[:, :k].T @ centred[i].reshape(-1) - square[:k, k])
         covariance[i, :k, :k] = noise * inverse
-        bound += 0.5 * k * np.log(noise) - float(np.log(root.diagonal()).sum())
+        bound += 0.5 * k * np.log(noise) - log_root
         bound -= 0.5 * float(y[i, :k] @ y[i, :k] + covariance[i].trace())
     return y, covariance, bound
 

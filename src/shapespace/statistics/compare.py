@@ -58,8 +58,6 @@ class CompareOptions:
         squares: one of `TYPES`.
         blocks: column with the subject of each scan, whose responses to all conditions within subjects may differ; None
             takes all shapes for independent.
-        random: the effects within subjects that differ between subjects, such as `1 + time | subject`, instead of
-            `blocks`; all others are assumed to be the same in all subjects. None for all effects.
         permutations: arrangements, the observed one among them.
         seed: of the arrangements.
         maps: whether to test each vertex.
@@ -67,6 +65,8 @@ class CompareOptions:
             vary anyway; None does not. It is for fits, whose model knows how shapes vary.
         level: of significance.
         drop_missing: leave out shapes of which something in the formula is missing, and say so.
+        random: the effects within subjects that differ between subjects, such as `1 + time | subject`, instead of
+            `blocks`; all others are assumed to be the same in all subjects. None for all effects.
         unequal_variances: test with a variance for each subject and sign flips of residuals, which allows classes whose
             dispersion differs. F is then the squared effect divided by its variance.
         effect_size: transformation of F before Z is standardised, one of `EFFECT_SIZES`.
@@ -74,13 +74,13 @@ class CompareOptions:
 
     squares: SquaresType = "II"
     blocks: str | None = None
-    random: str | None = None
     permutations: int = 1000
     seed: int = 0
     maps: bool = True
     bump_width_mm: float | None = None
     level: float = 0.05
     drop_missing: bool = False
+    random: str | None = None
     unequal_variances: bool = False
     effect_size: EffectSize = "box-cox"
 

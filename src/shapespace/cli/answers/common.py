@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def add_cohort(sub: argparse.ArgumentParser, surfaces: str = "auto") -> None:
     """Add the arguments that name a cohort, and where the answer is written; `surfaces` is a default."""
     sub.add_argument("data", type=Path, metavar="DATA",
-                     help="a CSV table whose column file, scan, name or id names a shape in each row; or a folder of "
-                     "fits, whose metadata are the table")  # fmt: skip
+                     help="a table (CSV or .xlsx) whose column file, scan, specimen, name or id names a shape in each "
+                     "row; or a folder of fits, whose metadata are the table")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
     sub.add_argument("--shapes", type=Path, metavar="DIR",
                      help="results of fits, or meshes in correspondence (default: the folder of DATA)")  # fmt: skip

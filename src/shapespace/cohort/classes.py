@@ -1,0 +1,83 @@
+"""Classes of a table that may be misspelt: their counts, classes of one shape, and classes that are nearly the same."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+
+from shapespace.cohort.table import Table, is_number
+
+_LISTED = 12
+"""Classes whose counts are listed, the largest first."""
+_COMPARED = 60
+"""Classes of which every two are compared letter by letter; columns with more hold names."""
+_LONG = 5
+"""Letters from which words that differ in one are likely to be the same; shorter ones such as left and lent are not."""
+
+
+def class_notes(table: Table, columns: Iterable[str]) -> tuple[str, ...]:
+    """Return sentences on the classes in some columns of a table; none on columns of numbers.
+
+    Raises:
+        InputError: there is no such column.
+    """
+    return tuple(note for column in dict.fromkeys(columns) for note in notes_on_classes(column, table.texts(column)))
+
+
+def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
+    """Return the number of shapes in each class, and sentences on classes that may be misspelt.
+
+    Where more than half of all shapes have a class of their own, the column holds names, whose counts are not listed.
+
+    Args:
+        column: its name.
+        cells: of all shapes; missing ones are empty.
+    """
+    counts = Counter(cell for cell in cells if cell)
+    total = counts.total()
+    if not total or 2 * sum(count for cell, count in counts.items() if is_number(cell)) > total:
+        return []
+    has_names = 2 * len(counts) > total
+    notes: list[str] = []
+    if not has_names:
+        listed = counts.most_common(_LISTED)
+        rest = f" and {len(counts) - _LISTED} more classes" if len(counts) > _LISTED else ""
+        notes.append(f"Shapes in each class of {column}: {', '.join(f'{name} {n}' for name, n in listed)}{rest}.")
+        alone = [name for name, count in counts.items() if count == 1]
+        if alone:
+            shown = ", ".join(repr(name[:40]) for name in alone[:3]) + (" ..." if len(alone) > 3 else "")
+            notes.append(
+                f"{column} has {len(alone)} {'class' if len(alone) == 1 else 'classes'} with one shape ({shown}); "
+                "check the spelling, or leave these shapes out."
+            )
+    for first, other, difference in _similar(list(counts), letters=not has_names):
+        notes.append(
+            f"{column} has the classes {first[:40]!r} ({counts[first]}) and {other[:40]!r} ({counts[other]}), which "
+            f"differ only in {difference}; correct the table if they are the same."
+        )
+    return notes
+
+
+def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str]]:
+    """Return pairs of names that are nearly the same, and in what they differ."""
+    plain: dict[str, list[str]] = {}
+    for name in names:
+        plain.setdefault("".join(name.casefold().split()), []).append(name)
+    found = [(group[0], other, "case or white space") for group in plain.values() for other in group[1:]]
+    if letters and len(plain) <= _COMPARED:
+        found += [
+            (plain[one][0], plain[other][0], "one letter")
+            for one, other in combinations(plain, 2)
+            if max(len(one), len(other)) >= _LONG and (one + other).isalpha() and _one_edit(one, other)
+        ]
+    return found
+
+
+def _one_edit(one: str, other: str) -> bool:
+    """Return whether inserting, removing or replacing one letter, or exchanging two neighbours, makes one the other."""
+    start = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+    rest, left = one[start:], other[start:]
+    replaced = rest[1:] == left[1:]
+    exchanged = rest[:2] == left[:2][::-1] and rest[2:] == left[2:]
+    return replaced or exchanged or rest[1:] == left or rest == left[1:]
