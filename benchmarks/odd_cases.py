@@ -22,8 +22,10 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
@@ -82,6 +84,7 @@ VARIANTS: Mapping[str, tuple[Variant, ...]] = {
     "hippocampus": (Variant(12, 6), Variant(24), Variant(24, None, "form"), Variant(24, 10)),
 }  # fmt: skip
 _FACE_TRIANGLES = 3_000
+_BATCH = 40
 _TRAINING, _ORGAN_VERTICES = 24, {"spleen": 1_200, "hippocampus": 1_000}
 
 
@@ -129,6 +132,12 @@ class Family:
                 model.save(path)
             self._models[variant] = ShapeModel.load(path)
         return self._models[variant]
+
+    @property
+    def largest(self) -> ShapeModel:
+        """The model of most shapes, with all of its modes."""
+        variants = VARIANTS[self.name]
+        return self.model(max(variants, key=lambda v: (v.representation == "vertices", v.modes is None, v.shapes)))
 
     @cached_property
     def _coarse(self) -> tuple[Any, Any]:
@@ -212,9 +221,13 @@ def draw(family_named: Callable[[str], Family], kind: Kind, seed: int, index: in
     inside = kind == "good" and (variant.shapes <= 12 or rng.random() < 0.2)
     details: list[str] = []
 
+    # The true vertices of an organ are those of a registration, which errs; those of a shape of a model are exact.
+    exact = kind == "good" and family.name in _ORGAN_VERTICES
+
     def shape() -> Mesh:
-        if inside:
-            return model.mesh(np.clip(rng.standard_normal(model.n_modes), -2.5, 2.5) * model.stddev)
+        if inside or exact:
+            source = model if inside else family.largest
+            return source.mesh(np.clip(rng.standard_normal(source.n_modes), -2.5, 2.5) * source.stddev)
         return family.draw(rng)
 
     noise = size * float(rng.uniform(0.001, 0.004))
@@ -242,8 +255,7 @@ def draw(family_named: Callable[[str], Family], kind: Kind, seed: int, index: in
         details.append(thing)
     elif case == "far":
         # Half of them are far out for a larger model of the family, and may leave the span of the one that is fitted.
-        largest = max(VARIANTS[family.name], key=lambda v: (v.representation == "vertices", v.shapes, v.modes is None))
-        source = model if rng.random() < 0.5 else family.model(largest)
+        source = model if rng.random() < 0.5 else family.largest
         z = np.zeros(source.n_modes)
         leading = min(int(rng.integers(1, 4)), source.n_modes)
         z[:leading] = rng.standard_normal(leading)
@@ -425,26 +437,53 @@ def records(path: Path) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def measure(path: Path, cache: Path, wanted: Mapping[Kind, int], seed: int) -> None:
+_families: dict[str, Family] = {}
+_cache = Path()
+
+
+def prepare(cache: Path) -> None:
+    """Set up a process that fits cases."""
+    global _cache
+    _cache = cache
+    threadpool_limits(1)
+
+
+def family_named(name: str) -> Family:
+    """Return the family of this process."""
+    if name not in _families:
+        _families[name] = Family(name, _cache)
+    return _families[name]
+
+
+def measured(task: tuple[Kind, int, int]) -> dict[str, Any]:
+    """Return the record of the case of a kind, a seed and an index."""
+    kind, seed, index = task
+    return {"kind": kind, "seed": seed, "index": index, **judge(draw(family_named, kind, seed, index))}
+
+
+def measure(path: Path, cache: Path, wanted: Mapping[Kind, int], seed: int, jobs: int) -> None:
     """Append the missing records to `path`: so many odd cases, and good ones until so many of their fits are right."""
     done = {(r["kind"], r["index"]): r["wrong"] for r in records(path) if r["seed"] == seed}
-    families: dict[str, Family] = {}
-
-    def family(name: str) -> Family:
-        return families.setdefault(name, families.get(name) or Family(name, cache))
-
+    prepare(cache)
+    for name in FAMILIES:
+        for variant in (*FEW, *VARIANTS[name]):
+            family_named(name).model(variant)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as out:
+    with (
+        path.open("a", encoding="utf-8") as out,
+        ProcessPoolExecutor(jobs, get_context("spawn"), prepare, (cache,)) as pool,
+    ):
         for kind, count in wanted.items():
-            index = counted = 0
+            first, counted = 0, 0
             while counted < count:
-                if (kind, index) not in done:
-                    record = {"kind": kind, "seed": seed, "index": index, **judge(draw(family, kind, seed, index))}
-                    done[kind, index] = record["wrong"]
+                indices = range(first, first + min(_BATCH, count - counted))
+                tasks = [(kind, seed, index) for index in indices if (kind, index) not in done]
+                for record in pool.map(measured, tasks):
+                    done[kind, record["index"]] = record["wrong"]
                     out.write(json.dumps(record, default=float) + "\n")
                     out.flush()
-                counted += kind == "odd" or not done[kind, index]
-                index += 1
+                counted += sum(kind == "odd" or not done[kind, index] for index in indices)
+                first = indices.stop
 
 
 def table(found: Sequence[Mapping[str, Any]]) -> str:
@@ -484,11 +523,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--results", type=Path, default=Path("bench-out/odd_cases.jsonl"))
     parser.add_argument("--cache", type=Path, default=Path("bench-out/odd_cases"), help="of models and surfaces")
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--report", action="store_true", help="print the table of the records measured so far")
     options = parser.parse_args()
     if not options.report:
-        threadpool_limits(1)
-        measure(options.results, options.cache, {"odd": options.odd, "good": options.good}, options.seed)
+        wanted: dict[Kind, int] = {"odd": options.odd, "good": options.good}
+        measure(options.results, options.cache, wanted, options.seed, options.jobs)
     found = [r for r in records(options.results) if r["seed"] == options.seed]
     print(table(found), misjudged(found), sep="\n\n")
 

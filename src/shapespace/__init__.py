@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from shapespace.fit.result import FitResult
     from shapespace.fit.robust_method import Robust
     from shapespace.geometry.distance import surface_distances
+    from shapespace.geometry.landmarks import place_landmarks
     from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
     from shapespace.io.beside import as_mesh
     from shapespace.io.landmarks import read_landmarks
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from shapespace.statistics.regression import Regression, regress
     from shapespace.statistics.score import ScoreOptions, Scores, score
     from shapespace.store.results import Results
-    from shapespace.types import LabelVolume, Mesh, Similarity
+    from shapespace.types import LabelVolume, Mesh, Similarity, SurfaceLandmarks
 
 __all__ = [
     "CLASSIFIERS",
@@ -70,6 +71,7 @@ __all__ = [
     "ShapeSpace",
     "ShapespaceError",
     "Similarity",
+    "SurfaceLandmarks",
     "VolumeSurface",
     "__version__",
     "as_mesh",
@@ -81,6 +83,7 @@ __all__ = [
     "load_faces",
     "measure_asymmetry",
     "measure_quality",
+    "place_landmarks",
     "read_cohort",
     "read_landmarks",
     "read_mesh",
@@ -124,6 +127,7 @@ _HOMES = {
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
     "Similarity": "types",
+    "SurfaceLandmarks": "types",
     "as_mesh": "io.beside",
     "change": "statistics.change",
     "compare": "statistics.compare",
@@ -134,6 +138,7 @@ _HOMES = {
     "load_faces": "datasets.faces",
     "measure_asymmetry": "statistics.asymmetry",
     "measure_quality": "model.quality",
+    "place_landmarks": "geometry.landmarks",
     "read_cohort": "cohort.read",
     "read_landmarks": "io.landmarks",
     "read_mesh": "io.meshes",

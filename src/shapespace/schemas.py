@@ -393,6 +393,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
         moved_share: RMS by which vertices moved in each round, as a share of its size.
         cpu_s: of each round.
         landmark_rms: distance of its landmarks from their places on the surface.
+        landmark_distances: name -> distance of each given landmark from the surface of the scan, in its unit.
         metadata: by the columns of the list that named it.
     """
 
@@ -422,6 +423,7 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
     moved_share: list[float] = []
     cpu_s: list[float] = []
     landmark_rms: float | None = None
+    landmark_distances: Mapping[str, float] = {}
     metadata: Mapping[str, str | int | float | None] = {}
     format: str = FORMAT
     format_version: int = VERSION

@@ -7,8 +7,9 @@ which are in the file's own unit until the fit has found that unit.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
@@ -29,6 +30,11 @@ MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm"
 
 GREY = 128
 """Red, green and blue of vertices without a colour, where others of their surface have one."""
+
+
+_MOST_VERTICES = int(np.iinfo(np.int32).max)
+_FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
+"""By which the sum of barycentric coordinates may differ from 1: as written with few digits, and by rounding."""
 
 
 def read_only(array: npt.ArrayLike) -> FloatArray:
@@ -164,6 +170,178 @@ class Mesh:
             ShapespaceError: menpo is not installed.
         """
         return late("to_menpo")(self)
+
+
+def _no_corners() -> IntArray:
+    return np.empty((0, 3), dtype=np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLandmarks(Mapping[str, int]):
+    """Named points on a surface, each in a triangle by barycentric coordinates.
+
+    They stand for the same places on every surface with these vertices: `positions` returns them. As a mapping, it is
+    name -> nearest vertex (the corner with the largest barycentric coordinate), for uses that need a vertex.
+
+    Args:
+        names: of the L landmarks, all different.
+        corners: (L, 3) int32, the vertices of the triangle of each; they are put in order of falling coordinates. A
+            landmark at a vertex has that vertex three times.
+        barycentric: (L, 3) float64 coordinates in that triangle: not negative, with the sum 1.
+        distance_mm: (L,) float64, how far the point that was given lay from the surface; 0 for one given on it. Empty
+            for 0 of all.
+
+    Raises:
+        InputError: arrays whose shapes do not belong together, repeated names, or coordinates that are not barycentric.
+    """
+
+    names: tuple[str, ...] = ()
+    corners: IntArray = field(default_factory=_no_corners)
+    barycentric: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    distance_mm: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        names = tuple(str(name) for name in self.names)
+        count = len(names)
+        corners, weights = np.array(self.corners, dtype=np.int64), np.array(self.barycentric, dtype=np.float64)
+        distance = np.array(self.distance_mm, dtype=np.float64) if len(self.distance_mm) else np.zeros(count)
+        if len(set(names)) < count:
+            raise InputError("Two landmarks have the same name; rename one.")
+        if corners.shape != (count, 3) or weights.shape != (count, 3) or distance.shape != (count,):
+            raise InputError(
+                f"{count} landmarks need corners ({count}, 3), barycentric coordinates ({count}, 3) and distances "
+                f"({count},), not {corners.shape}, {weights.shape} and {distance.shape}."
+            )
+        within = bool(((weights >= 0) & (weights <= 1.0 + _FEW_DIGITS)).all())
+        total = weights.sum(axis=1, keepdims=True) if within else np.zeros((count, 1))
+        if not (within and (np.abs(total - 1.0) <= _FEW_DIGITS).all()):
+            raise InputError("Barycentric coordinates of landmarks must not be negative, with the sum 1.")
+        # What differs by rounding alone stays as it is, so that it is the same again once it was written and read.
+        weights = np.where(np.abs(total - 1.0) > _ROUNDING, weights / total, weights)
+        if not (np.isfinite(distance).all() and (distance >= 0).all()):
+            raise InputError("Distances of landmarks from the surface must be finite and not negative.")
+        order = np.argsort(-weights, axis=1, kind="stable")
+        corners, weights = np.take_along_axis(corners, order, axis=1), np.take_along_axis(weights, order, axis=1)
+        for name, low, high in zip(names, corners.min(axis=1), corners.max(axis=1), strict=True):
+            if low < 0 or high > _MOST_VERTICES:
+                raise InputError(
+                    f"Landmark {name!r} is at vertex {low if low < 0 else high}, which the model does not have."
+                )
+        # A corner without weight may be missing from the surface, and must not matter.
+        corners = np.where(weights > 0, corners, corners[:, :1]).astype(np.int32)
+        for array in (corners, weights, distance):
+            array.setflags(write=False)
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "corners", corners)
+        object.__setattr__(self, "barycentric", weights)
+        object.__setattr__(self, "distance_mm", distance)
+
+    __repr__ = short_repr
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Plain values, as of `Mesh`.
+        return {one.name: getattr(self, one.name) for one in dataclasses.fields(self)} | {"names": list(self.names)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
+    def __getitem__(self, name: str) -> int:
+        return self._nearest[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SurfaceLandmarks):
+            return self.are_vertices and dict(self) == other
+        return self.names == other.names and all(
+            np.array_equal(getattr(self, array), getattr(other, array))
+            for array in ("corners", "barycentric", "distance_mm")
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @staticmethod
+    def of(landmarks: Mapping[str, int]) -> SurfaceLandmarks:
+        """Return `landmarks` themselves, or those at vertices where they are a mapping of name to vertex."""
+        if isinstance(landmarks, SurfaceLandmarks):
+            return landmarks
+        vertex = np.array([int(vertex) for vertex in landmarks.values()], dtype=object).reshape(-1, 1)
+        for name, (at,) in zip(landmarks, vertex, strict=True):
+            if not 0 <= at <= _MOST_VERTICES:
+                raise InputError(f"Landmark {str(name)!r} is at vertex {at}, which the model does not have.")
+        weights = np.zeros((len(vertex), 3))
+        weights[:, 0] = 1.0
+        return SurfaceLandmarks(tuple(map(str, landmarks)), np.repeat(vertex, 3, axis=1).astype(np.int32), weights)
+
+    @property
+    def are_vertices(self) -> bool:
+        """Whether each landmark was given as a vertex: it is exactly at one, at no distance from the surface."""
+        return bool((self.barycentric[:, 0] == 1.0).all()) and not self.distance_mm.any()
+
+    def interpolate(self, values: npt.ArrayLike) -> FloatArray:
+        """Return values of the vertices at the landmarks.
+
+        Args:
+            values: (V, ...) of the vertices, such as their positions (V, 3).
+
+        Returns:
+            (L, ...) float64.
+        """
+        there = np.asarray(values)[self.corners]
+        return np.asarray(np.einsum("lc,lc...->l...", self.barycentric, there), dtype=np.float64)
+
+    def positions(self, vertices: npt.ArrayLike) -> dict[str, FloatArray]:
+        """Return name -> (3,) position on the surface with these `vertices` (V, 3)."""
+        return dict(zip(self.names, self.interpolate(vertices), strict=True))
+
+    def select(self, names: Sequence[str]) -> SurfaceLandmarks:
+        """Return the landmarks of these `names`, in that order."""
+        rows = [self.names.index(name) for name in names]
+        return SurfaceLandmarks(tuple(names), self.corners[rows], self.barycentric[rows], self.distance_mm[rows])
+
+    def joined(self, *others: SurfaceLandmarks) -> SurfaceLandmarks:
+        """Return these landmarks followed by `others`, of other names.
+
+        Raises:
+            InputError: a name is in two of them.
+        """
+        parts = (self, *others)
+        return SurfaceLandmarks(
+            tuple(name for part in parts for name in part.names),
+            np.concatenate([part.corners for part in parts]),
+            np.concatenate([part.barycentric for part in parts]),
+            np.concatenate([part.distance_mm for part in parts]),
+        )
+
+    def within(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
+        """Return the landmarks that depend on no other vertices than those marked in `vertices` (V,) bool."""
+        marked: BoolArray = np.asarray(vertices, dtype=np.bool_)[self.corners]
+        rows = np.asarray(marked.all(axis=1))
+        return self.select([name for name, is_inside in zip(self.names, rows, strict=True) if is_inside])
+
+    def renumbered(self, vertices: npt.ArrayLike) -> SurfaceLandmarks:
+        """Return the same in the numbers that vertices have when only those marked in `vertices` (V,) bool remain."""
+        kept = self.within(vertices)
+        number = np.cumsum(np.asarray(vertices, dtype=np.bool_)) - 1
+        return dataclasses.replace(kept, corners=number[kept.corners].astype(np.int32))
+
+    def check(self, n_vertices: int) -> None:
+        """Refuse landmarks on vertices that a surface of `n_vertices` does not have.
+
+        Raises:
+            InputError: it does not have one of their vertices.
+        """
+        for name, corner in zip(self.names, self.corners.max(axis=1), strict=True):
+            if corner >= n_vertices:
+                raise InputError(f"Landmark {name!r} is at vertex {corner}, which the model does not have.")
+
+    @cached_property
+    def _nearest(self) -> Mapping[str, int]:
+        return dict(zip(self.names, self.corners[:, 0].tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -259,6 +259,28 @@ def test_build_takes_landmarks_as_points_on_the_first_mesh(run: Run, world: Worl
     assert dict(ShapeModel.load(tmp_path / "m.h5").landmarks) == {"nose": 17, "chin": 200}
 
 
+def test_build_keeps_points_between_vertices_and_says_how_far_they_were(run: Run, world: World, tmp_path: Path) -> None:
+    first = read_mesh(world.meshes / "blob_00.ply")
+    face = np.asarray(first.faces)[5]
+    a, b, c = first.vertices[face]
+    normal = np.cross(b - a, c - a) / np.linalg.norm(np.cross(b - a, c - a))
+    middle = (a + b + c) / 3
+    write_landmarks(tmp_path / "points.csv", {"on": middle, "off": 0.5 * (a + b) + 0.2 * c - 0.2 * a + 3.0 * normal})
+    asked = ("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", 2, "--landmarks")
+    outcome = run(*asked, tmp_path / "points.csv")
+    assert outcome.code == 0
+    assert "Landmarks were placed on the surface of blob_00.ply; the given points are 1.5 mm from it" in outcome.err
+    assert "at most 3 mm (off)" in outcome.err and "Warning" not in outcome.err
+    model = ShapeModel.load(tmp_path / "m.h5")
+    np.testing.assert_allclose(model.landmarks.positions(first.vertices)["on"], middle, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(model.landmarks.distance_mm, [0.0, 3.0], atol=1e-9)
+    facts = run("info", tmp_path / "m.h5", "--json").facts
+    assert facts["landmark_distances_mm"]["off"] == pytest.approx(3.0)
+    write_landmarks(tmp_path / "metres.csv", {"on": middle / 1000, "off": middle + 900 * normal})
+    far = run(*asked, tmp_path / "metres.csv").err
+    assert "Warning: 2 landmarks are farther from that surface than 1 % of its size" in far and "the unit" in far
+
+
 def test_info_knows_meshes_and_fits(run: Run, world: World, fitted: Path) -> None:
     mesh = run("info", world.scan, "--json").facts
     assert mesh["kind"] == "mesh" and mesh["vertices"] == 1000

@@ -10,7 +10,7 @@ import pytest
 from conftest import Run
 from raw_blobs import LANDMARKS, marked, raw_blob
 from shapespace.cli import main
-from shapespace.io.landmarks import write_landmarks
+from shapespace.io.landmarks import read_surface_landmarks, write_landmarks
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
@@ -126,8 +126,14 @@ def test_landmarks_in_files_named_as_the_scans_go_on_into_the_model(run: Run, ra
     )
     record = json.loads((tmp_path / "same" / "blob0.correspond.json").read_text("utf-8"))
     assert 0 <= record["landmark_rms"] < 15
+    assert set(record["landmark_distances"]) == set(LANDMARKS)
+    assert "The given landmarks of 2 scans are " in outcome.err and "on the corresponding surfaces" in outcome.err
     assert run("build", tmp_path / "same", "-o", tmp_path / "model.h5").code == 0
-    assert set(ShapeModel.load(tmp_path / "model.h5").landmarks) == set(LANDMARKS)
+    model = ShapeModel.load(tmp_path / "model.h5")
+    assert set(model.landmarks) == set(LANDMARKS)
+    # They are where the correspondence has them on its mean, between vertices.
+    assert model.landmarks == read_surface_landmarks(tmp_path / "same" / "landmarks.csv")
+    assert not model.landmarks.are_vertices
 
 
 def test_a_model_to_begin_with_and_landmarks_of_nobody(run: Run, raw: Path, same: Path, tmp_path: Path) -> None:

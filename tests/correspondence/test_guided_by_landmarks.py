@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places, agreed, astray
+from shapespace.correspondence.landmarks import Marks, agreed, astray
 from shapespace.correspondence.mirror import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
@@ -18,8 +18,9 @@ from shapespace.correspondence.rounds import CorrespondSettings, correspond, fir
 from shapespace.correspondence.template import Glance, choose
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.types import FloatArray, Mesh, Similarity
+from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 from synthetic_shapes import blob, sphere, training_meshes
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
@@ -86,7 +87,7 @@ def test_the_pull_is_the_posterior_mean_of_a_gaussian_process() -> None:
     mesh = Mesh(blob(directions, np.zeros(5)), faces)
     harmonics, where, rng = Harmonics.of(mesh, 60), np.array([3, 80, 200]), np.random.default_rng(0)
     points = mesh.vertices[where] + rng.standard_normal((3, 3))
-    places = Places.on(mesh, {str(k): mesh.vertices[k] for k in where})
+    places = place_landmarks(mesh, {str(k): mesh.vertices[k] for k in where})
     moved = Marks(places, points, 0.02).pull(mesh.vertices, harmonics, 20.0, 80.0)
     kernel = harmonics.functions @ np.diag(harmonics.kept(20.0)) @ harmonics.functions.T
     noise = (0.02 * 80.0 / 10.0) ** 2 * kernel[where, where].mean()
@@ -98,7 +99,7 @@ def test_landmarks_tell_the_pose_or_why_they_cannot() -> None:
     directions, faces = sphere(300)
     mesh = Mesh(blob(directions, np.zeros(5)), faces)
     points = {str(k): mesh.vertices[k] for k in (5, 60, 150, 290)}
-    places = Places.on(mesh, points)
+    places = place_landmarks(mesh, points)
     T = Similarity(0.4, Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), np.array([5.0, 0.0, -3.0]))
     pose = Marks(places, T.apply(np.stack(list(points.values()))), 0.02).pose(mesh.vertices)
     np.testing.assert_allclose(pose.apply(mesh.vertices), T.apply(mesh.vertices), atol=1e-6)
@@ -107,8 +108,8 @@ def test_landmarks_tell_the_pose_or_why_they_cannot() -> None:
         Marks(places, image, 0.02).pose(mesh.vertices)
     with pytest.raises(InputError, match="check their names"):
         Marks(places, image[[2, 0, 3, 1]] * [3.0, 1.0, 1.0], 0.02).pose(mesh.vertices)
-    two = places.of(["5", "60"])
-    assert Marks(two, two.at(mesh.vertices), 0.02).pose(mesh.vertices) is None
+    two = places.select(["5", "60"])
+    assert Marks(two, two.interpolate(mesh.vertices), 0.02).pose(mesh.vertices) is None
 
 
 def test_landmarks_as_good_as_on_a_line_tell_no_pose() -> None:
@@ -117,8 +118,8 @@ def test_landmarks_as_good_as_on_a_line_tell_no_pose() -> None:
     poles = [directions[:, 1].argmax(), directions[:, 1].argmin()]
     ends = mesh.vertices[poles]
     middle = ends.mean(axis=0) + np.array([0.5, 0.0, 0.0])
-    places = Places(("a", "b", "c"), np.array([[poles[0]] * 3, [poles[1]] * 3, [*poles, 0]]), np.full((3, 3), 1 / 3))
-    line = replace(places, weights=np.array([[1.0, 0, 0], [1.0, 0, 0], [0.495, 0.495, 0.01]]))
+    corners = np.array([[poles[0]] * 3, [poles[1]] * 3, [*poles, 0]])
+    line = SurfaceLandmarks(("a", "b", "c"), corners, np.array([[1.0, 0, 0], [1.0, 0, 0], [0.495, 0.495, 0.01]]))
     assert Marks(line, np.stack([*ends, middle]), 0.02).pose(mesh.vertices) is None
     assert Marks(line, np.stack([*ends, middle]), 1e-6).pose(mesh.vertices) is not None
 
@@ -147,10 +148,10 @@ def test_a_template_whose_landmarks_have_wrong_names_does_not_set_the_others_asi
     assert first_template(scans, marked(blobs[4]), SETTINGS).mesh.landmarks
 
 
-def _bench(template: Mesh) -> tuple[Workbench, Places]:
+def _bench(template: Mesh) -> tuple[Workbench, SurfaceLandmarks]:
     harmonics = Harmonics.of(template, QUICK.harmonics)
     names = {name: template.vertices[(template.vertices @ np.array(at)).argmax()] for name, at in LANDMARKS.items()}
-    return Workbench(template, harmonics, (Glance.of(template),), 0), Places.on(template, names)
+    return Workbench(template, harmonics, (Glance.of(template),), 0), place_landmarks(template, names)
 
 
 def test_landmarks_correct_a_pose_that_was_found_without_them() -> None:
@@ -158,7 +159,7 @@ def test_landmarks_correct_a_pose_that_was_found_without_them() -> None:
     mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
     bench, places = _bench(mesh)
     over = Similarity(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    marks = Marks(places, places.at(mesh.vertices), 0.1)
+    marks = Marks(places, places.interpolate(mesh.vertices), 0.1)
     placed = bench.place(PlaceTask(0, mesh, over, mesh.vertices, SHORT, marks=marks))
     assert np.trace(placed.T_scan_template.rotation) > 2.9
 
@@ -168,7 +169,7 @@ def test_landmarks_of_another_size_than_their_scan_are_named() -> None:
     mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
     bench, places = _bench(mesh)
     placed = bench.place(
-        PlaceTask(0, mesh, None, None, QUICK, marks=Marks(places, places.at(mesh.vertices) / 1000, 0.02))
+        PlaceTask(0, mesh, None, None, QUICK, marks=Marks(places, places.interpolate(mesh.vertices) / 1000, 0.02))
     )
     assert "look at their unit" in placed.reason
 
@@ -191,15 +192,15 @@ def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     mean = Mesh(np.mean(shapes, axis=0), faces)
     told = [(x, {"a": x[7], "b": x[90]} if k else {"a": x[40]}) for k, x in enumerate(shapes)]
     places = agreed(mean, told)
-    np.testing.assert_allclose(places.of(["a", "b"]).at(mean.vertices), mean.vertices[[7, 90]], atol=1e-6)
+    np.testing.assert_allclose(places.select(["a", "b"]).interpolate(mean.vertices), mean.vertices[[7, 90]], atol=1e-6)
 
 
 def test_landmarks_in_one_place_that_are_quite_sure_pull_as_one(blobs: list[RawBlob]) -> None:
     directions, faces = sphere(300)
     mesh = Mesh(blob(directions, np.zeros(5)), faces)
     harmonics, at = Harmonics.of(mesh, 60), mesh.vertices[5]
-    twice = Marks(Places.on(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
-    once = Marks(Places.on(mesh, {"a": at}), at[None] + 1.0, 1e-300)
+    twice = Marks(place_landmarks(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
+    once = Marks(place_landmarks(mesh, {"a": at}), at[None] + 1.0, 1e-300)
     x = mesh.vertices
     np.testing.assert_allclose(twice.pull(x, harmonics, 20.0, 80.0), once.pull(x, harmonics, 20.0, 80.0), atol=1e-3)
     for uncertainty in (0.0, np.nan, -1.0):
@@ -215,7 +216,8 @@ def test_shapes_that_are_wrongly_placed_do_not_move_landmarks() -> None:
     marks = [*wrong, right, right, {"c": 30}]
     told = [(x, {name: x[k] for name, k in one.items()}) for x, one in zip(shapes, marks, strict=True)]
     places = agreed(mean, told)
-    np.testing.assert_allclose(places.of(["a", "b", "c"]).at(mean.vertices), mean.vertices[[7, 150, 30]], atol=1e-6)
+    found = places.select(["a", "b", "c"]).interpolate(mean.vertices)
+    np.testing.assert_allclose(found, mean.vertices[[7, 150, 30]], atol=1e-6)
 
 
 def test_a_model_to_begin_with_gives_its_triangles_and_what_it_knows(blobs: list[RawBlob]) -> None:

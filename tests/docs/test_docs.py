@@ -15,7 +15,7 @@ import sys
 import tomllib
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -534,6 +534,7 @@ def test_the_reference_lists_every_column_of_the_table(tmp_path: Path) -> None:
 def test_the_model_file_holds_what_its_document_lists(tmp_path: Path) -> None:
     import h5py
 
+    from shapespace.types import SurfaceLandmarks
     from synthetic_shapes import blob_model
 
     blob_model().save(tmp_path / "model.h5")
@@ -541,6 +542,11 @@ def test_the_model_file_holds_what_its_document_lists(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "model.h5") as file:
         assert sorted(code_in(row[0])[0] for row in rows(document, "Datasets")) == sorted(file)
         assert sorted(code_in(row[0])[0] for row in rows(document, "Attributes")) == sorted(file.attrs)
+        version_1 = set(file)
+    between = SurfaceLandmarks(("a",), np.array([[1, 2, 3]]), np.full((1, 3), 1 / 3))
+    replace(blob_model(), landmarks=between).save(tmp_path / "version_2.h5")
+    with h5py.File(tmp_path / "version_2.h5") as file:
+        assert {code_in(row[0])[0] for row in rows(document, "Datasets of landmarks")} == set(file) - version_1
 
 
 def test_public_names_are_in_the_readme_example_or_the_architecture() -> None:

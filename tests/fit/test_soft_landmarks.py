@@ -9,8 +9,10 @@ from shapespace.datasets.organs import Organ
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig, FitResult, fit_scan
+from shapespace.fit.marks import Marks
+from shapespace.fit.moving_model import MovingSurface, prepare
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan, similarity, sphere
 
 MM = FitConfig(unit="mm")
@@ -107,3 +109,67 @@ def test_a_standard_deviation_that_cannot_be_is_refused() -> None:
     for bad in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="positive standard deviation"):
             FitConfig(landmark_stddev_mm=bad)
+
+
+def off_vertex(model: ShapeModel, count: int = 6) -> SurfaceLandmarks:
+    """Return landmarks well inside triangles of `model`."""
+    rng = np.random.default_rng(4)
+    faces = np.asarray(model.faces)[rng.choice(len(np.asarray(model.faces)), count, replace=False)]
+    return SurfaceLandmarks(tuple(f"p{k}" for k in range(count)), faces, 0.2 + 0.4 * rng.dirichlet(np.ones(3), count))
+
+
+def test_the_term_of_landmarks_between_vertices_has_the_jacobian_of_their_places() -> None:
+    model = replace(blob_model(300), landmarks=off_vertex(blob_model(300)))
+    prepared, b = prepare(model), 0.3 * model.stddev
+    surface = MovingSurface(prepared.topology, model.mean_vertices, prepared.modes)
+    T, rng = similarity(3, 15.0, 1.3), np.random.default_rng(0)
+
+    def points_at(b: FloatArray) -> FloatArray:
+        return T.apply(model.landmarks.interpolate(model.reconstruct(b)))
+
+    surface.deform(b)
+    aim = points_at(b) + rng.normal(0, 2.0, (6, 3))
+    marks = Marks.of(model, dict(zip(model.landmarks, aim, strict=True)), 2.0)
+    assert marks is not None
+    np.testing.assert_allclose(marks.off_mm(surface, T), np.linalg.norm(points_at(b) - aim, axis=1), atol=1e-3)
+    hessian, gradient = marks.equations(surface, T, model.n_modes)
+    # The weights are held in a step, so differences of the weighted squares are those of the linear residual.
+    off = (points_at(b) - aim) / T.scale
+    distance = np.linalg.norm(off, axis=1)
+    stddev = 2.0 / T.scale
+    width = 3.0 * max(stddev, min(1.48 * float(np.median(distance)), marks.far_mm))
+    weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
+    steps = 1e-3 * np.eye(model.n_modes)
+    moved = np.stack([(points_at(b + step) - points_at(b - step)) / (2e-3 * T.scale) for step in steps])
+    turned = off @ T.rotation
+    np.testing.assert_allclose(gradient[7:], np.einsum("kld,ld,l->k", moved, off, weight), rtol=1e-4)
+    np.testing.assert_allclose(hessian[7:, 7:], np.einsum("kld,mld,l->km", moved, moved, weight), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(gradient[3:6], weight @ turned, rtol=1e-4)
+
+
+def test_landmarks_between_vertices_are_recovered_between_vertices() -> None:
+    model = replace(blob_model(700), landmarks=off_vertex(blob_model(700)))
+    off_mm, snapped_mm, share = [], [], []
+    for k, z in enumerate(np.random.default_rng(8).uniform(-1.0, 1.0, (3, 5))):
+        pose = similarity(k, 20.0, 1.0)
+        raw = raw_scan(z, pose, vertices=4000, model_vertices=700, noise_mm=1.5)
+        truth = model.landmarks.positions(raw.truth)
+        result = fit_scan(model, raw.scan, MM, landmarks=truth)
+        assert result.start == "landmarks" and result.landmark_stddev_mm is not None
+        at = np.stack([result.landmarks[name] for name in model.landmarks])
+        true = np.stack([truth[name] for name in model.landmarks])
+        off_mm += np.linalg.norm(at - true, axis=1).tolist()
+        nearest = result.surface().vertices[list(model.landmarks.values())]
+        snapped_mm += np.linalg.norm(nearest - true, axis=1).tolist()
+        share.append((at - true) / np.stack([result.landmark_stddev_mm[name] for name in model.landmarks]))
+    assert np.mean(off_mm) < 0.8 and np.mean(snapped_mm) > 4.0
+    assert 0.5 < np.sqrt(np.mean(np.square(share))) < 1.6
+
+
+def test_landmarks_at_vertices_fit_to_the_bit_as_vertices_did() -> None:
+    model = blob_model(700)
+    face = np.asarray(model.faces)
+    rows = [int(np.flatnonzero((face == v).any(axis=1))[0]) for v in model.landmarks.values()]
+    weights = np.stack([(face[row] == v).astype(float) for row, v in zip(rows, model.landmarks.values(), strict=True)])
+    in_triangles = replace(model, landmarks=SurfaceLandmarks(tuple(model.landmarks), face[rows], weights))
+    assert in_triangles.landmarks == model.landmarks and in_triangles.content_hash == model.content_hash

@@ -400,7 +400,8 @@ def test_a_file_that_declares_more_than_it_holds_is_refused_before_memory_is_tak
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
-        ({"format": "shapespace model", "format_version": 2}, "version 2"),
+        ({"format": "shapespace model", "format_version": 3}, "version 3"),
+        ({"format": "shapespace model", "format_version": 2}, "missing"),
         ({"format": "shapespace model"}, "version None"),
         ({"format": "shapespace model", "format_version": 1}, "missing"),
         ({"format": "a cat"}, "not a shapespace model"),

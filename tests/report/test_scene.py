@@ -17,7 +17,7 @@ from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.report import scene
 from shapespace.report.staged import StagedFit
-from shapespace.types import Mesh
+from shapespace.types import Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan
 
 
@@ -137,13 +137,15 @@ def test_a_model_comes_back_to_a_thousandth_of_a_millimetre() -> None:
 
 
 def test_a_small_model_is_the_same_surface_in_another_order() -> None:
-    model = replace(blob_model(), landmarks={"top": 7})
+    corners, weights = np.array([[7, 7, 7], [3, 40, 9]]), np.array([[1.0, 0.0, 0.0], [0.5, 0.3, 0.2]])
+    model = replace(blob_model(), landmarks=SurfaceLandmarks(("top", "between"), corners, weights))
     facts, arrays = unpack(scene.pack_model(model, 2, small=True))
     _, plain = unpack(scene.pack_model(model, 2))
     assert facts["n_modes"] == model.n_modes
     assert arrays["modes"].shape == (2, model.n_vertices, 3)
-    place = arrays["mean"][facts["landmarks"]["top"]]
-    assert np.abs(place - model.mean_vertices[7]).max() < 0.03
+    for name, expected in model.landmarks.positions(model.mean_vertices).items():
+        at = facts["landmarks"][name]
+        assert np.abs(at["weights"] @ arrays["mean"][at["vertices"]] - expected).max() < 0.03
     corners = [np.sort(np.round(a["mean"][a["faces"].astype(int)].mean(axis=1), 1).sum(1)) for a in (arrays, plain)]
     assert np.abs(corners[0] - corners[1]).max() < 0.4
     z = np.array([2.0, -1.5])

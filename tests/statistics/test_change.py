@@ -23,7 +23,7 @@ from shapespace.statistics.change_found import ChangeSettings
 from shapespace.statistics.change_group import difference_test, mean_test
 from shapespace.statistics.change_maps import aligned, swept_mm3, volume_mm3
 from shapespace.statistics.change_visits import visits_of
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob, blob_model, sphere
 
 V = 400
@@ -185,6 +185,23 @@ def test_regions_and_landmarks_tell_where_it_changed() -> None:
         assert abs(rest) < 0.05 * nose and whole == pytest.approx(nose, rel=0.1)
         tip, back = subject.change.landmarks_mm
         assert np.linalg.norm(tip) == pytest.approx(3.0, abs=0.15) and np.linalg.norm(back) < 0.15
+
+
+def test_a_landmark_between_vertices_moves_as_its_place_in_the_triangle_does() -> None:
+    cohort = pairs([3.0 * bump(), 2.0 * bump(), bump()], rescans=True, noise_mm=0.2)
+    face = np.asarray(cohort.faces)[(np.asarray(cohort.faces) == TIP).any(axis=1)][0]
+    weights = np.array([0.5, 0.3, 0.2])
+    whole = SurfaceLandmarks(("between",), face[None], weights[None])
+    corners = SurfaceLandmarks.of({str(k): int(v) for k, v in enumerate(face)})
+    one, three = (asked(replace(cohort, landmarks=marks), stable="all") for marks in (whole, corners))
+    for subject, parts in zip(one.subjects, three.subjects, strict=True):
+        np.testing.assert_allclose(subject.change.landmarks_mm[0], weights @ parts.change.landmarks_mm, atol=1e-12)
+    assert one.group_landmarks is not None and one.repeatability is not None and three.repeatability is not None
+    maps = np.stack([subject.change.along_mm[face] @ weights for subject in one.subjects])
+    np.testing.assert_allclose(one.group_landmarks.effect, [maps.mean()])
+    # Noise of a weighted mean is at most the weighted mean of the noise.
+    within = three.repeatability.landmarks_within_mm
+    assert 0.3 * within.min() < one.repeatability.landmarks_within_mm[0] < weights @ within
 
 
 # What is noise

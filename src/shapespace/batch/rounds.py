@@ -14,7 +14,7 @@ import numpy.typing as npt
 from shapespace.batch.executors import Serial
 from shapespace.batch.where import Where
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places
+from shapespace.correspondence.landmarks import Marks
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.template import Glance
@@ -24,7 +24,7 @@ from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder
 from shapespace.io.hdf5 import content_hash
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import Mesh, Similarity
+from shapespace.types import Mesh, Similarity, SurfaceLandmarks
 from shapespace.version import __version__
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -208,7 +208,7 @@ def _task_arrays(task: PlaceTask) -> Arrays:
     if (marks := task.marks) is not None:
         arrays |= {
             "marks": marks.points, "mark_names": np.array(marks.places.names), "mark_corners": marks.places.corners,
-            "mark_weights": marks.places.weights, "mark_uncertainty": np.array(marks.uncertainty),
+            "mark_weights": marks.places.barycentric, "mark_uncertainty": np.array(marks.uncertainty),
         }  # fmt: skip
     return arrays
 
@@ -216,7 +216,7 @@ def _task_arrays(task: PlaceTask) -> Arrays:
 def _marks_of(arrays: Arrays) -> Marks | None:
     if "marks" not in arrays:
         return None
-    places = Places(tuple(map(str, arrays["mark_names"])), arrays["mark_corners"], arrays["mark_weights"])
+    places = SurfaceLandmarks(tuple(map(str, arrays["mark_names"])), arrays["mark_corners"], arrays["mark_weights"])
     return Marks(places, arrays["marks"], float(arrays["mark_uncertainty"]))
 
 

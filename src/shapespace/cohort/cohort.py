@@ -22,7 +22,7 @@ from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size,
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, read_only
 
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
@@ -126,7 +126,7 @@ class Cohort:
         table: what is known of each, N rows in this order.
         gauge: `shape` or `form`.
         faces: (F, 3) triangles; None for points.
-        landmarks: name -> vertex.
+        landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
         source: where the shapes come from.
@@ -144,7 +144,7 @@ class Cohort:
     table: Table
     gauge: Gauge = "shape"
     faces: IntArray | None = None
-    landmarks: Mapping[str, int] | None = None
+    landmarks: SurfaceLandmarks | None = None
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
     source: ShapeSource = ShapeSource()
@@ -167,6 +167,8 @@ class Cohort:
         )
         if not agree:
             raise InputError("A cohort needs a row of coefficients, a size and a row of the table for each shape.")
+        if self.landmarks is not None:
+            object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -284,7 +286,7 @@ class Cohort:
             faces: (F, 3) triangles.
             gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
             align: False takes them as they stand.
-            landmarks: name -> vertex.
+            landmarks: named points on the surfaces (`place_landmarks`), or name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
             least: how many shapes there must be, where `onto` is None.
             unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
@@ -328,9 +330,9 @@ class Cohort:
         reference = shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
-            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces, landmarks,
+            called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces,
+            None if landmarks is None else SurfaceLandmarks.of(landmarks), observed=mask, analysed=analysed,
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
-            observed=mask, analysed=analysed,
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort
@@ -410,7 +412,7 @@ class Cohort:
         basis, coefficients = _in_basis(rows, b)
         cohort = Cohort(
             tuple(names), read_only(reference), basis, coefficients, read_only(sizes_mm), table, gauge, model.faces,
-            dict(model.landmarks), fitted, source=fitted.source("coefficients"),
+            model.landmarks, fitted, source=fitted.source("coefficients"),
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort

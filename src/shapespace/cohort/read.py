@@ -210,7 +210,7 @@ def _of_results(
         cohort = replace(
             Cohort.of_meshes(meshes, stated, options.gauge, onto, options.least),
             fitted=fitted,
-            landmarks=dict(model.landmarks),
+            landmarks=model.landmarks,
             sizes_mm=sizes,
             source=fitted.source(kind),
         )

@@ -15,12 +15,13 @@ from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.results import read_record
 from shapespace.commands.about import ABOUT, read_about
-from shapespace.errors import FileFormatError, InputError, MeshError, ShapespaceError
+from shapespace.errors import InputError, MeshError, ShapespaceError
+from shapespace.geometry.landmarks import far_landmarks, place_landmarks
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.surface import without_estimates
 from shapespace.io.files import make_folder, read_error
 from shapespace.io.labels import label_of, read_labels
-from shapespace.io.landmarks import read_landmark_indices, read_landmarks
+from shapespace.io.landmarks import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.regions import read_region
 from shapespace.model.choose_modes import MOST_SHAPES
 from shapespace.model.missing import MIN_SEEN, Kept
@@ -30,7 +31,7 @@ from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.scans import NEUTRAL
 from shapespace.store.corresponding import surface_files
 from shapespace.store.results import is_result, mesh_at
-from shapespace.types import MM_PER_UNIT, Mesh, common_faces
+from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ class BuildSettings:
         representation: what the modes move.
         control_points: of a B-spline.
         min_seen: share of the meshes that must show a vertex of a model of vertices; None for a half.
-        landmarks: a file of vertices, or of points on the first mesh; None looks for them.
+        landmarks: a file of vertices or of triangles with barycentric coordinates, or of points on the first mesh;
+            None looks for them.
         regions: name -> file with its vertices of the meshes, kept in the model for fits that are held to one.
         labels: a table of subjects and expressions, for a model that parts both; None for a plain one.
         expression_variance: with `labels`, the share that the modes of expression hold.
@@ -165,7 +167,7 @@ def build(
     first = on_disk[0] if streamed else loaded[0]
     if found.unit_ratios:
         notes.append(found.told_units(settings.unit))
-    marks = {} if parent is not None else _landmarks(files, records, first, settings, notes)
+    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, settings, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in settings.regions.items()
     }
@@ -260,7 +262,7 @@ def _streamed(
     output: Path,
     settings: BuildSettings,
     gauge: Gauge,
-    landmarks: Mapping[str, int],
+    landmarks: SurfaceLandmarks,
     parent: ShapeModel | None,
     notes: list[str],
     *,
@@ -404,7 +406,7 @@ def _min_seen(settings: BuildSettings) -> float:
     return MIN_SEEN if settings.min_seen is None else settings.min_seen
 
 
-def _missing(meshes: Sequence[Mesh], landmarks: Mapping[str, int], settings: BuildSettings) -> list[str]:
+def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: BuildSettings) -> list[str]:
     """Return how many vertices are missing, and which of them and of the landmarks are not in the model for it.
 
     Raises:
@@ -433,7 +435,10 @@ def _missing(meshes: Sequence[Mesh], landmarks: Mapping[str, int], settings: Bui
             "--min-seen says how many must."
         )
     if lost := sorted(set(landmarks) - set(kept.landmarks(landmarks))):
-        told.append(f"The model has no {', '.join(lost)}, since these landmarks lie on vertices that are taken out.")
+        told.append(
+            f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
+            "out."
+        )
     return told
 
 
@@ -443,59 +448,77 @@ def _landmarks(
     first: Mesh,
     settings: BuildSettings,
     notes: list[str],
-) -> dict[str, int]:
-    """Return name -> vertex: as given, or from beside the first mesh, or those of the model that fitted the meshes."""
+) -> SurfaceLandmarks:
+    """Return the landmarks: as given, or from beside the first mesh, or those of the model that fitted the meshes."""
     mm = MM_PER_UNIT[settings.unit]
     if settings.landmarks is not None:
-        return _landmark_indices(settings.landmarks, first, mm)
+        return _read_landmarks(settings.landmarks, first, mm, notes)
     beside = files[0].parent / "landmarks.csv"
     if beside.is_file():
         try:
-            marks = _landmark_indices(beside, first, mm)
+            marks = _read_landmarks(beside, first, mm, placed := list[str]())
         except ShapespaceError as error:
             notes.append(f"The model has no landmarks, since {beside} cannot be used: {error}")
-            return {}
-        notes.append(f"Landmarks are taken from {beside}.")
+            return SurfaceLandmarks()
+        notes += [f"Landmarks are taken from {beside}.", *placed]
         return marks
     return _landmarks_of_parent(files, records, first, notes)
 
 
 def _landmarks_of_parent(
     files: Sequence[Path], records: Mapping[Path, Mapping[str, Any]], first: Mesh, notes: list[str]
-) -> dict[str, int]:
-    """Return the landmarks of the one model that fitted all `files`: they are vertices, in its order."""
+) -> SurfaceLandmarks:
+    """Return the landmarks of the one model that fitted all `files`: they are on its vertices, in its order."""
     sources = [record.get("model") for record in records.values()]
     if len(records) < len(files) or not all(isinstance(source, dict) for source in sources):
-        return {}
+        return SurfaceLandmarks()
     known = cast(list[dict[str, Any]], sources)
     if len({source.get("hash") for source in known}) > 1:
         notes.append("The model has no landmarks, since the meshes were fitted by different models; give --landmarks.")
-        return {}
+        return SurfaceLandmarks()
     path = files[0].parent / str(known[0].get("path") or known[0].get("name"))
     try:
         parent = ShapeModel.load(path)
     except ShapespaceError:
         notes.append(f"The model has no landmarks, since the one that fitted these meshes is no longer at {path}.")
-        return {}
+        return SurfaceLandmarks()
     if parent.content_hash != known[0].get("hash") or parent.n_vertices != len(first.vertices):
         notes.append(f"The model has no landmarks, since {path} is not the model that fitted these meshes.")
-        return {}
+        return SurfaceLandmarks()
     if parent.landmarks:
         notes.append(f"Landmarks are those of {path}, which fitted these meshes.")
-    return dict(parent.landmarks)
+    return parent.landmarks
 
 
-def _landmark_indices(path: Path, first: Mesh, mm: float) -> dict[str, int]:
-    """Return name -> vertex from a file of indices, or of points on the first mesh in the meshes' own unit."""
-    if path.suffix.lower() == ".csv":
-        try:
-            return read_landmark_indices(path)
-        except FileFormatError:
-            pass  # a CSV of points, not of indices
+def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> SurfaceLandmarks:
+    """Return landmarks from a file of vertices or triangles, or of points on the first mesh in the meshes' own unit.
+
+    Of points the notes say how far they lie from the surface on which they are placed.
+    """
+    if path.suffix.lower() == ".csv" and is_of_vertices(path):
+        return read_surface_landmarks(path)
     points = read_landmarks(path)
-    # argmin takes a vertex that is missing, and so not-a-number, for the least.
-    there = np.where(np.isnan(first.vertices), np.inf, first.vertices)
-    return {name: int(np.linalg.norm(there - mm * point, axis=1).argmin()) for name, point in points.items()}
+    placed = place_landmarks(first, {name: mm * point for name, point in points.items()})
+    notes += _placing_notes(placed, first)
+    return placed
+
+
+def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
+    """Return how far landmarks that were given as points lie from the surface, and which are too far to be on it."""
+    distance, worst = landmarks.distance_mm, int(landmarks.distance_mm.argmax())
+    notes = [
+        f"Landmarks were placed on the surface of {surface.name}; the given points are {distance.mean():.2g} mm from "
+        f"it on average, at most {distance[worst]:.2g} mm ({landmarks.names[worst]})."
+    ]
+    if far := far_landmarks(surface, landmarks):
+        listed = sorted(far, key=lambda name: -far[name])[:_NAMED]
+        named = ", ".join(f"{name} ({far[name]:.2g} mm)" for name in listed) + (", ..." if len(far) > _NAMED else "")
+        some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
+        notes.append(
+            f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge: {named}. Check "
+            "the names, the unit and the frame of the landmarks."
+        )
+    return notes
 
 
 def _with_origin(files: Sequence[Path], settings: BuildSettings, notes: list[str]) -> BuildSettings:
@@ -517,7 +540,7 @@ def _additive(
     labels: Path,
     settings: BuildSettings,
     gauge: Gauge,
-    landmarks: Mapping[str, int],
+    landmarks: SurfaceLandmarks,
 ) -> AdditiveModel:
     from shapespace.model.additive import AdditiveModel
 

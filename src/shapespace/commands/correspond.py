@@ -34,18 +34,18 @@ from shapespace.correspondence.rounds import (
 )
 from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.errors import ShapespaceError
-from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
-from shapespace.geometry.surface import face_areas, without_estimates
+from shapespace.geometry.landmarks import far_landmarks, place_landmarks
+from shapespace.geometry.surface import face_areas, rms_size, without_estimates
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_text
 from shapespace.io.json_files import read_json
-from shapespace.io.landmarks import write_landmark_indices
+from shapespace.io.landmarks import write_surface_landmarks
 from shapespace.io.meshes import ending_of, read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, json_text, read
 from shapespace.store.corresponding import LANDMARKS, MEAN, RECORD, SUMMARY, SURFACE
-from shapespace.types import Mesh
+from shapespace.types import Mesh, SurfaceLandmarks
 from shapespace.version import __version__
 
 _KEPT = ".rounds"
@@ -148,6 +148,7 @@ def _corresponding(
         _note_other_objects(made, notes)
     records = _records(made, read, jobs, folder)
     _tell(records, made, given, say)
+    _report_landmarks(records, read, say)
     # Until all is written the folder is none that build takes.
     remove_file(folder / SUMMARY)
     _forget_others({record.name for record in records}, folder, say)
@@ -256,6 +257,7 @@ class _Read:
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     hashes: dict[str, str] = field(default_factory=dict[str, str])
     unread: dict[str, str] = field(default_factory=dict[str, str])
+    landmark_distances: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
 def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
@@ -277,7 +279,11 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet:
                 mesh = marks.onto(mesh, job.scan, job.landmarks)
                 read.hashes[job.name] = content_hash
                 own = Mesh(mesh.vertices, mesh.faces, mesh.landmarks, job.name)
-                read.scans[job.name], read.notes[job.name] = _looked_at(own, strict=strict)
+                read.scans[job.name], read.notes[job.name] = scan, notes = _looked_at(own, strict=strict)
+                if scan.landmarks:
+                    placed = place_landmarks(scan, scan.landmarks)
+                    read.landmark_distances[job.name] = dict(zip(placed, placed.distance_mm.tolist(), strict=True))
+                    notes += _far_notes(scan, placed)
             except ShapespaceError as error:
                 read.unread[job.name] = f"{_BROKEN}{error}"
             bar.update()
@@ -293,6 +299,41 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
     mesh, findings = repair(scan, strict=strict)
     notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
     return without_astray(mesh), [*notes, *_told_astray(mesh)]
+
+
+def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
+    """Return a sentence on landmarks of `scan` that are off its surface by more than their placing can explain."""
+    far = far_landmarks(scan, placed)
+    if not far:
+        return []
+    listed = sorted(far, key=lambda name: -far[name])[:_LISTED]
+    named = ", ".join(f"{name} ({far[name]:.2g})" for name in listed) + (", ..." if len(far) > _LISTED else "")
+    return [
+        "Landmarks are farther from its surface than 1 % of its size and than its mean edge (distances in its unit): "
+        f"{named}."
+    ]
+
+
+def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:
+    """Say how far the given landmarks are from the scans, and from their places on the corresponding surfaces."""
+    shares = {
+        (name, scan): distance / rms_size(read.scans[scan].vertices)
+        for scan, distances in read.landmark_distances.items()
+        for name, distance in distances.items()
+    }
+    if not shares:
+        return
+    name, scan = max(shares, key=lambda key: shares[key])
+    sentence = (
+        f"The given landmarks of {len(read.landmark_distances)} scans are {100 * np.mean(list(shares.values())):.2g} % "
+        f"of the size from the surface of their scan on average, at most {100 * shares[name, scan]:.2g} % ({name} of "
+        f"{scan})"
+    )
+    off = [
+        one.landmark_rms / rms_size(read.scans[one.name].vertices) for one in records if one.landmark_rms is not None
+    ]
+    after = f"; from their places on the corresponding surfaces {100 * np.mean(off):.2g} % (RMS)" if off else ""
+    say(f"{sentence}{after}.")
 
 
 def _told_astray(scan: Mesh) -> list[str]:
@@ -367,6 +408,7 @@ def _records(
         if one is not None and one.vertices is not None:
             surface = without_estimates(Mesh(one.vertices, made.template.faces, name=name, observed=one.observed))
             record = _judged(record, surface, made.template, read.scans[name])
+        record = structs.replace(record, landmark_distances=read.landmark_distances.get(name, {}))
         if name in sizes:
             scale, ratio = map(float, sizes[name])
             odd = [] if 1 / _OTHER_SIZE < scale < _OTHER_SIZE else [_told_size(scale)]
@@ -433,10 +475,8 @@ def _write(made: Correspondence, records: Sequence[CorrespondRecord], read: Sequ
         write_text(folder / f"{record.name}{RECORD}", json_text(record))
     make_folder((folder / MEAN).parent)
     write_mesh(folder / MEAN, made.template)
-    if made.template.landmarks:
-        points = np.stack(list(made.template.landmarks.values()))
-        nearest = build_engine(made.template).query(points).vertex
-        write_landmark_indices(folder / LANDMARKS, dict(zip(made.template.landmarks, nearest.tolist(), strict=True)))
+    if made.landmarks:
+        write_surface_landmarks(folder / LANDMARKS, made.landmarks)
     else:
         remove_file(folder / LANDMARKS)
 

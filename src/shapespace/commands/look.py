@@ -178,6 +178,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({} if model.residuals is None else _residual_facts(model)),
         "noise_variance_mm2": model.noise_variance,
         "landmarks": list(model.landmarks),
+        **_landmark_distances(model),
         **({"regions": {name: len(at) for name, at in model.regions.items()}} if model.regions else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
@@ -185,6 +186,12 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "licence": model.licence,
         "hash": model.content_hash,
     }
+
+
+def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:
+    """Return how far the given landmarks were from the surface; nothing where none was off it."""
+    distances = model.landmarks.distance_mm.tolist()
+    return {"landmark_distances_mm": dict(zip(model.landmarks, distances, strict=True))} if any(distances) else {}
 
 
 def _residual_facts(model: ShapeModel) -> dict[str, Any]:

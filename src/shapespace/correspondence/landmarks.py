@@ -19,10 +19,11 @@ import numpy as np
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
+from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.mirror import FLIP
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import faces_of, rms_size
-from shapespace.types import FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 FEWEST = 3
 """So many give a pose."""
@@ -39,43 +40,6 @@ _ASTRAY = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """Where named points lie on a template.
-
-    Args:
-        names: of L points.
-        corners: (L, 3) vertices of the triangle that each lies on.
-        weights: (L, 3) barycentric.
-    """
-
-    names: tuple[str, ...]
-    corners: IntArray
-    weights: FloatArray
-
-    @staticmethod
-    def nowhere() -> Places:
-        """Return no points."""
-        return Places((), np.empty((0, 3), dtype=np.int32), np.empty((0, 3)))
-
-    @staticmethod
-    def on(mesh: Mesh, points: Mapping[str, FloatArray]) -> Places:
-        """Return where on `mesh`, which has triangles, the nearest points to `points` lie."""
-        if not points:
-            return Places.nowhere()
-        corners, weights = on_triangles(mesh, np.stack(list(points.values())))
-        return Places(tuple(points), corners, weights)
-
-    def at(self, vertices: FloatArray) -> FloatArray:
-        """Return (L, 3) where they are on `vertices` (V, 3); of any functions (V, C) the values (L, C)."""
-        return np.einsum("lc,lcd->ld", self.weights, vertices[self.corners])
-
-    def of(self, names: Sequence[str]) -> Places:
-        """Return those of `names`, in that order."""
-        which = [self.names.index(name) for name in names]
-        return Places(tuple(names), self.corners[which], self.weights[which])
-
-
-@dataclass(frozen=True, eq=False)
 class Marks:
     """The landmarks of one scan that the template has too.
 
@@ -85,17 +49,17 @@ class Marks:
         uncertainty: standard deviation, as a share of the template's size.
     """
 
-    places: Places
+    places: SurfaceLandmarks
     points: FloatArray
     uncertainty: float
 
     @staticmethod
-    def shared(places: Places, scan: Mesh, uncertainty: float) -> Marks | None:
+    def shared(places: SurfaceLandmarks, scan: Mesh, uncertainty: float) -> Marks | None:
         """Return those that `scan` has of `places`; None where it has none."""
         names = [name for name in places.names if name in scan.landmarks]
         if not names:
             return None
-        return Marks(places.of(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
+        return Marks(places.select(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
 
     def moved(self, T: Similarity) -> Marks:
         """Return the same landmarks with their points moved by `T`."""
@@ -109,7 +73,7 @@ class Marks:
         """
         if len(self.points) < FEWEST:
             return None
-        own = self.places.at(vertices)
+        own = self.places.interpolate(vertices)
         across = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(own))
         if across < _SURE * self.uncertainty * rms_size(vertices):
             return None
@@ -134,17 +98,18 @@ class Marks:
 
     def pull(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
         """Return (V, 3) the movement (2) of the surface `x` (V, 3), in whose frame the points must be."""
-        functions = self.places.at(harmonics.functions)
+        functions = self.places.interpolate(harmonics.functions)
         spread = functions * harmonics.kept(range_mm)
         kernel = spread @ functions.T
         ratio = max(self.uncertainty * size_mm / (_OFF_SHARE * range_mm), _FIRMEST)
         loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
-        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, self.points - self.places.at(x)), dtype=np.float64)
+        left = self.points - self.places.interpolate(x)
+        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, left), dtype=np.float64)
         return harmonics.functions @ (spread.T @ pulled)
 
     def rms(self, vertices: FloatArray) -> float:
         """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
-        return _rms(self.places.at(vertices) - self.points)
+        return _rms(self.places.interpolate(vertices) - self.points)
 
 
 def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -171,7 +136,7 @@ def without_astray(scan: Mesh) -> Mesh:
 
 def unlike_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:
     """Return whether most of the `scans` whose landmarks can be compared with those of `template` contradict them."""
-    places = Places.on(template, template.landmarks)
+    places = place_landmarks(template, template.landmarks)
     told = [marks for scan in scans if (marks := Marks.shared(places, scan, uncertainty)) is not None]
     refused, agreeing = 0, 0
     for marks in told:
@@ -186,20 +151,20 @@ def _rms(difference: FloatArray) -> float:
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
-def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> Places:
+def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> SurfaceLandmarks:
     """Return where on `mean` the landmarks of shapes lie: the middle of where those have them that agree with most.
 
     Args:
         mean: with triangles.
         shapes: (V, 3) vertices of each, and its landmarks in the same frame.
     """
-    told = [(Places.on(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
+    told = [(place_landmarks(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
     names = list(dict.fromkeys(name for _, points in told for name in points))
     if not names:
-        return Places.nowhere()
+        return SurfaceLandmarks()
     at = np.full((len(told), len(names), 3), np.nan)
     for own, (places, points) in zip(at, told, strict=True):
-        own[[names.index(name) for name in points]] = places.at(mean.vertices)
+        own[[names.index(name) for name in points]] = places.interpolate(mean.vertices)
     off = np.sqrt(np.array([np.nansum((at - own) ** 2, axis=(1, 2)) for own in at]))
     shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])
     contrary = off > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
@@ -208,4 +173,4 @@ def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArra
     for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True):
         if np.isfinite(points).any():
             middle[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
-    return Places.on(mean, middle)
+    return place_landmarks(mean, middle)

@@ -16,7 +16,7 @@ import numpy as np
 
 from shapespace.correspondence.guide import Others, aligned, told_by_others
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, Places, agreed, unlike_most, without_astray
+from shapespace.correspondence.landmarks import Marks, agreed, unlike_most, without_astray
 from shapespace.correspondence.mirror import Mirror
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
 from shapespace.correspondence.register import ElasticSettings
@@ -24,12 +24,13 @@ from shapespace.correspondence.scans import copies, unit_ratios
 from shapespace.correspondence.template import Glance, choose, clean, given, resampled
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
 from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
@@ -125,22 +126,28 @@ class Correspondence:
         scans: in the order given.
         why: where the first template came from, in a sentence.
         moved: RMS movement in each round, share of the size.
+        landmarks: the landmarks that scans have, on each of the surfaces.
     """
 
     template: Mesh
     scans: tuple[Corresponding, ...]
     why: str
     moved: tuple[float, ...]
+    landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
 
     __repr__ = short_repr
 
     def meshes(self) -> list[Mesh]:
-        """Return the complete surfaces of scans that are not set aside, in their own frames, with `Mesh.observed`."""
-        return [
-            Mesh(scan.vertices, self.template.faces, name=scan.name, observed=scan.observed)
-            for scan in self.scans
-            if scan.vertices is not None
-        ]
+        """Return the complete surfaces of scans that are not set aside, in their own frames, with `Mesh.observed`.
+
+        They have the landmarks in whose triangles all vertices are observed.
+        """
+        return [self._mesh(one, one.vertices) for one in self.scans if one.vertices is not None]
+
+    def _mesh(self, scan: Corresponding, vertices: FloatArray) -> Mesh:
+        there = np.ones(len(vertices), dtype=np.bool_) if scan.observed is None else scan.observed
+        landmarks = self.landmarks.within(there).positions(vertices)
+        return Mesh(vertices, self.template.faces, landmarks, scan.name, observed=scan.observed)
 
 
 class Runner(Protocol):
@@ -200,7 +207,7 @@ def first_template(
     if model is not None:
         if model.faces is None:
             raise MeshError("The model has no triangles, and a template needs them; leave it out, or give another.")
-        points = {name: model.mean_vertices[vertex] for name, vertex in model.landmarks.items()}
+        points = model.landmarks.positions(model.mean_vertices)
         mesh, why = (
             Mesh(model.mean_vertices, model.faces, points, "mean"),
             "The template is the mean of the model given.",
@@ -301,7 +308,7 @@ class _State:
         self.broken, self.reasons = first.broken, dict(first.broken)
         self.template, self.guide = first.mesh, first.guide
         self.harmonics = Harmonics.of(first.mesh, settings.first.harmonics)
-        self.places = Places.on(first.mesh, first.mesh.landmarks)
+        self.places = place_landmarks(first.mesh, first.mesh.landmarks)
         self.mirror = (
             Mirror.of(first.mesh, self.harmonics, settings.first, settings.seed) if settings.symmetric else None
         )
@@ -468,9 +475,10 @@ class _State:
         """Return the scans with what is known of each."""
         complete = self._completed()
         scans = [self._ended(i, complete.get(i)) for i in range(len(self.names))]
-        points = dict(zip(self.places.names, self.places.at(self.template.vertices), strict=True))
+        points = self.places.positions(self.template.vertices)
         template = self.template.with_vertices(self.template.vertices, points)
-        return Correspondence(template, tuple(scans), why, tuple(self.moved))
+        landmarks = replace(self.places, distance_mm=np.empty(0))  # places on a mean have no given point
+        return Correspondence(template, tuple(scans), why, tuple(self.moved), landmarks)
 
     def _completed(self) -> dict[int, FloatArray]:
         """Return the vertices (V, 3) of each placed scan, in the template's frame, with estimates where not observed.

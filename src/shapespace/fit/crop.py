@@ -113,5 +113,5 @@ def _unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str
     there = rms_size(np.stack([landmarks[name] for name in shared])) if len(shared) > 1 else 0.0
     if there == 0.0:
         raise FitError(f"{scan_name}: its landmarks do not tell its unit, by which it is cropped; give --unit.")
-    ratio = there / rms_size(model.mean_vertices[[model.landmarks[name] for name in shared]])
+    ratio = there / rms_size(model.landmarks.select(shared).interpolate(model.mean_vertices))
     return min(MM_PER_UNIT, key=lambda unit: abs(float(np.log(ratio * MM_PER_UNIT[unit]))))

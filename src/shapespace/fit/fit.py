@@ -386,9 +386,8 @@ def _landmark_stddev_mm(
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
         # The surface was told in the model's modes, and what that moved a landmark by is an error of it.
-        vertex = list(landmarks.values())
-        told = fitted.T_scan_model.apply(model.reconstruct(fitted.b)[vertex])
-        variance += (told - fitted.vertices_scan_mm[vertex]) ** 2
+        in_modes = landmarks.interpolate(fitted.T_scan_model.apply(model.reconstruct(fitted.b)))
+        variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
     return dict(zip(landmarks, np.sqrt(variance), strict=True))
 
 

@@ -11,7 +11,7 @@ from shapespace.fit.regions import UNSEEN
 from shapespace.fit.state import Fitted, IcpState
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import IntArray
+from shapespace.types import IntArray, SurfaceLandmarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class HeldTo:
         """Return what tells `on_state` of such states."""
         return lambda state: on_state(self.state(state))
 
-    def landmarks(self, model: ShapeModel) -> dict[str, int]:
-        """Return name -> vertex of the landmarks of `model` that lie in the region."""
-        return {name: at for name, at in model.landmarks.items() if self.part.inside[at]}
+    def landmarks(self, model: ShapeModel) -> SurfaceLandmarks:
+        """Return the landmarks of `model` that lie in the region."""
+        return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
         """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""

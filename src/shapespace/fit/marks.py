@@ -1,6 +1,7 @@
 """Landmarks that somebody placed on the scan, as a soft constraint on every step of the robust fit.
 
-Each pulls its vertex of the model with its standard deviation. Matches count far more often than they know something
+Each pulls its point of the model's surface with its standard deviation; that point is a weighted mean of the corners of
+its triangle, and so are its rows of the Jacobian. Matches count far more often than they know something
 new, which the posterior mends by a temperature; so that a landmark weighs what it is worth beside them, they are taken
 for as many observations as there are patches, and landmarks are weighed up by the same factor. While the matches still
 lie far apart landmarks lead the fit, and in the end, where matches are told to a fraction of a millimetre, they yield.
@@ -8,7 +9,7 @@ lie far apart landmarks lead the fit, and in the end, where matches are told to 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from shapespace.fit.moving_model import MovingSurface
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Similarity
+from shapespace.types import FloatArray, Similarity, SurfaceLandmarks
 
 SHARE = 0.03
 """Standard deviation of a landmark as a share of the model's size (RMS distance from its centre), if none is given."""
@@ -30,15 +31,13 @@ class Marks:
     """Landmarks of a scan that the model has too.
 
     Args:
-        names: of them, (L,).
-        vertex: (L,) of the model.
+        landmarks: L of them, on the model's surface.
         points_mm: (L, 3) in the scan's mm frame.
         stddev_mm: of each coordinate, mm of the scan.
         far_mm: beyond three times this, mm of the model's frame, a landmark has no say, however far off all are.
     """
 
-    names: Sequence[str]
-    vertex: IntArray
+    landmarks: SurfaceLandmarks
     points_mm: FloatArray
     stddev_mm: float
     far_mm: float
@@ -49,18 +48,17 @@ class Marks:
         names = [name for name in model.landmarks if name in landmarks_mm]
         if not names or not np.isfinite(stddev_mm):
             return None
-        vertex = np.array([model.landmarks[name] for name in names], dtype=np.int32)
         return Marks(
-            names,
-            vertex,
+            model.landmarks.select(names),
             np.stack([landmarks_mm[name] for name in names]),
             stddev_mm,
             SHARE * rms_size(model.mean_vertices),
         )
 
     def off_mm(self, surface: MovingSurface, T_scan_model: Similarity) -> FloatArray:
-        """Return (L,) how far each vertex lies from its landmark, mm of the scan."""
-        return np.linalg.norm(T_scan_model.apply(surface.vertices[self.vertex]) - self.points_mm, axis=1)
+        """Return (L,) how far each landmark of the surface lies from that of the scan, mm of the scan."""
+        at = self.landmarks.interpolate(surface.vertices)
+        return np.linalg.norm(T_scan_model.apply(at) - self.points_mm, axis=1)
 
     def equations(self, surface: MovingSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
         """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.
@@ -70,7 +68,7 @@ class Marks:
             T_scan_model: where it is now, in the scan's mm frame.
             modes: k, how many are free.
         """
-        x = surface.vertices[self.vertex]
+        x = self.landmarks.interpolate(surface.vertices)
         off = x - T_scan_model.inverse().apply(self.points_mm)
         distance = np.linalg.norm(off, axis=1)
         stddev = self.stddev_mm / T_scan_model.scale
@@ -78,7 +76,7 @@ class Marks:
         width = _WIDTH * max(stddev, min(_MAD * float(np.median(distance)), self.far_mm))
         weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
         pose = small_poses(x).reshape(len(x), 3, POSE)
-        rows = np.concatenate([pose, surface.modes[self.vertex][:, :, :modes]], axis=2)
+        rows = np.concatenate([pose, self.landmarks.interpolate(surface.modes[:, :, :modes])], axis=2)
         every = rows.reshape(3 * len(x), -1)
         heavy = np.repeat(weight, 3)[:, None] * every
         hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)
@@ -90,7 +88,7 @@ class Marks:
         far = off_mm > _FAR * max(self.stddev_mm, _MAD * float(np.median(off_mm)))
         return [
             f"Landmark {name!r} lies {off:.1f} mm from where the fit has it; check its place and its name."
-            for name, off, is_far in zip(self.names, off_mm, far, strict=True)
+            for name, off, is_far in zip(self.landmarks.names, off_mm, far, strict=True)
             if is_far
         ]
 

@@ -23,7 +23,7 @@ from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray, SurfaceLandmarks
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
 _NOISE_TEMPERATURE = 1.7
@@ -117,13 +117,13 @@ def posterior(
     return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
 
 
-def covariance_of_vertices(known: Posterior, surface: MovingSurface, vertex: IntArray) -> FloatArray:
-    """Return the covariance (L, 3, 3), mm^2 of the model's frame, of where the vertices `vertex` (L,) lie.
+def covariance_of_landmarks(known: Posterior, surface: MovingSurface, landmarks: SurfaceLandmarks) -> FloatArray:
+    """Return the covariance (L, 3, 3), mm^2 of the model's frame, of the positions of landmarks.
 
-    Pose, coefficients and modes beside the model move a vertex together, so it is that of their sum.
+    Pose, coefficients and modes beside the model move a landmark together, so it is that of their sum.
     """
-    pose = small_poses(surface.vertices[vertex]).reshape(len(vertex), 3, POSE)
-    rows = np.concatenate([pose, surface.modes[vertex]], axis=2)
+    pose = small_poses(landmarks.interpolate(surface.vertices)).reshape(len(landmarks), 3, POSE)
+    rows = np.concatenate([pose, landmarks.interpolate(surface.modes)], axis=2)
     return rows @ known.covariance @ rows.transpose(0, 2, 1)
 
 

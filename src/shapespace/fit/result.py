@@ -251,7 +251,7 @@ class FitResult:
                 "leave the model out, as the result knows its own."
             )
         vertices = self._vertices(stage)
-        landmarks = {name: vertices[index] for name, index in self.model.landmarks.items()}
+        landmarks = self.model.landmarks.positions(vertices)
         return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:

@@ -29,7 +29,7 @@ from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.marks import Marks, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
 from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
-from shapespace.fit.posterior import Posterior, covariance_of_vertices, lack_of_new_shapes, new_shapes, posterior
+from shapespace.fit.posterior import Posterior, covariance_of_landmarks, lack_of_new_shapes, new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -357,7 +357,7 @@ def _of_marks(problem: Problem, at: Estimate) -> dict[str, float]:
 
 def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T: Similarity) -> FloatArray:
     """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
-    covariance = covariance_of_vertices(known, surface, np.array(list(model.landmarks.values()), dtype=np.int32))
+    covariance = covariance_of_landmarks(known, surface, model.landmarks)
     # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
     covariance += np.eye(3) * _LACK_LEFT * lack_of_new_shapes(model) ** 2 / 3.0
     return T.scale**2 * T.rotation @ covariance @ T.rotation.T

@@ -109,7 +109,7 @@ def start_from_landmarks(
             f"the model has {', '.join(list(model.landmarks)[:5])} and so on, the scan "
             f"{', '.join(list(scan_landmarks_mm)[:5]) or 'none'}."
         )
-    source = model.mean_vertices[[model.landmarks[name] for name in names]]
+    source = model.landmarks.select(names).interpolate(model.mean_vertices)
     target = np.stack([scan_landmarks_mm[name] for name in names])
     try:
         T = fit_similarity(source, target, with_scale=with_scale)

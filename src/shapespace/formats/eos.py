@@ -14,7 +14,7 @@ from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes, orthonormal, scaled
 from shapespace.io.files import read_bytes, write_bytes
 from shapespace.io.json_files import check_file
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, SurfaceLandmarks
 
 _AGAIN = "give a model that eos has saved"
 _BLENDSHAPES_AGAIN = "give the blendshapes that eos has saved"
@@ -77,10 +77,22 @@ class Eos:
             out += struct.pack("<B", 1)
         out += struct.pack("<QQ", 0, 0)
         write_bytes(path, bytes(out))
-        said = ["Numbers are in single precision."]
+        said = ["Numbers are in single precision.", *_moved_landmarks(model)]
         if model.provenance or model.licence:
             said.append("Provenance and licence are left out: eos has no place for them.")
         return said
+
+
+def _moved_landmarks(model: LinearModel) -> list[str]:
+    """Return a sentence on how far landmarks move to the vertices that eos stores; none where all are at vertices."""
+    vertices = model.mean[list(model.landmarks.values())]
+    moved_mm = np.linalg.norm(model.landmarks.interpolate(model.mean) - vertices, axis=1) * (model.mm or 1.0)
+    if not moved_mm.any():
+        return []
+    return [
+        f"Landmarks are moved to the nearest vertices, which is all that eos stores: {moved_mm.mean():.2g} mm on "
+        f"average, at most {moved_mm.max():.2g} mm ({model.landmarks.names[int(moved_mm.argmax())]})."
+    ]
 
 
 def read_blendshapes(path: Path) -> Modes:
@@ -189,7 +201,7 @@ def _model(archive: _Archive) -> LinearModel:
         shape=Modes(moved),
         expression=expression,
         faces=faces.astype(np.int32) if len(faces) else None,
-        landmarks=landmarks,
+        landmarks=SurfaceLandmarks.of(landmarks),
         provenance=f"eos model of version {version}",
         licence=_SFM_LICENCE if is_sfm else "",
         notes=tuple(notes),

@@ -7,10 +7,15 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final, cast
 
+import numpy as np
+
 from shapespace.formats.parts import LinearModel
+from shapespace.types import SurfaceLandmarks
 
 KEY: Final = "shapespace"
 """Under which the facts stand."""
+_PLACES: Final = "landmark_triangles"
+"""Of landmarks off the vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
 _LONGEST_WORDS = 20_000
 _MOST_LANDMARKS = 10_000
 
@@ -25,6 +30,7 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
         "held_out": model.held_out,
         "total_variance_mm2": None if total is None else float(total * mm**2),
         "landmarks": dict(model.landmarks),
+        **({} if model.landmarks.are_vertices else {_PLACES: _places_of(model.landmarks, mm)}),
         "provenance": model.provenance,
         "licence": model.licence,
     }
@@ -36,19 +42,19 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
 def with_facts(model: LinearModel, facts: object) -> LinearModel:
     """Return `model` with what `facts` of `facts_of` tells; what is not as that writes it is passed over.
 
-    Landmarks are vertices, so they are taken only where the number of vertices is still the same.
+    Landmarks are in triangles of vertices, so they are read only where the number of vertices is still the same.
     """
     known = json_object(facts)
     if not known:
         return model
     n = len(model.mean)
-    landmarks, notes = dict(model.landmarks), model.notes
+    landmarks, notes = model.landmarks, model.notes
     marks = json_object(known.get("landmarks"))
     if marks and known.get("vertices") != n:
         notes = (*notes, "Its landmarks are left out: the number of vertices has changed since they were set.")
     elif len(marks) <= _MOST_LANDMARKS:
-        found = {name: _count(value) for name, value in marks.items()}
-        landmarks |= {name: vertex for name, vertex in found.items() if vertex is not None and vertex < n}
+        own = _landmarks(marks, json_object(known.get(_PLACES)), n, model.mm or 1.0)
+        landmarks = landmarks.select([name for name in landmarks if name not in own]).joined(own)
     training, total = _count(known.get("n_training")), known.get("total_variance_mm2")
     shape = model.shape
     if isinstance(total, float) and math.isfinite(total) and total > 0:
@@ -68,6 +74,34 @@ def with_facts(model: LinearModel, facts: object) -> LinearModel:
         licence=_words(known.get("licence")) or model.licence,
         notes=notes,
     )
+
+
+def _places_of(landmarks: SurfaceLandmarks, mm: float) -> dict[str, dict[str, Any]]:
+    rows = zip(landmarks.names, landmarks.corners, landmarks.barycentric, landmarks.distance_mm, strict=True)
+    return {
+        name: {"vertices": corners.tolist(), "barycentric": weights.tolist(), "distance_mm": float(distance * mm)}
+        for name, corners, weights, distance in rows
+    }
+
+
+def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, mm: float) -> SurfaceLandmarks:
+    """Return the landmarks of facts: in their triangles where these are given, else at their vertices."""
+    found: list[SurfaceLandmarks] = []
+    for name, value in vertices.items():
+        vertex, place = _count(value), json_object(places.get(name))
+        if vertex is None or vertex >= n:
+            continue
+        one = SurfaceLandmarks.of({name: vertex})
+        try:
+            corners = np.array([place["vertices"]], dtype=np.int32)
+            weights = np.array([place["barycentric"]], dtype=np.float64)
+            distance = np.array([place["distance_mm"]], dtype=np.float64) / mm
+            exact = SurfaceLandmarks((name,), corners, weights, distance)
+            one = exact if dict(exact) == dict(one) and corners.max() < n else one
+        except (KeyError, ValueError, TypeError, OverflowError):
+            pass  # not as `facts_of` writes it, which leaves the vertex
+        found.append(one)
+    return SurfaceLandmarks().joined(*found)
 
 
 def total_variance(model: LinearModel) -> float | None:

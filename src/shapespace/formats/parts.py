@@ -6,7 +6,7 @@ basis and spread is that product, and a basis that is not orthonormal loses noth
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Protocol
@@ -17,7 +17,7 @@ from scipy.linalg import qr, svd
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import ModelFileError
-from shapespace.types import FloatArray, IntArray, read_only
+from shapespace.types import FloatArray, IntArray, SurfaceLandmarks, read_only
 
 ORTHOGONAL: Final = 1e-3
 _LARGEST = 1e30
@@ -54,7 +54,7 @@ class LinearModel:
         expression: modes that come on top of those of identity, or None.
         faces: (M, 3) counter-clockwise from outside, or None for a point model.
         mm: how many mm one unit of the file is; None where the format does not say, which is then taken as mm.
-        landmarks: name -> vertex.
+        landmarks: named points on the surface; a mapping of name to vertex may be given for those at vertices.
         n_training: how many shapes it was made of; None where the file does not say.
         held_out: whether its variances hold for new shapes as they stand, as those of a Gaussian process do; those of
             the shapes that the modes were found in do not.
@@ -68,7 +68,7 @@ class LinearModel:
     expression: Modes | None = None
     faces: IntArray | None = None
     mm: float | None = None
-    landmarks: Mapping[str, int] = field(default_factory=lambda: dict[str, int]())
+    landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     n_training: int | None = None
     held_out: bool = False
     provenance: str = ""
@@ -77,6 +77,7 @@ class LinearModel:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mean", read_only(self.mean))
+        object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
 
     def noting(self, *notes: str) -> LinearModel:
         """Return it with more `notes`."""
@@ -100,15 +101,16 @@ class LinearModel:
             wrong = "it holds numbers that are not finite, or too large for lengths"
         elif any(block.names and len(block.names) != block.moved.shape[1] for block in blocks):
             wrong = "it has another number of names than of modes"
-        elif self.faces is not None and not _are_triangles(self.faces, n):
+        elif self.faces is not None and not are_triangles(self.faces, n):
             wrong = f"its triangles are of the shape {self.faces.shape}, or name vertices that it does not have"
-        elif any(not 0 <= vertex < n for vertex in self.landmarks.values()):
+        elif bool((self.landmarks.corners >= n).any()):
             wrong = "a landmark lies at a vertex that it does not have"
         if wrong:
             raise ModelFileError(f"{path} is no usable shape model: {wrong}; export it again from where it was made.")
 
 
-def _are_triangles(faces: IntArray, n: int) -> bool:
+def are_triangles(faces: IntArray, n: int) -> bool:
+    """Whether `faces` is (F, 3) with indices of `n` vertices."""
     return faces.ndim == 2 and faces.shape[1] == 3 and (not len(faces) or (faces.min() >= 0 and faces.max() < n))
 
 

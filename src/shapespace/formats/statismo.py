@@ -16,19 +16,22 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, are_measurable, scaled
+from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
+from shapespace.geometry.landmarks import place_landmarks
 from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
 from shapespace.io.files import write_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.landmarks import LANDMARK_FORMATS
 from shapespace.io.vtk import read_vtk
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from where it was made"
 _LARGEST_BYTES = 2**31
 _POINTS_AT = 1e-3
-"""Of the extent of the model; landmarks farther from every vertex are at none."""
+"""Share of the extent of the model; landmarks farther from its surface are not on it."""
+_SINGLE = 2e-6
+"""Share of the size of the model by which single precision may move a point."""
 _UNIT_LENGTH = 1e-2
 _BFM_MODES = 199
 _BFM_LICENCE = "Basel Face Model: non-commercial research only, see its licence"
@@ -120,7 +123,7 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         expression=expression,
         faces=faces,
         mm=_mm(tree, root, told),
-        landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), notes, path),
+        landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), faces, notes, path),
         n_training=_n_training(tree, root, part, told),
         # Not so of Gaussian processes: fits that took their variances as they stand were too sure of themselves.
         held_out=told.get("held_out") == "yes",
@@ -276,25 +279,31 @@ def _n_training(tree: Tree, root: str, part: _Part, told: Mapping[str, str]) -> 
     return None
 
 
-def _landmarks(tree: Tree, surfaces: Sequence[FloatArray], notes: list[str], path: Path) -> dict[str, int]:
-    """Return the vertices that the file's landmarks, which are points, lie at, on the surface that they are nearest."""
+def _landmarks(
+    tree: Tree, surfaces: Sequence[FloatArray], faces: IntArray | None, notes: list[str], path: Path
+) -> SurfaceLandmarks:
+    """Return the file's landmarks, which are points, on the surface that they are nearest.
+
+    Args:
+        tree: of the file.
+        surfaces: (V, 3) vertices of the reference and of the mean, in the file's unit.
+        faces: (F, 3) triangles of both.
+        notes: takes a sentence on landmarks that are left out.
+        path: of the file.
+    """
     found = _landmark_points(tree, path)
     if not found:
-        return {}
-    places = np.stack(list(found.values()))
-    best: tuple[FloatArray, npt.NDArray[np.int64]] | None = None
-    for surface in surfaces:
-        away2 = np.stack([((surface - place) ** 2).sum(axis=1) for place in places])
-        nearest = away2.argmin(axis=1)
-        away = np.sqrt(away2[np.arange(len(places)), nearest])
-        if best is None or away.sum() < best[0].sum():
-            best = away, nearest
-    assert best is not None
-    limit = _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
-    at = {name: int(vertex) for name, away, vertex in zip(found, *best, strict=True) if away <= limit}
-    if len(at) < len(found):
-        notes.append(f"{len(found) - len(at)} of {len(found)} landmarks lie at no vertex and are left out.")
-    return at
+        return SurfaceLandmarks()
+    own = faces if faces is not None and are_triangles(faces, len(surfaces[0])) else None
+    placed = [place_landmarks(Mesh(surface, own), found, precision=_SINGLE) for surface in surfaces]
+    best = min(placed, key=lambda one: float(one.distance_mm.sum()))
+    there = best.distance_mm <= _POINTS_AT * float(np.ptp(surfaces[0], axis=0).max())
+    if not there.all():
+        notes.append(
+            f"{int((~there).sum())} of {len(found)} landmarks lie more than {100 * _POINTS_AT:g} % of the extent of "
+            "the model off its surface and are left out."
+        )
+    return best.select([name for name, is_there in zip(best.names, there, strict=True) if is_there])
 
 
 def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:

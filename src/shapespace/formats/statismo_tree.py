@@ -101,8 +101,8 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
         growing.add_catalogue("shape", "color", "expression")
         said.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
     if model.landmarks:
-        # As single precision has them, so that they lie at the vertices that the file has.
-        at = {name: model.mean[vertex].astype(np.float32).astype(float) for name, vertex in model.landmarks.items()}
+        # On the surface as single precision has it, so that they lie on that of the file.
+        at = model.landmarks.positions(model.mean.astype(np.float32).astype(np.float64))
         growing.texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(at)
     blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
     kept = sum(float((block.moved**2).sum()) for block in blocks)

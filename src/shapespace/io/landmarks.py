@@ -19,7 +19,7 @@ from shapespace.io.files import read_bytes, write_text
 from shapespace.io.limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.parsing import damaged, json_value, xml_root
 from shapespace.io.tables import as_written, rows_text
-from shapespace.types import FloatArray
+from shapespace.types import FloatArray, SurfaceLandmarks
 
 Pairs = list[tuple[str, FloatArray]]
 # A label names each of its points, so a long one would be there as often as it has points.
@@ -121,7 +121,7 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
     """
     path = Path(path)
     rows = _csv_rows(_content(path), path)
-    if not rows or [cell.lower() for cell in rows[0][:2]] != ["name", "vertex"]:
+    if not _has_vertex_header(rows):
         raise damaged(path, "it does not start with the header 'name,vertex'")
     indices: dict[str, int] = {}
     for row in rows[1:]:
@@ -131,6 +131,95 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
             raise damaged(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
         indices[row[0]] = int(row[1])
     return indices
+
+
+_CORNER_COLUMNS = (("vertex", "weight"), ("vertex_2", "weight_2"), ("vertex_3", "weight_3"))
+_DISTANCE_COLUMN = "distance_mm"
+
+
+def is_of_vertices(path: Path | str) -> bool:
+    """Return whether a CSV file has the header of landmarks on vertices, `name,vertex`, and not one of points.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: it is empty, or not comma-separated text.
+    """
+    path = Path(path)
+    return _has_vertex_header(_csv_rows(_content(path), path))
+
+
+def _has_vertex_header(rows: list[list[str]]) -> bool:
+    return bool(rows) and [cell.lower() for cell in rows[0][:2]] == ["name", "vertex"]
+
+
+def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
+    """Read landmarks on surfaces in correspondence, from CSV; `#` for comments.
+
+    The header is `name,vertex`, for landmarks at vertices, or that of `write_surface_landmarks`.
+
+    Args:
+        path: the file; vertices count from 0.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: another header, a name twice, a vertex that is not a whole number from 0, or coordinates that
+            are not barycentric.
+    """
+    path = Path(path)
+    indices = read_landmark_indices(path)
+    rows = _csv_rows(_content(path), path)
+    header = [cell.lower() for cell in rows[0]]
+    columns = [name for pair in _CORNER_COLUMNS for name in pair]
+    try:
+        if not set(columns) <= set(header):
+            return SurfaceLandmarks.of(indices)
+        cells = [dict(zip(header, row, strict=False)) for row in rows[1:]]
+        corners = [[_index(row[vertex]) for vertex, _ in _CORNER_COLUMNS] for row in cells]
+        weights = [[float(row[weight]) for _, weight in _CORNER_COLUMNS] for row in cells]
+        distance = [float(row.get(_DISTANCE_COLUMN) or 0.0) for row in cells]
+        return SurfaceLandmarks(
+            tuple(indices), np.reshape(corners, (-1, 3)), np.reshape(weights, (-1, 3)), np.array(distance)
+        )
+    except InputError as error:
+        raise FileFormatError(f"Cannot read {path}: {error}") from error
+    except (KeyError, ValueError, OverflowError) as error:
+        raise damaged(path, "it has a row without three vertices and their weights") from error
+
+
+def _index(cell: str) -> int:
+    if not cell.isascii() or not cell.isdecimal():
+        raise ValueError("not a whole number")
+    return int(cell)
+
+
+def write_surface_landmarks(path: Path | str, landmarks: SurfaceLandmarks) -> None:
+    """Write landmarks on surfaces in correspondence as CSV, exactly, whole or not at all.
+
+    Each row has the vertices of a triangle and their weights, which are barycentric coordinates, the largest first, and
+    how far the given point lay from the surface. Landmarks that are all at vertices are written as `name,vertex`.
+
+    Args:
+        path: the file.
+        landmarks: on the surfaces; vertices count from 0.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    if landmarks.are_vertices:
+        write_landmark_indices(path, landmarks)
+        return
+    header = ["name", *(name for pair in _CORNER_COLUMNS for name in pair), _DISTANCE_COLUMN]
+    rows = [
+        [name, *(text for pair in zip(corners, weights, strict=True) for text in map(repr, pair)), repr(distance)]
+        for name, corners, weights, distance in zip(
+            landmarks.names,
+            landmarks.corners.tolist(),
+            landmarks.barycentric.tolist(),
+            landmarks.distance_mm.tolist(),
+            strict=True,
+        )
+    ]
+    write_text(Path(path), rows_text([header, *rows]))
 
 
 def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None:

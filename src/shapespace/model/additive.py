@@ -30,7 +30,7 @@ from shapespace.model.new_shapes import HeldOut, variances_of_new_shapes
 from shapespace.model.pca import modes_for_variance, principal_components
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
 _STILL_ROUNDS = 3
 _STILL_SHAPES = 60
@@ -123,7 +123,7 @@ class AdditiveModel:
             still_share: how many those are, as a share of all.
             kin: (N,) names of those that are left out together when variances are found, such as a face and its mirror
                 image; None takes `subjects`.
-            landmarks: name -> vertex, kept in the model.
+            landmarks: of the model: named points on the surface (`place_landmarks`), or name -> vertex.
             provenance: what the meshes are, in words.
             licence: of the meshes.
 
@@ -155,7 +155,7 @@ class AdditiveModel:
             n_training=len(meshes),
             faces=faces,
             gauge=gauge,
-            landmarks=landmarks or {},
+            landmarks=SurfaceLandmarks.of(landmarks or {}),
             provenance=provenance,
             licence=licence,
             held_out=True,

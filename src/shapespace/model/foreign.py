@@ -100,7 +100,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "faces": linear.faces,
         # Others align rigidly and leave size in the modes.
         "gauge": "form",
-        "landmarks": linear.landmarks,
+        "landmarks": replace(linear.landmarks, distance_mm=linear.landmarks.distance_mm * mm),
         "representation": "vertices",
         "coding": {},
         "provenance": linear.provenance,

@@ -22,7 +22,7 @@ from shapespace.geometry.surface import part_of
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.pca import PrincipalComponents, checked_modes, fix_signs, modes_for_variance, principal_components
 from shapespace.model.ppca import Ppca, ppca
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 MIN_SEEN = 0.5
 """Share of the shapes that must show a vertex for it to be in a model, where nobody says how many."""
@@ -87,11 +87,15 @@ class Kept:
         number = np.cumsum(self.vertices, dtype=np.int32) - 1
         return {name: number[at[self.vertices[at]]] for name, at in regions.items() if self.vertices[at].any()}
 
-    def landmarks(self, landmarks: Mapping[str, int]) -> dict[str, int]:
-        """Return those that lie on kept vertices, in their new numbers."""
-        number = np.cumsum(self.vertices) - 1
-        there = {name: at for name, at in landmarks.items() if not 0 <= at < len(number) or self.vertices[at]}
-        return {name: int(number[at]) if 0 <= at < len(number) else at for name, at in there.items()}
+    def landmarks(self, landmarks: Mapping[str, int]) -> SurfaceLandmarks:
+        """Return the landmarks whose vertices are all kept, in their new numbers.
+
+        Raises:
+            InputError: a landmark on a vertex that the meshes do not have.
+        """
+        given = SurfaceLandmarks.of(landmarks)
+        given.check(len(self.vertices))
+        return given.renumbered(self.vertices)
 
     def indices(self, vertices: IntArray | None) -> IntArray | None:
         """Return those of `vertices` that are kept, in their new numbers; None stays None."""

@@ -1,4 +1,8 @@
-"""The model file: one HDF5 file with everything that the model is. Version 1."""
+"""The model file: one HDF5 file with everything that the model is.
+
+Version 2 stores landmarks as triangles and barycentric coordinates. A model whose landmarks are all vertices is still
+written as version 1, which stores vertices: earlier versions of shapespace can read it, and it keeps its hash.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +20,22 @@ from shapespace.errors import FileFormatError, ModelFileError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.hdf5 import Attribute, content_hash, read_hdf5, write_hdf5
 from shapespace.io.json_files import plain_json
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import FloatArray, IntArray, SurfaceLandmarks
 from shapespace.version import __version__
 
 FORMAT_NAME = "shapespace model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+_VERSION_OF_VERTICES = 1
+"""The version that stores landmarks as vertices."""
 _HELD_OUT = "held out"
 _RESIDUALS = "residuals"
 _REGIONS = "regions"
-_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS)
+_CORNERS, _BARYCENTRIC, _DISTANCE = "landmark_corners", "landmark_barycentric", "landmark_distance_mm"
+_EVERY_MODEL = ("mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE)
 """What is not of one representation."""
 _UNIT_TOLERANCE = 1e-3
 _TOLD = 200
-_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS)
+_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS)
 
 
 class _Told(Struct, frozen=True):
@@ -55,7 +62,7 @@ class ModelFields(TypedDict):
     n_training: int
     faces: IntArray | None
     gauge: Gauge
-    landmarks: Mapping[str, int]
+    landmarks: SurfaceLandmarks
     representation: str
     coding: Mapping[str, npt.NDArray[Any]]
     provenance: str
@@ -90,16 +97,20 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     if model["residuals"] is not None:
         arrays[_RESIDUALS] = model["residuals"]
     arrays.update(model["coding"])
+    landmarks = model["landmarks"]
+    if has_places := not landmarks.are_vertices:
+        arrays[_CORNERS], arrays[_BARYCENTRIC] = landmarks.corners, landmarks.barycentric
+        arrays[_DISTANCE] = landmarks.distance_mm
     attributes: dict[str, Attribute] = {
         "format": FORMAT_NAME,
-        "format_version": FORMAT_VERSION,
+        "format_version": FORMAT_VERSION if has_places else _VERSION_OF_VERTICES,
         "units": "mm",
         "variance_divisor": _HELD_OUT if model["held_out"] else "N - 1",
         "gauge": model["gauge"],
         "representation": model["representation"],
         "total_variance": model["total_variance"],
         "n_training": model["n_training"],
-        "landmarks": json.dumps(dict(model["landmarks"])),
+        "landmarks": json.dumps(dict(landmarks)),
         "provenance": model["provenance"],
         "licence": model["licence"],
     }
@@ -121,6 +132,14 @@ def _regions(told: str, vertices: IntArray | None) -> dict[str, IntArray]:
     return dict(zip(counts, np.split(vertices, ends[:-1]), strict=True)) if vertices is not None else {}
 
 
+def _landmarks(vertices: Mapping[str, int], arrays: Mapping[str, npt.NDArray[Any]]) -> SurfaceLandmarks:
+    """Return landmarks of version 2: their arrays, with the names of the attribute and its nearest vertices."""
+    found = SurfaceLandmarks(tuple(vertices), arrays[_CORNERS], arrays[_BARYCENTRIC], arrays[_DISTANCE])
+    if dict(found) != dict(vertices):
+        raise ValueError("landmarks do not belong to their triangles")
+    return found
+
+
 def load(path: Path) -> ModelFields:
     """Return the fields of the `ShapeModel` in `path`.
 
@@ -135,14 +154,14 @@ def load(path: Path) -> ModelFields:
     if attributes.get("format") != FORMAT_NAME:
         raise ModelFileError(f"{path} is HDF5 but not a shapespace model; give a file written by shapespace build.")
     version = attributes.get("format_version")
-    if version != FORMAT_VERSION:
+    if version not in (_VERSION_OF_VERTICES, FORMAT_VERSION):
         raise ModelFileError(
             f"{path} is a model of format version {str(version)[:40]}, but this shapespace reads "
-            f"version {FORMAT_VERSION}; update shapespace."
+            f"versions {_VERSION_OF_VERTICES} and {FORMAT_VERSION}; update shapespace."
         )
     try:
         told = msgspec.convert(attributes, _Told)
-        landmarks = msgspec.convert(plain_json(told.landmarks), dict[str, int])
+        vertices = msgspec.convert(plain_json(told.landmarks), dict[str, int])
         for name, array in arrays.items():
             if array.dtype != (np.int32 if name in _WHOLE_NUMBERS else np.float64):
                 raise ValueError(f"{name} is of the type {array.dtype}")
@@ -161,7 +180,7 @@ def load(path: Path) -> ModelFields:
             "total_variance": told.total_variance,
             "n_training": told.n_training,
             "gauge": told.gauge,
-            "landmarks": landmarks,
+            "landmarks": _landmarks(vertices, owned) if version == FORMAT_VERSION else SurfaceLandmarks.of(vertices),
             "representation": told.representation,
             "coding": {name: array for name, array in owned.items() if name not in _EVERY_MODEL},
             "provenance": told.provenance,

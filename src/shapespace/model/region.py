@@ -92,7 +92,6 @@ def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
     rows = whole.vertex_basis.reshape(whole.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
     basis, stddev, lift = np.linalg.svd(rows * whole.stddev, full_matrices=False)
     kept = stddev > _FAINTEST * stddev[0]
-    number = np.cumsum(inside) - 1
     model = ShapeModel(
         mean=mean.ravel(),
         basis=basis[:, kept],
@@ -101,7 +100,7 @@ def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
         n_training=whole.n_training,
         faces=faces,
         gauge=whole.gauge,
-        landmarks={name: int(number[at]) for name, at in whole.landmarks.items() if inside[at]},
+        landmarks=whole.landmarks.renumbered(inside),
         held_out=whole.held_out,
     )
     return Part(model, inside, lift[kept].T)

@@ -41,7 +41,7 @@ from shapespace.model.streamed import (
     too_large,
 )
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, common_faces, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +51,8 @@ _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
 _TOLD = 300
 _FILES: weakref.WeakKeyDictionary[ShapeModel, Path] = weakref.WeakKeyDictionary()
+_PLACES = "landmark_places"
+"""In the state of a model: landmarks between vertices, as plain arrays."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
 """Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
@@ -71,7 +73,7 @@ class ShapeModel:
         n_training: number of training shapes.
         faces: (F, 3) int32 or None for point models.
         gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).
-        landmarks: name -> vertex index.
+        landmarks: named points on the surface; a mapping of name to vertex may be given for those at vertices.
         representation: a name of `REPRESENTATIONS`.
         coding: the arrays of that representation; none for vertices.
         provenance: what it was made from, in words.
@@ -93,7 +95,7 @@ class ShapeModel:
     n_training: int
     faces: IntArray | None = None
     gauge: Gauge = "shape"
-    landmarks: Mapping[str, int] = field(default_factory=lambda: dict[str, int]())
+    landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     representation: str = "vertices"
     coding: Mapping[str, npt.NDArray[Any]] = field(default_factory=lambda: dict[str, npt.NDArray[Any]]())
     provenance: str = ""
@@ -133,24 +135,28 @@ class ShapeModel:
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "basis", basis)
         object.__setattr__(self, "stddev", stddev)
-        object.__setattr__(self, "landmarks", MappingProxyType({str(k): int(v) for k, v in self.landmarks.items()}))
+        object.__setattr__(self, "landmarks", SurfaceLandmarks.of(self.landmarks))
         object.__setattr__(self, "total_variance", float(self.total_variance))
         object.__setattr__(self, "n_training", int(self.n_training))
         object.__setattr__(self, "coding", MappingProxyType(dict(self._coder.arrays())))
         checked = Mesh(self._coder.decode(mean), self.faces, name="model")
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
-        _refuse_far_landmarks(self.landmarks, len(checked.vertices))
+        self.landmarks.check(len(checked.vertices))
         regions = {str(name): region_vertices(at, len(checked.vertices), name) for name, at in self.regions.items()}
         object.__setattr__(self, "regions", MappingProxyType(regions))
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
-        plain = {name: dict(getattr(self, name)) for name in ("landmarks", "coding", "regions")}
-        return {**self.fields(), **plain}
+        plain = {name: dict(getattr(self, name)) for name in ("coding", "regions", "landmarks")}
+        places = None if self.landmarks.are_vertices else self.landmarks.__getstate__()
+        return {**self.fields(), **plain, _PLACES: places}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+        fields = dict(state)  # without places in states of earlier versions
+        if places := fields.pop(_PLACES, None):
+            fields["landmarks"] = SurfaceLandmarks(**places)
+        self.__init__(**fields)  # type: ignore[misc]
 
     @classmethod
     def fit(
@@ -184,7 +190,7 @@ class ShapeModel:
             gauge: `form` aligns rigidly and leaves size in the modes; `shape` divides size out.
             align: False takes the meshes as they stand.
             alignment_vertices: indices that carry the alignment, such as forehead and nose when expressions vary.
-            landmarks: name -> vertex index, kept in the model.
+            landmarks: of the model: named points on the surface (`place_landmarks`), or name -> vertex.
             representation: `vertices`; `bspline`, control points of a smooth surface; `bspline-detail`, the same
                 with what the spline cannot hold of the mean added to every shape.
             control_points: along u and v of a B-spline; None for 24 each.
@@ -225,7 +231,7 @@ class ShapeModel:
                 tell=tell,
             )
             if len(meshes):
-                _refuse_far_landmarks(landmarks or {}, len(meshes[0].vertices))
+                SurfaceLandmarks.of(landmarks or {}).check(len(meshes[0].vertices))
             about = {"landmarks": landmarks or {}, "provenance": provenance, "licence": licence}
             return cls._of_streamed(stream, modes, seed, keep_shapes, tell, about)
         meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
@@ -473,8 +479,7 @@ class ShapeModel:
     def mesh(self, b: npt.ArrayLike = ()) -> Mesh:
         """Return the shape with coefficients `b` (k,) mm as a mesh with the model's triangles and landmarks."""
         vertices = self.reconstruct(b)
-        landmarks = {name: vertices[index] for name, index in self.landmarks.items()}
-        return Mesh(vertices, self.faces, landmarks, name="model")
+        return Mesh(vertices, self.faces, self.landmarks.positions(vertices), name="model")
 
     def project(self, shape: Mesh | FloatArray, *, align: bool = True) -> FloatArray:
         """Return the coefficients b (K,), mm, of a shape in vertex correspondence: b = P^T (Q - mean) (eq 19).
@@ -673,12 +678,6 @@ def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntA
     region = found.astype(np.int32)
     region.setflags(write=False)
     return region
-
-
-def _refuse_far_landmarks(landmarks: Mapping[str, int], n_vertices: int) -> None:
-    for name, vertex in landmarks.items():
-        if not 0 <= vertex < n_vertices:
-            raise InputError(f"Landmark {name!r} is at vertex {vertex}, which the model does not have.")
 
 
 def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray) -> None:

@@ -167,7 +167,12 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
         "n_modes": model.n_modes,
         "n_training": model.n_training,
         "gauge": model.gauge,
-        "landmarks": {name: int(place[vertex]) for name, vertex in model.landmarks.items()},
+        "landmarks": {
+            name: {"vertices": place[corners].tolist(), "weights": weights.tolist()}
+            for name, corners, weights in zip(
+                model.landmarks.names, model.landmarks.corners, model.landmarks.barycentric, strict=True
+            )
+        },
         "provenance": model.provenance,
         "licence": model.licence,
     }

@@ -22,7 +22,7 @@ from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
 from shapespace.statistics.methods_answer import methods_parts
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
-from shapespace.types import BoolArray, FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
 _SHOWN = 2
@@ -328,7 +328,7 @@ def _told_grey(found: Asymmetry) -> str:
 
 
 def _points(found: Asymmetry) -> TablePart:
-    of = {v: name for name, v in (found.cohort.landmarks or {}).items()}
+    of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
         TableColumn(name="point"), _lengths(found).column("directional"), TableColumn(name="p", kind="p"),
         _lengths(found).column("fluctuating"),

@@ -37,7 +37,7 @@ from shapespace.statistics.change_repeat import Repeatability, Rescans
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
 from shapespace.statistics.dispersion import DispersionTest, dispersion_test
 from shapespace.statistics.observed import weights_of
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 WHOLE = "whole"
 """What the whole surface is called beside its regions."""
@@ -94,12 +94,12 @@ def change(
         )
     groups = _groups(cohort, settings, visits, single)
     stable = stable_vertices(cohort, settings.stable)
-    landmarks = dict(cohort.landmarks or {})
+    landmarks = cohort.landmarks or SurfaceLandmarks()
     regions = _regions(cohort, settings)
     parts = np.zeros((len(regions), cohort.n_vertices))
     for row, vertices in zip(parts, regions.values(), strict=True):
         row[vertices] = 1.0
-    rescans = Rescans(cohort.reference, faces_in(cohort), list(landmarks.values()), parts)
+    rescans = Rescans(cohort.reference, faces_in(cohort), landmarks, parts)
     drafts: list[_Draft] = []
     source: Literal["rescans", "fits", "stable"] = (
         "rescans" if visits.rescans else "fits" if cohort.fitted is not None else "stable"
@@ -110,9 +110,7 @@ def change(
         found = aligned(cohort, own, stable)
         rescans.add(found)
         if len(own) > 1:
-            drafts.append(
-                _draft(cohort, name, found, list(landmarks.values()), parts, source, visits.unit, closed=closed)
-            )
+            drafts.append(_draft(cohort, name, found, landmarks, parts, source, visits.unit, closed=closed))
             before += found.means[0]
             moved += found.means[-1] - found.means[0]
         if on_step is not None:
@@ -172,7 +170,7 @@ def _draft(
     cohort: Cohort,
     name: str,
     found: Aligned,
-    landmarks: list[int],
+    landmarks: SurfaceLandmarks,
     parts: FloatArray,
     source: Literal["rescans", "fits", "stable"],
     unit: str,
@@ -208,7 +206,7 @@ def _draft(
             known = known_by_fits(cohort, found, weights, landmarks, parts)
         else:
             known = Known(np.zeros(len(area)), np.zeros(len(landmarks)), np.zeros(len(parts)))
-        moved = np.tensordot(weights, found.means[:, landmarks], axes=1)
+        moved = landmarks.interpolate(np.tensordot(weights, found.means, axes=1))
         sums.append(
             Estimate(
                 weights @ along,
@@ -296,15 +294,16 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
         return answer
     asked = [effect_of(subject, rate=settings.rate) for subject in subjects]
     maps = np.stack([one.along_mm for one in asked])
-    blank = _blank(subjects)
+    blank, landmarks = _blank(subjects), answer.landmarks
+    at_landmarks = landmarks.interpolate(maps.T)
+    at_landmarks[blank[landmarks.corners].any(axis=1)] = 0.0
     # Without variation a vertex is found nowhere, and takes no part in the maxima.
     maps[:, blank] = 0.0
     volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
-    vertices = list(answer.landmarks.values())
     run = (settings.permutations, settings.seed)
     unequal = settings.unequal_variances
-    whole, few = np.ones(len(answer.parts)), np.ones(len(vertices))
+    whole, few = np.ones(len(answer.parts)), np.ones(len(landmarks))
     names: tuple[str, ...] = tuple(sorted(set(groups.values())))
     second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
     return replace(
@@ -312,7 +311,7 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
         blank=blank if blank.any() else None,
         group=mean_test(maps, area, *run),
         group_volumes=mean_test(volumes, whole, *run),
-        group_landmarks=mean_test(maps[:, vertices], few, *run) if vertices else None,
+        group_landmarks=mean_test(at_landmarks.T, few, *run) if landmarks else None,
         between=None if second is None else difference_test(maps, second, area, *run, unequal_variances=unequal),
         between_volumes=None
         if second is None

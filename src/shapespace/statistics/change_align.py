@@ -14,7 +14,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.regions import read_region
 from shapespace.model.shape_model import region_vertices
-from shapespace.types import FloatArray, IntArray, Similarity
+from shapespace.types import FloatArray, IntArray, Similarity, SurfaceLandmarks
 
 SEARCHED = 1500
 """Vertices among which the stable part is searched."""
@@ -71,13 +71,13 @@ def _near_landmarks(cohort: Cohort, text: str) -> IntArray:
     radius_mm = NEAR_MM
     if len(words) > 1 and words[-1].replace(".", "", 1).isdecimal():
         radius_mm = float(words.pop())
-    known = dict(cohort.landmarks or {})
+    known = cohort.landmarks or SurfaceLandmarks()
     lacking = next((word for word in words if word not in known), None)
     if lacking is not None:
         there = ", ".join(sorted(known)) or "none"
         raise InputError(f"There is no landmark {lacking[:40]!r} to align by; the surfaces have {there}.")
-    marks = cohort.reference[[known[word] for word in words]]
-    away = np.linalg.norm(cohort.reference[:, None] - marks, axis=2).min(axis=1)
+    places = known.select(words).interpolate(cohort.reference)
+    away = np.linalg.norm(cohort.reference[:, None] - places, axis=2).min(axis=1)
     return np.flatnonzero(away <= radius_mm).astype(np.int32)
 
 

@@ -239,8 +239,8 @@ def _region_table(change: Found, test: MapTest) -> Part:
 
 def _group_landmarks(change: Found, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
     rows: list[list[Any]] = []
-    for at, (name, vertex) in enumerate(change.landmarks.items()):
-        values = np.array([effect_of(one, rate=change.settings.rate).along_mm[vertex] for one in change.subjects])
+    maps = np.stack([effect_of(one, rate=change.settings.rate).along_mm for one in change.subjects])
+    for at, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
         low, high = interval_of_mean(values)
         rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[at]])
     return ("landmark", "mean", "stddev", "low", "high", "p"), rows
@@ -289,9 +289,13 @@ def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
             for at, name in enumerate(change.parts)
         ),
         *(
-            (f"{name} (mm)", float(within), float(smallest), float(found.icc[vertex]))
-            for (name, vertex), within, smallest in zip(
-                change.landmarks.items(), found.landmarks_within_mm, found.landmarks_smallest_mm, strict=True
+            (f"{name} (mm)", float(within), float(smallest), float(icc))
+            for name, within, smallest, icc in zip(
+                change.landmarks.names,
+                found.landmarks_within_mm,
+                found.landmarks_smallest_mm,
+                change.landmarks.interpolate(found.icc),
+                strict=True,
             )
         ),
     ]
@@ -458,6 +462,7 @@ def _tables(change: Found) -> dict[str, Rows]:
 
 def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[object]]:
     found, known = subject.change, change.repeatability
+    along, stddev = change.landmarks.interpolate(np.stack([found.along_mm, found.stddev_mm], axis=1)).T
     smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
     return [
         (
@@ -466,11 +471,11 @@ def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[objec
             *map(float, found.landmarks_mm[at]),
             float(np.linalg.norm(found.landmarks_mm[at])),
             float(found.landmarks_stddev_mm[at]),
-            float(found.along_mm[vertex]),
-            float(found.stddev_mm[vertex]),
+            float(along[at]),
+            float(stddev[at]),
             smallest[at],
         )
-        for at, (name, vertex) in enumerate(change.landmarks.items())
+        for at, name in enumerate(change.landmarks.names)
     ]
 
 

@@ -20,7 +20,7 @@ from shapespace.statistics.change_repeat import Repeatability
 from shapespace.statistics.change_visits import visits_of
 from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
-from shapespace.types import BoolArray, FloatArray, Mesh
+from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 NINETY_FIVE = 1.96
 """Standard deviations that noise exceeds one time in twenty."""
@@ -173,7 +173,7 @@ class Found:
         groups: names of the two groups, in order.
         before: (V, 3) mean of the first visits,
         after: and moved by the mean change.
-        landmarks: name -> vertex.
+        landmarks: on the surfaces.
         parts: names of what volumes are told of: `whole` and the regions.
         unit: of time, as in `mm per year`; empty where times are words.
         closed: whether the surface is.
@@ -195,7 +195,7 @@ class Found:
     groups: tuple[str, ...]
     before: FloatArray
     after: FloatArray
-    landmarks: Mapping[str, int]
+    landmarks: SurfaceLandmarks
     parts: tuple[str, ...]
     unit: str
     closed: bool

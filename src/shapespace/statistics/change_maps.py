@@ -12,7 +12,7 @@ from shapespace.geometry.similarity import fit_similarity, small_poses
 from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
 from shapespace.statistics.change_align import align_by
 from shapespace.statistics.change_visits import Visit
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _RIGID = 6
 """Of the poses: turns and shifts."""
@@ -130,7 +130,7 @@ class Known:
     volumes_mm3: FloatArray
 
 
-def known_by_stable(subject: Aligned, landmarks: Sequence[int], parts: FloatArray) -> Known:
+def known_by_stable(subject: Aligned, landmarks: SurfaceLandmarks, parts: FloatArray) -> Known:
     """Return what the spread over the stable part says, which did not change; the same at all vertices."""
     moved = subject.means[-1] - subject.means[0]
     along = np.einsum("vd,vd->v", moved, subject.normals)
@@ -140,7 +140,7 @@ def known_by_stable(subject: Aligned, landmarks: Sequence[int], parts: FloatArra
 
 
 def known_by_fits(
-    cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: Sequence[int], parts: FloatArray
+    cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: SurfaceLandmarks, parts: FloatArray
 ) -> Known:
     """Return what the fits' own standard deviations say, through modes and alignment.
 
@@ -152,7 +152,7 @@ def known_by_fits(
         cohort: of fits.
         subject: aligned.
         weights: (T,) of the sum over visits.
-        landmarks: vertices.
+        landmarks: on the surfaces.
         parts: (P, V) of which volumes are swept, 1 for their vertices and 0 for the others.
     """
     fitted, faces = cohort.fitted, faces_in(cohort)
@@ -171,7 +171,7 @@ def known_by_fits(
     for w, visit in zip(weights, subject.visits, strict=True):
         variance += (w / len(visit.rows)) ** 2 * (fitted.b_stddev[list(visit.rows)] ** 2).sum(axis=0)
     along = np.einsum("vdk,vd->vk", moves, subject.normals) ** 2 @ variance
-    marks = (moves[list(landmarks)] ** 2).sum(axis=1) @ variance
+    marks = (landmarks.interpolate(moves) ** 2).sum(axis=1) @ variance
     vectors = np.repeat(face_vectors(subject.means.mean(axis=0), faces) / 6.0, 3, axis=0)
     outward = np.stack([np.bincount(faces.ravel(), vectors[:, d], len(centre)) for d in range(3)], axis=1)
     volumes = (parts @ np.einsum("vdk,vd->vk", moves, outward)) ** 2 @ variance

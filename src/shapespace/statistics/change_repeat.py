@@ -9,7 +9,7 @@ import numpy as np
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_areas
 from shapespace.statistics.change_maps import Aligned, swept_mm3
-from shapespace.types import FloatArray, IntArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 SMALLEST = 1.96 * float(np.sqrt(2.0))
 """Of the within-subject standard deviation: the smallest detectable change of one scan against another."""
@@ -64,13 +64,13 @@ class Rescans:
     Args:
         reference: (V, 3) in whose frame people are compared.
         faces: (F, 3).
-        landmarks: vertices.
+        landmarks: on the surfaces.
         parts: (P, V) of which volumes are swept, the whole first; 1 for their vertices and 0 for the others.
     """
 
     reference: FloatArray
     faces: IntArray
-    landmarks: list[int]
+    landmarks: SurfaceLandmarks
     parts: FloatArray
     scans: int = 0
     visits: int = 0
@@ -89,7 +89,7 @@ class Rescans:
         for scans in chosen:
             off = scans - scans.mean(axis=0)
             self._along += (np.einsum("nvd,vd->nv", off, subject.normals) ** 2).sum(axis=0)
-            self._marks += (off[:, self.landmarks] ** 2).sum(axis=(0, 2))
+            self._marks += (self.landmarks.interpolate(np.moveaxis(off, 1, 0)) ** 2).sum(axis=(1, 2))
             self._volume += _squares(self._swept(subject.means[0], scans) @ self.parts.T)
             self.scans += len(scans)
             self.visits += 1

@@ -151,9 +151,9 @@ def _near(cohort: Cohort, vertex: int) -> str:
     """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
     if not cohort.landmarks:
         return ""
-    names, places = list(cohort.landmarks), np.array(list(cohort.landmarks.values()))
-    far = np.linalg.norm(cohort.reference[places] - cohort.reference[vertex], axis=1)
-    return f" near {names[int(far.argmin())]}"
+    places = cohort.landmarks.interpolate(cohort.reference)
+    far = np.linalg.norm(places - cohort.reference[vertex], axis=1)
+    return f" near {cohort.landmarks.names[int(far.argmin())]}"
 
 
 def _column(name: str, kind: Any = "text") -> TableColumn:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shapespace.cli.answers.common import add_cohort, cohort_of, finish
+
+if TYPE_CHECKING:
+    from shapespace.types import SurfaceLandmarks
 
 
 def add(sub: argparse.ArgumentParser) -> None:
@@ -24,7 +27,8 @@ def add(sub: argparse.ArgumentParser) -> None:
                      help="a part whose volume is told too: a CSV file of vertices; can be repeated (default: the "
                      "regions of the model)")  # fmt: skip
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
-                     help="CSV of name,vertex (default: those of the model)")  # fmt: skip
+                     help="CSV of name,vertex, or landmarks.csv of shapespace correspond (default: those of the "
+                     "model)")  # fmt: skip
     sub.add_argument("--group", metavar="COLUMN", help="two groups whose changes are compared")
     sub.add_argument("--unequal-variances", action="store_true",
                      help="of --group: allow one to vary more than the other (Welch's t, sign flips)")  # fmt: skip
@@ -66,17 +70,17 @@ def run(arguments: argparse.Namespace) -> int:
     return finish(answer, arguments)
 
 
-def _landmarks(path: Path, n_vertices: int) -> dict[str, int]:
+def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:
     from shapespace.errors import InputError
-    from shapespace.io.landmarks import read_landmark_indices
+    from shapespace.io.landmarks import read_surface_landmarks
 
-    found = read_landmark_indices(path)
-    far = next((name for name, vertex in found.items() if vertex >= n_vertices), None)
-    if far is not None:
-        raise InputError(
-            f"{path}: landmark {far[:40]!r} is at vertex {found[far]}, but the surfaces have {n_vertices}; give "
-            "landmarks of these surfaces."
-        )
+    found = read_surface_landmarks(path)
+    for name, vertex in zip(found.names, found.corners.max(axis=1).tolist(), strict=True):
+        if vertex >= n_vertices:
+            raise InputError(
+                f"{path}: landmark {name[:40]!r} is at vertex {vertex}, but the surfaces have {n_vertices}; give "
+                "landmarks of these surfaces."
+            )
     return found
 
 

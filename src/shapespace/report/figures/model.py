@@ -68,7 +68,7 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
     mean = model.mesh()
     layers = [Layer(mean)]
     if model.landmarks:
-        at = mean.vertices[list(model.landmarks.values())]
+        at = model.landmarks.interpolate(mean.vertices)
         size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
         layers.append(Layer(Mesh(at), _LANDMARK, point_radius_mm=size))
     panels: list[Image] = []

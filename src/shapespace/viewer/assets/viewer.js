@@ -194,12 +194,17 @@
     drawMarks(stage.a, $("marks").checked);
   }
 
+  // Where a landmark lies on a surface: `at` has the vertices of its triangle and their barycentric weights.
+  function onSurface(positions, at) {
+    return [0, 1, 2].map((axis) => at.vertices.reduce((sum, v, k) => sum + at.weights[k] * positions[3 * v + axis], 0));
+  }
+
   let hasMarks = false;
   function drawMarks(view, wanted) {
     if (!wanted && !hasMarks) return;
     const entries = Object.entries(model.facts.landmarks);
-    view.marks("landmarks", wanted ? entries.map(([label, v]) => ({
-      position: [positions[3 * v], positions[3 * v + 1], positions[3 * v + 2]], label, colour: LEFT_RED,
+    view.marks("landmarks", wanted ? entries.map(([label, at]) => ({
+      position: onSurface(positions, at), label, colour: LEFT_RED,
     })) : []);
     hasMarks = wanted;
   }
@@ -907,8 +912,8 @@
       }
       stage.a.marks("placed", Array.from(placed, ([label, position]) => ({ position, label, colour: LEFT_RED })));
       stage.b.marks("landmarks", about.landmarks.map((name) => {
-        const v = model.facts.landmarks[name], wanted = name === mine.placing.current;
-        return { position: Array.from(model.mean.slice(3 * v, 3 * v + 3)), label: wanted ? name : "", colour: wanted ? LEFT_RED : placed.has(name) ? [0.1, 0.45, 0.28] : [0.6, 0.6, 0.6] };
+        const at = model.facts.landmarks[name], wanted = name === mine.placing.current;
+        return { position: onSurface(model.mean, at), label: wanted ? name : "", colour: wanted ? LEFT_RED : placed.has(name) ? [0.1, 0.45, 0.28] : [0.6, 0.6, 0.6] };
       }));
     }
     const names = h("div", { class: "names", role: "group", "aria-label": "Which landmark" }, ...about.landmarks.map((name) => h("button", {
