@@ -795,6 +795,118 @@ class Recognition(Struct, frozen=True, kw_only=True):
 # analysis.json
 
 
+class SampleSize(Struct, frozen=True, kw_only=True):
+    """Number of subjects and of shapes in a class of one variable, or in a combination of classes of several."""
+
+    variables: tuple[str, ...]
+    classes: tuple[str, ...]
+    subjects: int
+    shapes: int
+
+
+class TestScheme(Struct, frozen=True, kw_only=True):
+    """How the p values of one or more terms were computed.
+
+    Args:
+        tested: terms, or other quantities.
+        stratum: in which they are tested; empty where there is one.
+        statistic: such as `F`, `Welch t` or `R2`; empty for p values of a distribution.
+        resampling: permutations of rows, sign flips of rows, bootstrap draws, leaving out each unit, or none.
+        unit: what is permuted or flipped, such as `subject`.
+        reduced_model: terms of the model whose residuals are resampled; empty for the mean; None where values
+            themselves are.
+        arrangements: number of them, the observed data among them.
+        exhaustive: whether these are all there are.
+        unequal_variances: whether the test allows groups of unequal dispersion.
+    """
+
+    __test__: ClassVar = False  # no test class of pytest
+
+    tested: tuple[str, ...]
+    statistic: str = "F"
+    stratum: str = ""
+    resampling: Literal["permutation", "sign flips", "bootstrap", "leave-one-out", "none"] = "permutation"
+    unit: str = "subject"
+    reduced_model: tuple[str, ...] | None = ()
+    arrangements: int = 0
+    exhaustive: bool = False
+    unequal_variances: bool = False
+
+
+class Dispersion(Struct, frozen=True, kw_only=True):
+    """A test of equal dispersion of groups.
+
+    Args:
+        variable: whose classes are the groups.
+        stratum: in which residuals are taken; empty where there is one.
+        groups: classes with two or more members.
+        counts: members of each.
+        stddev: standard deviation of each about its mean, RMS over the vertices, in `Methods.unit`.
+        f: F of the distances to the group mean.
+        p: by permutation of these distances.
+        arrangements: number of permutations, the observed data among them.
+        equal: whether p is above the level of significance.
+        smaller_is_more_variable: whether smaller groups have the larger dispersion; None where neither is so.
+    """
+
+    variable: str
+    groups: tuple[str, ...]
+    counts: tuple[int, ...]
+    stddev: tuple[float, ...]
+    f: float | None
+    p: float
+    arrangements: int
+    equal: bool
+    stratum: str = ""
+    smaller_is_more_variable: bool | None = None
+
+
+class Methods(Struct, frozen=True, kw_only=True):
+    """What a methods section states about an analysis.
+
+    Args:
+        subjects: number of subjects.
+        shapes: number of shapes.
+        vertices: number of vertices of a shape.
+        gauge: `shape` divides size out, `form` keeps it.
+        source: of the shapes: coefficients, fitted, dense, corresponding, or other surfaces.
+        modes: of the model that the shapes are combinations of; None where they are not limited to modes.
+        explained_variance_ratio: share of the model's training variance in these modes; None as for `modes`.
+        dimensions: of the space that is analysed; None where maps of vertices are.
+        analysed_variance_ratio: share of the variance of the cohort in these dimensions.
+        unit: of lengths: `mm`, or empty for coordinates without a unit.
+        level: of significance.
+        sizes: subjects and shapes of each class, and of each combination of classes.
+        tests: how p values were computed.
+        dispersions: tests of equal dispersion.
+        unequal_variances: whether tests allow unequal dispersion; None where no groups are compared.
+        effect_size: transformation before Z is standardised, `box-cox` or `log`; empty where no Z is given.
+        r2_strata: strata of whose total sum of squares R² is a share; an empty name is the whole. None where no R² is.
+        corrected_over: sets over which p values are corrected for multiple testing; all others are not corrected.
+        assumptions: what the tests assume beyond these, a sentence each.
+    """
+
+    subjects: int
+    shapes: int
+    vertices: int
+    gauge: str = "shape"
+    source: str = "surfaces"
+    modes: int | None = None
+    explained_variance_ratio: float | None = None
+    dimensions: int | None = None
+    analysed_variance_ratio: float = 1.0
+    unit: Literal["mm", ""] = "mm"
+    level: float = 0.05
+    sizes: tuple[SampleSize, ...] = ()
+    tests: tuple[TestScheme, ...] = ()
+    dispersions: tuple[Dispersion, ...] = ()
+    unequal_variances: bool | None = None
+    effect_size: Literal["box-cox", "log", ""] = ""
+    r2_strata: tuple[str, ...] | None = None
+    corrected_over: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
+
+
 class Analysis(Recognition, frozen=True, kw_only=True):
     """An analysis.json: an answer about a cohort, by the command in `question`, as parts like those of a study."""
 
@@ -806,6 +918,7 @@ class Analysis(Recognition, frozen=True, kw_only=True):
     format: str = FORMAT
     question: str = ""
     notes: tuple[str, ...] = ()
+    methods: Methods | None = None
 
     @classmethod
     def from_json(cls, content: object, where: str = "analysis.json", again: str = ANALYSIS_AGAIN) -> Self:

@@ -34,6 +34,18 @@ def test_a_table_becomes_a_report_with_all_its_numbers(run: Run, tmp_path: Path)
     assert np.array_equal(low.faces, high.faces)
 
 
+def test_unequal_variances_effect_size_and_no_unit_are_settings_of_the_answer(run: Run, tmp_path: Path) -> None:
+    table = people(run, tmp_path / "people", "--effect", "4")
+    more = ("--permutations", "40", "--no-maps", "--unequal-variances", "--effect-size", "log", "--no-unit", "--json")
+    told = run("compare", table, "--formula", "~ sex", *more, "-o", tmp_path / "answer")
+    assert told.code == 0, told.err
+    settings, methods = told.facts["settings"], told.facts["methods"]
+    assert settings["unequal_variances"] is True and settings["effect_size"] == "log"
+    assert methods["unit"] == "" and methods["unequal_variances"] is True and methods["effect_size"] == "log"
+    assert [test["resampling"] for test in methods["tests"]] == ["sign flips"]
+    assert not any(" mm" in sentence for sentence in told.facts["summary"])
+
+
 def test_a_formula_that_cannot_be_ends_in_one_sentence(run: Run, tmp_path: Path) -> None:
     table = people(run, tmp_path / "people")
     for formula, word in (("~ weight", "no column"), ("~ __import__('os')", "__import__"), ("~ expression", "groups")):

@@ -1,6 +1,7 @@
 """Asymmetry: the ANOVA is that of Klingenberg, what is put in comes back with its interval, and nonsense is refused."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -250,6 +251,18 @@ def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:
     answer = found.answer()
     points = next(p for p in answer.parts if p.title == "Points")
     assert {row[0] for row in points.rows} >= {"left", "right", "chin"}  # type: ignore[attr-defined]
+
+
+def test_landmarks_without_a_unit_are_never_in_mm_and_the_methods_name_each_test(thing: Symmetric) -> None:
+    found = measure_asymmetry(replace(people(thing, 6, 2, 3), unit=""), pairs=thing.pairs, permutations=9)
+    answer = found.answer()
+    assert not any(re.search(r"\bmm\b|mm²", sentence) for sentence in answer.summary)
+    assert not any(head.endswith(("_mm", "_mm2")) for header, _ in answer.tables.values() for head in header)
+    schemes = {one.tested: (one.resampling, one.arrangements) for one in found.methods.tests}
+    assert schemes["side", "directional asymmetry of each vertex"] == ("sign flips", 10)
+    assert schemes["individual", "individual x side"] == ("permutation", 10)
+    assert [(one.classes, one.subjects, one.shapes) for one in found.methods.sizes] == [(("2",), 6, 12)]
+    assert "Methods" in [part.title for part in answer.parts]
 
 
 def test_the_answer_can_be_read_and_says_what_is_not_known(thing: Symmetric, tmp_path: Path) -> None:

@@ -448,6 +448,52 @@ def test_volumes_below_a_tenth_of_a_millilitre_are_stated_in_cubic_millimetres(m
     assert f"volume, {unit}" in columns and f"stddev, {unit}" in columns
 
 
+def uneven(arms: int = 16) -> Cohort:
+    """Changes whose mean is alike in both arms, and three times as variable in the smaller one."""
+    rng = np.random.default_rng(1)
+    arm = ["treated" if k < arms // 4 else "control" for k in range(arms)]
+    # Standard deviations in mm of the height of the bump.
+    return pairs([rng.normal(0, 3.0 if name == "treated" else 1.0) * bump() for name in arm], arm=arm)
+
+
+def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_analysis(tmp_path: Path) -> None:
+    found = asked(uneven(), group="arm", permutations=199, stable="all")
+    (one,) = found.methods.dispersions
+    assert not one.equal and one.smaller_is_more_variable and one.counts == (12, 4) and found.dispersion is not None
+    answer = found.answer()
+    (warning,) = [sentence for sentence in answer.summary if sentence.startswith("Warning: dispersion")]
+    assert "differences are found that do not exist" in warning and "--unequal-variances" in warning
+    kept = json.loads(answer.save(tmp_path).read_text())
+    assert kept["methods"]["dispersions"][0]["equal"] is False
+    allowed = asked(uneven(), group="arm", permutations=199, stable="all", unequal_variances=True)
+    assert allowed.between is not None and allowed.between.unequal_variances
+    assert not [sentence for sentence in allowed.answer().summary if sentence.startswith("Warning: dispersion")]
+    assert allowed.between.omnibus_p > found.between.omnibus_p if found.between is not None else False
+
+
+def test_the_methods_count_subjects_of_each_group_and_name_each_test() -> None:
+    found = asked(uneven(), group="arm", permutations=199, stable="all")
+    sizes = {one.classes: (one.subjects, one.shapes) for one in found.methods.sizes}
+    assert sizes == {("control",): (12, 24), ("treated",): (4, 8)}
+    assert [(one.resampling, one.statistic) for one in found.methods.tests] == [
+        ("sign flips", "t"),
+        ("permutation", "t"),
+    ]
+    assert found.methods.unit == "mm" and found.methods.unequal_variances is False
+    last = [part.title for part in found.answer().parts][-4:]
+    assert last == ["Methods", "Sample sizes", "Tests", "Equal dispersion of groups"]
+
+
+def test_an_interval_of_a_map_holds_the_effect_and_not_0_where_p_is_small() -> None:
+    rng = np.random.default_rng(3)
+    maps = rng.normal(size=(12, 30)) + 2.0 * (np.arange(30) < 5)
+    test = mean_test(maps, np.ones(30), 400, 0)
+    for vertex in range(30):
+        low, high = test.interval(vertex)
+        assert low < test.effect[vertex] < high
+        assert (low > 0 or high < 0) == (test.p[vertex] <= 0.05)
+
+
 def test_one_subject_alone_has_maps_and_no_test() -> None:
     found = asked(pairs([2 * bump()], rescans=True))
     assert found.group is None
@@ -528,6 +574,7 @@ def test_shapes_without_size_and_points_are_refused() -> None:
     cohort = cells(**PAIR)
     assert "gauge form" in refusal(replace(cohort, gauge="shape"), order=ORDER)
     assert "triangles" in refusal(replace(cohort, faces=None), order=ORDER)
+    assert "no unit" in refusal(replace(cohort, unit=""), order=ORDER)
 
 
 def test_a_stable_region_is_read_from_a_file_and_found_in_the_model(tmp_path: Path) -> None:

@@ -1,6 +1,9 @@
 """Linear models of shape: sums of squares by a plain oracle, permutation, blocks, maps, and what is refused."""
 
 import itertools
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,12 @@ from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import PARTS, Analysis, json_text
+from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
 from shapespace.statistics.compare_formula import FUNCTIONS, design_of
 from shapespace.statistics.compare_within import strata_of
+from shapespace.statistics.effect_size import EFFECT_SIZES, effect_size
 from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
@@ -588,3 +592,159 @@ def test_no_bump_is_found_where_there_is_none() -> None:
         assert made is not None and made.bump is not None
         found += bool((made.bump.p_family <= 0.05).any())
     assert found <= 4
+
+
+# Unequal variances, dispersion, methods and the summary.
+
+
+def unequal_groups(spread: float = 2.0, seed: int = 0, effect: float = 0.0) -> Cohort:
+    """6 female and 18 male shapes, of which the female ones vary `spread` times as much."""
+    sex = ["female"] * 6 + ["male"] * 18
+    points, faces = surface()
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(24, *points.shape)) * np.where(np.array(sex) == "female", spread, 1.0)[:, None, None]
+    noise[:6, :, 2] += effect
+    table = {"sex": sex, "age": rng.uniform(20, 60, 24).tolist()}
+    return Cohort.of_shapes(points + noise, table, faces=faces, align=False)
+
+
+def test_with_unequal_variances_f_of_two_classes_is_the_squared_welch_t_of_the_whole_and_of_each_vertex() -> None:
+    shapes = unequal_groups()
+    found = compare(shapes, "~ sex", CompareOptions(permutations=20, unequal_variances=True))
+    flat = np.stack([shapes.vertices(k) for k in range(24)])
+    one, other = flat[:6], flat[6:]
+    variance = one.var(axis=0, ddof=1) / 6 + other.var(axis=0, ddof=1) / 18
+    squared = (one.mean(axis=0) - other.mean(axis=0)) ** 2
+    assert found.test("sex").f == pytest.approx(squared.sum() / variance.sum(), rel=1e-8)
+    (effect,) = found.effects
+    assert effect.f == pytest.approx(found.test("sex").f, rel=1e-8) and effect.p == found.test("sex").p
+    assert effect.map is not None
+    np.testing.assert_allclose(effect.map.any_way.f, squared.sum(axis=1) / variance.sum(axis=1), rtol=1e-8)
+
+
+def test_a_covariate_and_three_classes_keep_their_estimates_with_unequal_variances() -> None:
+    table = people()
+    plain = compare(cohort(table), "~ site * age", QUICK)
+    allowed = compare(cohort(table), "~ site * age", replace(QUICK, unequal_variances=True))
+    for one, other in zip(plain.effects, allowed.effects, strict=True):
+        np.testing.assert_allclose(one.change, other.change)
+    for one, other in zip(plain.tests, allowed.tests, strict=True):
+        assert (one.term, one.df, one.squares, one.r2) == (other.term, other.df, other.squares, other.r2)
+        # Of equal variances the two statistics estimate the same ratio.
+        assert 0.4 < one.f / other.f < 2.5
+
+
+def test_unequal_dispersion_warns_unless_the_test_allows_it_and_stands_in_the_analysis() -> None:
+    found = compare(unequal_groups(), "~ sex + age", CompareOptions(permutations=200, maps=False))
+    (test,) = found.dispersions
+    assert test.variable == "sex" and test.p <= 0.01 and test.ratio == pytest.approx(2.0, abs=0.3)
+    assert found.warnings[0].startswith("Warning: dispersion is unequal")
+    assert "differences are found that do not exist" in found.warnings[0]
+    analysis = json.loads(json_text(found.answer().analysis()))
+    assert analysis["methods"]["dispersions"][0]["equal"] is False and found.warnings[0] in analysis["summary"]
+    allowed = CompareOptions(permutations=200, maps=False, unequal_variances=True)
+    assert not [one for one in compare(unequal_groups(), "~ sex", allowed).warnings if "ispersion" in one]
+    equal = compare(unequal_groups(1.0), "~ sex", CompareOptions(permutations=200, maps=False))
+    assert equal.methods.dispersions[0].equal and not [one for one in equal.warnings if "ispersion" in one]
+
+
+def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:
+    shapes = unequal_groups().take(range(2, 24))
+    found = compare(shapes, "~ sex", CompareOptions(permutations=40, maps=False, unequal_variances=True))
+    assert found.warnings[0].startswith("Warning: sex has a class of 4 subjects")
+
+
+def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_variances() -> None:
+    rng = np.random.default_rng(0)
+    subjects = [f"s{k}" for k in range(14) for _ in range(4)]
+    table = {
+        "subject": subjects,
+        "sex": ["f" if int(name[1:]) < 5 else "m" for name in subjects],
+        "visit": ["before", "before", "after", "after"] * 14,
+    }
+    points, _ = surface()
+    own = rng.normal(size=(14, 2, *points.shape)) * np.where(np.arange(14) < 5, 3.0, 1.0)[:, None, None, None]
+    noise = 0.3 * rng.normal(size=(56, *points.shape))
+    shapes = points + noise + own[np.arange(56) // 4, (np.arange(56) // 2) % 2]
+    given = Cohort.of_shapes(shapes, table, align=False)
+    options = CompareOptions(blocks="subject", permutations=40, maps=False, unequal_variances=True)
+    found = compare(given, "~ sex * visit", options)
+    assert [(one.variable, one.stratum) for one in found.dispersions] == [
+        ("sex", "between subject"), ("sex", "within subject: visit")
+    ]  # fmt: skip
+    assert all(one.counts == (5, 9) and one.p <= 0.05 for one in found.dispersions)
+    cells = shapes.reshape(14, 2, 2, -1).mean(axis=2)
+    for values, term in ((cells.mean(axis=1), "sex"), (cells[:, 1] - cells[:, 0], "sex:visit")):
+        one, other = values[:5], values[5:]
+        variance = one.var(axis=0, ddof=1) / 5 + other.var(axis=0, ddof=1) / 9
+        expected = ((one.mean(axis=0) - other.mean(axis=0)) ** 2).sum() / variance.sum()
+        assert found.test(term).f == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(InputError, match=r"Unequal variances are not available for .*visit"):
+        compare(given, "~ sex * visit", replace(options, random="1 | subject"))
+
+
+def test_the_methods_name_the_sample_the_residuals_and_the_unit() -> None:
+    table = people()
+    found = compare(cohort(table), "~ sex * site + age", QUICK)
+    methods = found.methods
+    sizes = {one.classes: one.subjects for one in methods.sizes}
+    assert sizes["female",] + sizes["male",] == 37 and sizes["female", "a"] == sum(
+        one == ("female", "a") for one in zip(table["sex"], table["site"], strict=True)
+    )
+    reduced = {one.tested: one.reduced_model for one in methods.tests}
+    assert reduced["sex",] == ("site", "age") and reduced["sex:site",] == ("sex", "site", "age")
+    assert {one.resampling for one in methods.tests} == {"permutation"} and methods.r2_strata == ("",)
+    (stated,) = [part for part in found.answer().parts if isinstance(part, TextPart) and part.title == "Methods"]
+    text = " ".join(stated.text)
+    for words in ("37 shapes of 37 subjects", "Exchangeability", "R² is the share", "Box-Cox", "Lengths are in mm"):
+        assert words in text
+    assert "not corrected" not in text and "Nothing is corrected over the number of terms" in text
+
+
+def test_lengths_of_landmarks_without_a_unit_are_never_mm() -> None:
+    shapes = unequal_groups()
+    scaled = np.stack([shapes.vertices(k) for k in range(24)])
+    scaled = scaled - scaled.mean(axis=1, keepdims=True)
+    scaled /= np.linalg.norm(scaled, axis=(1, 2), keepdims=True)
+    table = {name: list(values) for name, values in shapes.table.columns.items() if name in ("sex", "age")}
+    found = compare(Cohort.of_shapes(scaled, table, faces=shapes.faces), "~ sex + age", CompareOptions(permutations=40))
+    answer = found.answer()
+    assert found.cohort.unit == "" and not any(re.search(r"\bmm", one) for one in answer.summary)
+    parts = json_text([replace_arrays(part) for part in answer.parts])
+    assert not re.search(r"\bmm\b|mm²", parts) and "no unit" in parts
+    assert all("mm" not in head for header, _ in answer.tables.values() for head in header)
+
+
+def replace_arrays(part: Any) -> Any:
+    """Return a part without the names of its arrays, which belong to the format."""
+    import msgspec
+
+    given = msgspec.structs.asdict(part)
+    return {key: value for key, value in given.items() if key not in ("arrays", "values", "mask")}
+
+
+def test_a_map_is_exploratory_unless_its_term_is_significant_and_has_an_interval() -> None:
+    def sentences(effect: float, seed: int) -> list[str]:
+        found = compare(unequal_groups(1.0, seed, effect), "~ sex", CompareOptions(permutations=200, level=0.05))
+        return [one for one in found.answer().summary if "of the vertices differ" in one]
+
+    (shown,) = sentences(2.0, 0)
+    assert "exploratory" not in shown and re.search(r"simultaneous 95 % interval [+-]\d.* to [+-]\d", shown)
+    found = compare(unequal_groups(1.0), "~ sex", CompareOptions(permutations=200))
+    (effect,) = found.effects
+    assert effect.exploratory == (found.test("sex").p > 0.05)
+    assert effect.map is not None
+    for vertex in range(SIDE * SIDE):
+        low, high = effect.map.interval_mm(vertex)
+        assert (low > 0 or high < 0) == (effect.map.shown.p_family[vertex] <= 0.05)
+
+
+def test_z_by_logarithms_is_an_option() -> None:
+    table = people(30)
+    found = {
+        kind: compare(cohort(table), "~ sex", replace(QUICK, effect_size=kind)).test("sex") for kind in EFFECT_SIZES
+    }
+    for kind, test in found.items():
+        assert test.z == effect_size(test.arrangements, kind)
+    with pytest.raises(InputError, match="no effect size 'cube'"):
+        CompareOptions(effect_size="cube")  # type: ignore[arg-type]

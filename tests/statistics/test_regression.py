@@ -372,6 +372,8 @@ def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regress
     assert "Their age is known: RMSE" in said
     told = json.loads(answer.save(tmp_path).read_text())
     assert [read_part(part, "part").title for part in told["parts"]][:2] == ["On subjects left out", "Calibration"]
+    assert told["methods"]["subjects"] == 60
+    assert {test["resampling"] for test in told["methods"]["tests"]} <= {"permutation", "bootstrap"}
     rows = (tmp_path / "predictions.csv").read_text().splitlines()
     assert rows[0] == "scan,subject,observed,predicted,low,high,baseline" and len(rows) == 61
     alone = predicted_answer(learned.predictor, new, learned.predictor.predict(new))

@@ -156,6 +156,9 @@ def test_what_the_model_left_and_what_the_modes_cannot_make_are_said_to_be_outsi
         and "more than of all of the reference" in found.outside[0][0]
     )
     assert "left 9.00 mm of the scan" in found.outside[1][0] and found.outside[2] == ("its fit is doubtful",)
+    methods = found.methods
+    assert methods.dimensions == 2 and methods.analysed_variance_ratio == found.variance_share
+    assert [one.resampling for one in methods.tests] == ["leave-one-out", "none"]
     summary = found.answer().summary
     assert sum("outside what is known" in sentence for sentence in summary) == 3
 

@@ -29,10 +29,14 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandm
 SUBJECT = "subject"
 """The column that says whose a shape is, unless another is named."""
 
+LengthUnit: TypeAlias = Literal["mm", ""]
+"""Unit of the lengths of a cohort; empty for coordinates without a unit."""
 ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding", "surfaces"]
 """Kinds of shapes: model coefficients or surfaces of fits, surfaces written by `correspond`, or any other surfaces."""
 
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
+_UNIT_SIZE = 1e-2
+"""Tolerance of unit centroid sizes, by which aligned coordinates are known; tangent projection changes them by less."""
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
@@ -130,6 +134,7 @@ class Cohort:
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
         source: where the shapes come from.
+        unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
         analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
             nothing varies. None if all are analysed.
@@ -147,6 +152,7 @@ class Cohort:
     fitted: Fitted | None = None
     notes: tuple[str, ...] = ()
     source: ShapeSource = ShapeSource()
+    unit: LengthUnit = "mm"
     observed: BoolArray | None = None
     analysed: BoolArray | None = None
 
@@ -280,6 +286,7 @@ class Cohort:
         landmarks: Mapping[str, int] | None = None,
         onto: Cohort | None = None,
         least: int = 2,
+        unit: LengthUnit | None = None,
         observed: BoolArray | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
@@ -297,6 +304,8 @@ class Cohort:
             landmarks: named points on the surfaces (`place_landmarks`), or name -> vertex.
             onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
             least: how many shapes there must be, where `onto` is None.
+            unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
+                after a Procrustes superimposition, which divides the unit out.
             observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
 
         Raises:
@@ -338,6 +347,7 @@ class Cohort:
         cohort = Cohort(
             called, read_only(reference), basis, coefficients, sizes, Table(cells, called), gauge, faces,
             None if landmarks is None else SurfaceLandmarks.of(landmarks), observed=mask, analysed=analysed,
+            unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
         )  # fmt: skip
         refuse_twice(cohort)
         return cohort

@@ -16,7 +16,7 @@ from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import write_rows
 from shapespace.reprs import short_repr
-from shapespace.schemas import Analysis, Part, Target, json_text
+from shapespace.schemas import Analysis, Methods, Part, TableColumn, Target, json_text
 from shapespace.types import Mesh
 from shapespace.version import __version__
 
@@ -26,6 +26,52 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 
 LESS_SO_THAT_NONE_FLIPS = "Drawn smaller than it is, so that no triangle turns over."
 """The note of a morph whose full size would turn triangles over."""
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """How lengths are written: in mm, or without a unit where the coordinates have none.
+
+    Args:
+        unit: `mm`, or empty.
+    """
+
+    unit: str
+
+    def number(self, value: float, sign: str = "") -> str:
+        """Return a length without its unit; those of coordinates without a unit are small shares of the size.
+
+        Args:
+            value: the length.
+            sign: `+` for a sign of positive lengths too.
+        """
+        return f"{value:{sign}.{2 if self.unit else 4}f}"
+
+    def text(self, value: float, sign: str = "") -> str:
+        """Return a length with its unit; arguments as of `number`."""
+        return self.number(value, sign) + self.suffix
+
+    @property
+    def suffix(self) -> str:
+        """The unit after a space; empty for none."""
+        return f" {self.unit}" if self.unit else ""
+
+    def column(self, name: str) -> TableColumn:
+        """Return the column of lengths of a table in a report."""
+        return TableColumn(name=name, kind="mm" if self.unit else "number")
+
+    def label(self, name: str, power: str = "") -> str:
+        """Return a name of lengths with its unit, such as `score, mm`; `power` is `²` for areas."""
+        return f"{name}, {self.unit}{power}" if self.unit else name
+
+    def field(self, name: str, power: str = "") -> str:
+        """Return the name of a column of a file, such as `rms_mm`; `power` is `2` for areas."""
+        return f"{name}_{self.unit}{power}" if self.unit else name
+
+    @property
+    def of_map(self) -> str:
+        """The unit of a map."""
+        return self.unit or "units of the coordinates"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +90,7 @@ class Answer:
         notes: who was left out and why, a sentence each.
         settings: all that the result depends on, seeds among it.
         model_hashes: of the models of the fits.
+        methods: sample sizes, tests and assumptions, which the last parts state in words; None of predictions alone.
     """
 
     question: str
@@ -59,6 +106,7 @@ class Answer:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     model_hashes: tuple[str, ...] = ()
+    methods: Methods | None = None
 
     __repr__ = short_repr
 
@@ -76,6 +124,7 @@ class Answer:
             settings=self.settings,
             versions={"shapespace": __version__, "numpy": np.__version__},
             model_hashes=self.model_hashes,
+            methods=self.methods,
         )
 
     def save(self, folder: Path | str) -> Path:

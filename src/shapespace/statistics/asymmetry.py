@@ -8,6 +8,7 @@ told, which is how far the sides are apart.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +25,9 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
 from shapespace.reprs import listed_briefly, short_repr
+from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
+from shapespace.statistics.methods import methods_of
 from shapespace.statistics.observed import weights_of
 from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
@@ -150,6 +153,36 @@ class Asymmetry:
             off = self.difference - self.difference.mean(axis=0)
             return np.sqrt((off**2).sum(axis=(0, 2)) / (len(off) - 1))
         return self.maps.std(axis=0, ddof=1)
+
+    @cached_property
+    def methods(self) -> Methods:
+        """Sample sizes, tests and assumptions."""
+        tests: list[TestScheme] = []
+        if self.permutations:
+            count = 1 + self.permutations
+            flipped = ("side", "directional asymmetry of each vertex")
+            tests.append(TestScheme(tested=flipped, resampling="sign flips", reduced_model=None, arrangements=count))
+            permuted = tuple(one.source for one in self.anova if one.p is not None and one.source != "side")
+            if permuted:
+                tests.append(TestScheme(tested=permuted, unit="shape", reduced_model=None, arrangements=count))
+        paired = (
+            "given or found by mirroring the mean" if self.sides.paired else "the nearest place of the mirror image"
+        )
+        return methods_of(
+            self.cohort, len(self.subjects), vertices=len(self.sides),
+            sizes=tuple(
+                SampleSize(variables=("shapes of a subject",), classes=(str(count),), subjects=of, shapes=count * of)
+                for count, of in sorted(Counter(map(int, self.counts)).items())
+            ),
+            tests=tuple(tests),
+            corrected_over=("the vertices of a map",) if tests else (),
+            assumptions=(
+                f"Shapes and their mirror images are superimposed together; partners of vertices are {paired}. Sums of "
+                "squares are over all vertices of shapes and images, with the degrees of freedom of Klingenberg et al. "
+                "(2002).",
+                "Scores in standard deviations are distances from the mean of the reference group, not effect sizes.",
+            ),
+        )  # fmt: skip
 
     def effect(self, source: str) -> Effect:
         """Return the row of the ANOVA of that name."""

@@ -20,8 +20,9 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Rows
+from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Lengths, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
+from shapespace.statistics.methods_answer import methods_parts
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
@@ -46,6 +47,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         _histogram(found),
         _listed(found, order),
         *pictures,
+        *methods_parts(found.methods),
     ]
     fitted = cohort.fitted
     answer = Answer(
@@ -67,29 +69,32 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
             "seed": found.seed,
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        methods=found.methods,
     )
     return with_shape_data(answer, cohort)
 
 
 def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
-    mm = found.scores.mm
+    mm, lengths = found.scores.mm, _lengths(found)
     side, both = found.effect("side"), found.effect("individual x side")
     directional = float(np.sqrt((found.directional**2).mean()))
     sentences = [
-        f"{len(found.subjects)} subjects lie {np.median(mm):.2f} mm (median; 5 to 95 %: {np.percentile(mm, 5):.2f} to "
-        f"{np.percentile(mm, 95):.2f} mm) from their own mirror images, RMS {_direction(found)}.",
-        f"On average the sides differ by {directional:.2f} mm RMS (directional asymmetry): "
+        f"{len(found.subjects)} subjects lie {lengths.text(float(np.median(mm)))} (median; 5 to 95 %: "
+        f"{lengths.number(float(np.percentile(mm, 5)))} to {lengths.text(float(np.percentile(mm, 95)))}) from their "
+        f"own mirror images, RMS {_direction(found)}.",
+        f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
         f"F = {_number(side.f)}, p = {_p(side)}.",
     ]
     if both.p is None and both.f is None:
         sentences.append(
-            "No subject was measured twice, so fluctuating asymmetry cannot be told from measurement error, and the "
-            "millimetres hold both."
+            "No subject was measured twice, so fluctuating asymmetry cannot be distinguished from measurement error, "
+            "and the lengths contain both."
         )
     else:
         sentences.append(
             f"Subjects differ in their asymmetry beyond measurement error (fluctuating asymmetry): "
-            f"F = {_number(both.f)}, p = {_p(both)}; the error alone would be taken for {found.scores.error_mm:.2f} mm "
+            f"F = {_number(both.f)}, p = {_p(both)}; the error alone would be taken for "
+            f"{lengths.text(found.scores.error_mm)} "
             "in one shape, and is subtracted."
         )
     if found.permutations:
@@ -104,15 +109,23 @@ def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
     return tuple(sentences)
 
 
+def _lengths(found: Asymmetry) -> Lengths:
+    return Lengths(found.cohort.unit)
+
+
 def _direction(found: Asymmetry) -> str:
     return "along the normals" if found.normals is not None else "over the points"
 
 
 def _told(found: Asymmetry, at: int) -> str:
-    scores = found.scores
-    interval = "" if np.isnan(scores.low[at]) else f" (95 % interval {scores.low[at]:.2f} to {scores.high[at]:.2f} mm)"
+    scores, lengths = found.scores, _lengths(found)
+    interval = (
+        ""
+        if np.isnan(scores.low[at])
+        else f" (95 % interval {lengths.number(scores.low[at])} to {lengths.text(scores.high[at])})"
+    )
     z = "" if np.isnan(found.z[at]) else f", {found.z[at]:.1f} standard deviations from the mean of the others"
-    return f"{scores.mm[at]:.2f} mm{interval}{z}"
+    return f"{lengths.text(scores.mm[at])}{interval}{z}"
 
 
 def _measured(found: Asymmetry) -> tuple[str, ...]:
@@ -158,7 +171,9 @@ def _p(effect: Effect) -> str:
 
 
 def _anova_part(found: Asymmetry) -> TablePart:
-    numbers = (TableColumn(name=name, kind="number") for name in ("SS mm²", "df", "MS mm²", "F"))
+    lengths = _lengths(found)
+    names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
+    numbers = (TableColumn(name=name, kind="number") for name in names)
     columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
     rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in found.anova)
     return TablePart(
@@ -167,15 +182,17 @@ def _anova_part(found: Asymmetry) -> TablePart:
 
 
 def _anova_rows(found: Asymmetry) -> Rows:
-    return ("source", "ss_mm2", "df", "ms_mm2", "f", "p"), [
+    field = _lengths(found).field
+    return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
         (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in found.anova
     ]
 
 
 def _subject_rows(found: Asymmetry) -> Rows:
+    field = _lengths(found).field
     header = (
-        "subject", "shapes", "asymmetry_mm", "low_mm", "high_mm", "measured_mm", "z", "z_low", "z_high", "in_reference",
-        "vertices_mm", "vertices_low_mm", "vertices_high_mm",
+        "subject", "shapes", *map(field, ("asymmetry", "low", "high", "measured")), "z", "z_low", "z_high",
+        "in_reference", *map(field, ("vertices", "vertices_low", "vertices_high")),
     )  # fmt: skip
     s, v = found.scores, found.vertex_scores
     columns = (s.mm, s.low, s.high, s.raw_mm, found.z, found.z_low, found.z_high)
@@ -203,15 +220,15 @@ def _histogram(found: Asymmetry) -> HistogramPart:
             Counts(label=label, counts=tuple(np.histogram(found.scores.mm[who], edges)[0].astype(float).tolist()))
             for label, who in series
         ),
-        x=f"asymmetry (RMS {_direction(found)}, mm)",
+        x=f"asymmetry (RMS {_lengths(found).label(_direction(found))})",
     )
 
 
 def _listed(found: Asymmetry, order: Any) -> TablePart:
-    s = found.scores
+    s, lengths = found.scores, _lengths(found)
     columns = (
-        TableColumn(name="subject"), TableColumn(name="shapes", kind="count"), TableColumn(name="asymmetry", kind="mm"),
-        TableColumn(name="low", kind="mm"), TableColumn(name="high", kind="mm"),
+        TableColumn(name="subject"), TableColumn(name="shapes", kind="count"), lengths.column("asymmetry"),
+        lengths.column("low"), lengths.column("high"),
         TableColumn(name="standard deviations", kind="number"),
     )  # fmt: skip
     rows = tuple(
@@ -320,8 +337,8 @@ def _told_grey(found: Asymmetry) -> str:
 def _points(found: Asymmetry) -> TablePart:
     of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
-        TableColumn(name="point"), TableColumn(name="directional", kind="mm"), TableColumn(name="p", kind="p"),
-        TableColumn(name="fluctuating", kind="mm"),
+        TableColumn(name="point"), _lengths(found).column("directional"), TableColumn(name="p", kind="p"),
+        _lengths(found).column("fluctuating"),
     )  # fmt: skip
     rows = tuple(
         (of.get(int(v), str(int(v))), float(found.directional[k]), _known(found.directional_p[k]),

@@ -36,6 +36,7 @@ from shapespace.statistics.change_maps import (
 )
 from shapespace.statistics.change_repeat import Repeatability, Rescans
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
+from shapespace.statistics.dispersion import DispersionTest, dispersion_test
 from shapespace.statistics.observed import weights_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, require
 
@@ -81,6 +82,8 @@ def change(
     settings = settings or ChangeSettings()
     if cohort.gauge != "form":
         raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")
+    if cohort.unit != "mm":
+        raise InputError("Changes are in millimetres, but these coordinates have no unit; give surfaces in mm.")
     if cohort.faces is None:
         raise InputError("Changes are along normals, and points have none; give surfaces with triangles.")
     if settings.permutations < 1 or settings.seed < 0:
@@ -265,6 +268,19 @@ def _groups(cohort: Cohort, settings: ChangeSettings, visits: Visits, single: Se
     return found
 
 
+def _dispersion(
+    answer: Change, maps: FloatArray, second: BoolArray, area: FloatArray, names: tuple[str, ...]
+) -> DispersionTest | None:
+    """Return the test of equal dispersion of the changes (N, V) of two groups, vertices weighted by their area."""
+    settings, codes = answer.settings, second.astype(np.intp)
+    rooted = maps * np.sqrt(area / area.mean())
+    residual = rooted - np.stack([rooted[codes == k].mean(axis=0) for k in (0, 1)])[codes]
+    leverage = 1.0 / np.bincount(codes)[codes]
+    return dispersion_test(
+        settings.group or "", residual, leverage, codes, names, maps.shape[1], settings.permutations, settings.seed
+    )
+
+
 def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
     """Return (V,) where maps of the group are blank: too few subjects observe the vertex, over all or in a group."""
     every = np.ones(len(subjects[0].area_mm2), dtype=np.bool_)
@@ -291,6 +307,7 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
     run = (settings.permutations, settings.seed)
+    unequal = settings.unequal_variances
     whole, few = np.ones(len(answer.parts)), np.ones(len(landmarks))
     names: tuple[str, ...] = tuple(sorted(set(groups.values())))
     second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
@@ -300,7 +317,10 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
         group=mean_test(maps, area, *run),
         group_volumes=mean_test(volumes, whole, *run),
         group_landmarks=mean_test(at_landmarks.T, few, *run) if landmarks else None,
-        between=None if second is None else difference_test(maps, second, area, *run),
-        between_volumes=None if second is None else difference_test(volumes, second, whole, *run),
+        between=None if second is None else difference_test(maps, second, area, *run, unequal_variances=unequal),
+        between_volumes=None
+        if second is None
+        else difference_test(volumes, second, whole, *run, unequal_variances=unequal),
         groups=names,
+        dispersion=None if second is None else _dispersion(answer, maps, second, area, names),
     )

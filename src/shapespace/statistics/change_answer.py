@@ -23,7 +23,13 @@ from shapespace.schemas import (
 )
 from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Rows
 from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
-from shapespace.statistics.change_group import MapTest
+from shapespace.statistics.change_group import LEVEL, MapTest
+from shapespace.statistics.methods_answer import (
+    dispersion_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import FloatArray, Mesh
 
@@ -31,7 +37,8 @@ ARRAYS, MAPS = "change.npz", "subjects.npz"
 SHOWN = 6
 """Subjects whose maps the report draws."""
 LISTED, CURVES = 50, 12
-_LEVEL = 0.05
+_LEVEL = LEVEL
+_MM3_PER_ML = 1000.0
 _LEAST_ML_MM3 = 100.0
 """Volumes below this, mm³, are stated in mm³ and others in ml: two decimals of 0.1 ml say too little."""
 _FEW = 10
@@ -74,7 +81,7 @@ def answer_of(change: Found) -> Answer:
         "change",
         "What changed?",
         tuple(_summary(change)),
-        tuple(parts),
+        (*parts, *methods_parts(change.methods)),
         tables=_tables(change),
         arrays={ARRAYS: arrays, MAPS: _maps(change)},
         meshes={
@@ -91,9 +98,11 @@ def answer_of(change: Found) -> Answer:
             "rate": settings.rate,
             "permutations": settings.permutations,
             "seed": settings.seed,
+            "unequal_variances": settings.unequal_variances,
             "uncertainty": change.uncertainty,
         },
         model_hashes=() if change.cohort.fitted is None else (change.cohort.fitted.model.content_hash,),
+        methods=change.methods,
     )
     return with_shape_data(answer, change.cohort)
 
@@ -127,6 +136,12 @@ def _summary(change: Found) -> list[str]:
             f"The volume of {second} changed by {unit.told(difference)} {unit.name}{_per(change)} "
             f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
         )
+        unequal = change.settings.unequal_variances
+        told += [
+            dispersion_sentence(one, unequal, "mm")
+            for one in change.methods.dispersions
+            if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
+        ]
     if change.repeatability is None:
         told.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:
@@ -139,6 +154,8 @@ def _summary(change: Found) -> list[str]:
             f"surface; {smallest.max():.2f} mm at most), and {unit.told(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
         )
+    if change.group is not None:
+        told.append(multiplicity_sentence(change.methods))
     return told
 
 
@@ -163,13 +180,17 @@ class _VolumeUnit:
 def _of_test(change: Found, test: MapTest, what: str, other: str) -> str:
     at = int(np.abs(test.t).argmax())
     found = test.p <= _LEVEL
+    low, high = test.interval(at)
     where = (
-        f"with the error over all vertices held it lies on {100 * found.mean():.0f} % of the vertices, up to "
-        f"{test.effect[found][np.abs(test.effect[found]).argmax()]:+.2f} mm{_per(change)}"
+        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * found.mean():.0f} % of the vertices differ, "
+        f"clearest by {test.effect[at]:+.2f} mm{_per(change)} (simultaneous 95 % interval {low:+.2f} to {high:+.2f} "
+        "mm)"
         if found.any()
-        else f"with the error over all vertices held it lies nowhere (smallest p = {test.p[at]:.3g})"
+        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[at]:.3g})"
     )
     differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
+    if found.any() and test.omnibus_p > _LEVEL:
+        where = f"exploratory, since the test of the whole surface is not significant: {where}"
     few = (
         f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
     )
@@ -260,7 +281,8 @@ def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) 
     }
     note = (
         f"Mean change of {second} ({test.n[1]} subjects) less that of {first} ({test.n[0]}). In full colour where the "
-        f"family-wise p is at most {_LEVEL:g}, by {test.permutations} permutations of subjects"
+        f"family-wise p is at most {_LEVEL:g}, by {test.permutations} "
+        f"{'sign flips, with unequal variances' if test.unequal_variances else 'permutations of subjects'}"
         f"{' (all there are)' if test.every else ''}."
     )
     return [

@@ -13,11 +13,14 @@ from scipy.stats import t as student
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import listed_briefly, short_repr
+from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.change_align import stable_vertices
-from shapespace.statistics.change_group import MapTest
+from shapespace.statistics.change_group import LEVEL, MapTest
 from shapespace.statistics.change_maps import aligned
 from shapespace.statistics.change_repeat import Repeatability
 from shapespace.statistics.change_visits import visits_of
+from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 NINETY_FIVE = 1.96
@@ -40,6 +43,7 @@ class ChangeSettings:
         rate: maps over the group are in mm per unit of time, rather than last visit minus first.
         permutations: of the tests.
         seed: of these.
+        unequal_variances: compare the groups by Welch's t with sign flips, which allows unequal dispersion.
     """
 
     subject: str = "subject"
@@ -51,6 +55,7 @@ class ChangeSettings:
     rate: bool = False
     permutations: int = 1000
     seed: int = 0
+    unequal_variances: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +176,7 @@ class Found:
         group_landmarks: the same of the landmarks, along the normals.
         between: test of the second group against the first, where they were asked for.
         between_volumes: the same of the volumes.
+        dispersion: test of equal dispersion of the changes of the two groups; None without groups.
         groups: names of the two groups, in order.
         before: (V, 3) mean of the first visits,
         after: and moved by the mean change.
@@ -201,7 +207,38 @@ class Found:
     unit: str
     closed: bool
     model_only: bool
+    dispersion: DispersionTest | None = None
     blank: BoolArray | None = None
+
+    @cached_property
+    def methods(self) -> Methods:
+        """Sample sizes, tests and assumptions."""
+        tests: list[TestScheme] = []
+        changes = "rate of change" if self.settings.rate else "change"
+        for tested, test in ((f"mean {changes}", self.group), (f"{changes} of two groups", self.between)):
+            if test is not None:
+                flipped = len(test.n) == 1 or test.unequal_variances
+                tests.append(
+                    TestScheme(
+                        tested=(tested,), statistic="Welch t" if test.unequal_variances else "t",
+                        resampling="sign flips" if flipped else "permutation",
+                        reduced_model=() if test.unequal_variances else None, arrangements=test.permutations,
+                        exhaustive=test.every, unequal_variances=test.unequal_variances,
+                    )
+                )  # fmt: skip
+        names = [one.name for one in self.subjects for visit in one.visits for _ in range(visit.scans)]
+        group = {one.name: one.group for one in self.subjects}
+        variables = [(self.settings.group, [group[name] for name in names])] if self.settings.group else []
+        return methods_of(
+            self.cohort, len(self.subjects), shapes=len(names), dimensions=None, tests=tuple(tests),
+            sizes=sample_sizes(names, variables),
+            dispersions=() if self.dispersion is None else (dispersion_record(self.dispersion, LEVEL),),
+            unequal_variances=None if self.between is None else self.settings.unequal_variances,
+            corrected_over=("the vertices of a map", "the parts in the table of volumes", "the landmarks of a table")
+            if tests else (),
+            assumptions=("Visits of a subject are aligned rigidly to its first by the stable part; p values do not "
+                         "contain the uncertainty of this alignment.",),
+        )  # fmt: skip
 
     @cached_property
     def by_name(self) -> Mapping[str, SubjectChange]:

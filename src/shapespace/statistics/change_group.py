@@ -1,4 +1,4 @@
-"""Tests of maps over subjects: by sign flips against none, by permutation between two groups; maxima over vertices.
+"""Tests of maps over subjects: the mean by sign flips, two groups by permutation, or by sign flips if variances differ.
 
 Nichols and Holmes, Human Brain Mapping 15, 2002; Winkler et al., NeuroImage 92, 2014.
 """
@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.reprs import short_repr
+from shapespace.statistics.dispersion import welch_flips
 from shapespace.types import BoolArray, FloatArray
 
 _BLOCK = 64
 _TIE = 1e-10
 """Share by which a statistic that is the same in other words may differ by rounding."""
 _FLOOR = 1e-12
+LEVEL = 0.05
+"""Family-wise error of maps, and one minus the confidence of their intervals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +36,9 @@ class MapTest:
         permutations: that were made, the data's own among them.
         every: whether these are all there are.
         n: subjects, or subjects of each group.
+        critical_t: of |t|, above which `p` is at most `LEVEL`; effect ± |effect / t| critical_t are simultaneous
+            intervals.
+        unequal_variances: whether t is Welch's, compared with sign flips, which allows groups of unequal variance.
     """
 
     effect: FloatArray
@@ -42,6 +48,13 @@ class MapTest:
     permutations: int
     every: bool
     n: tuple[int, ...]
+    critical_t: float
+    unequal_variances: bool = False
+
+    def interval(self, vertex: int) -> tuple[float, float]:
+        """Return the interval of the effect at a vertex, simultaneous over all vertices at the level 1 - `LEVEL`."""
+        half = abs(float(self.effect[vertex] / self.t[vertex])) * self.critical_t if self.t[vertex] else 0.0
+        return float(self.effect[vertex]) - half, float(self.effect[vertex]) + half
 
     __repr__ = short_repr
 
@@ -79,8 +92,8 @@ def mean_test(
         yield np.ones(n)
         yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
 
-    t, p, omnibus_p = _permuted(maps, area, draws(), count, t_of, on_step)
-    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,))
+    t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, on_step)
+    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,), critical)
 
 
 def difference_test(
@@ -90,11 +103,23 @@ def difference_test(
     permutations: int,
     seed: int,
     on_step: Callable[[int, int], None] | None = None,
+    *,
+    unequal_variances: bool = False,
 ) -> MapTest:
     """Return whether the mean of `maps` (N, V) differs between subjects that are `second` (N,) and those that are not.
 
-    Subjects change places between the groups, and arguments are those of `mean_test`; each group has two or more.
+    Subjects are permuted between the groups, which assumes equal variances of the groups; with `unequal_variances`
+    Welch's t is compared with sign flips of residuals instead. Other arguments are those of `mean_test`; each group has
+    two subjects or more.
     """
+    if unequal_variances:
+        t, arrangements, every = welch_flips(maps, second, area, permutations, seed)
+        largest, whole = arrangements
+        p = (len(largest) - np.searchsorted(np.sort(largest), np.abs(t) * (1 - _TIE))) / len(largest)
+        omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
+        counts = (int((~second).sum()), int(second.sum()))
+        effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
+        return MapTest(effect, t, p, omnibus, len(largest), every, counts, _critical(largest), unequal_variances=True)
     n, of_second = len(maps), int(second.sum())
     of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
@@ -121,8 +146,8 @@ def difference_test(
         rng = np.random.default_rng(seed)
         yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
 
-    t, p, omnibus_p = _permuted(centred, area, draws(), count, t_of, on_step)
-    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second))
+    t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, on_step)
+    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second), critical)
 
 
 def _permuted(
@@ -132,8 +157,8 @@ def _permuted(
     count: int,
     t_of: Callable[[FloatArray], FloatArray],
     on_step: Callable[[int, int], None] | None,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return t of the first of `draws`, its p (V,) against the maxima of all, and the p of the omnibus test."""
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return t of the first of `draws`, its p (V,) against the maxima of all, the omnibus p and the critical |t|."""
     gram = (maps * area) @ maps.T
     observed, own = np.zeros(maps.shape[1]), 0.0
     maxima: list[float] = []
@@ -150,7 +175,12 @@ def _permuted(
             on_step(len(maxima), count)
     ordered = np.sort(maxima)
     below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))
-    return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima)
+    return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima), _critical(ordered)
+
+
+def _critical(maxima: FloatArray) -> float:
+    """Return the value that the largest statistics (P,) of a share of `LEVEL` of the arrangements exceed."""
+    return float(np.sort(maxima)[-(int(LEVEL * len(maxima) * (1 + _TIE)) + 1)])
 
 
 def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:

@@ -20,6 +20,7 @@ from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
 from shapespace.late import late
 from shapespace.reprs import listed_briefly, short_repr
+from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.compare_formula import (
     Design,
@@ -31,7 +32,12 @@ from shapespace.statistics.compare_formula import (
 )
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less
+from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
 from shapespace.statistics.compare_within import Strata, Within, strata_of
+from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
+from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
+from shapespace.statistics.methods_answer import dispersion_sentence, is_dispersion_warning
 from shapespace.statistics.observed import information, weights_of
 from shapespace.types import FloatArray, read_only, require
 
@@ -62,6 +68,9 @@ class CompareOptions:
         drop_missing: leave out shapes of which something in the formula is missing, and say so.
         random: the effects within subjects that differ between subjects, such as `1 + time | subject`, instead of
             `blocks`; all others are assumed to be the same in all subjects. None for all effects.
+        unequal_variances: test with a variance for each subject and sign flips of residuals, which allows classes whose
+            dispersion differs. F is then the squared effect divided by its variance.
+        effect_size: transformation of F before Z is standardised, one of `EFFECT_SIZES`.
     """
 
     squares: SquaresType = "II"
@@ -73,6 +82,8 @@ class CompareOptions:
     level: float = 0.05
     drop_missing: bool = False
     random: str | None = None
+    unequal_variances: bool = False
+    effect_size: EffectSize = "box-cox"
 
     def __post_init__(self) -> None:
         if self.squares not in TYPES:
@@ -81,6 +92,8 @@ class CompareOptions:
             raise InputError(f"The number of permutations must lie from 20 to 1000000, not at {self.permutations}.")
         if self.seed < 0 or not 0 < self.level < 1:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
+        if self.effect_size not in EFFECT_SIZES:
+            raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
         if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
@@ -95,8 +108,8 @@ class TermTest:
         df: degrees of freedom.
         squares: sum of squares, mm².
         r2: its share of the total of the stratum.
-        f: mean square by that of the residuals.
-        z: how many standard deviations log F lies above those of the arrangements.
+        f: mean square by that of the residuals; with unequal variances, squared effect by its variance.
+        z: F in standard deviations above the mean of its arrangements, after `CompareOptions.effect_size`.
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
     """
@@ -140,10 +153,11 @@ class Effect:
         distance_mm: Procrustes distance, the root of the squared changes summed over vertices.
         rms_mm: root of their mean.
         f: squared distance by its variance.
-        z: how many standard deviations log F lies above those of the arrangements.
+        z: F in standard deviations above the mean of its arrangements, after `CompareOptions.effect_size`.
         p: share of arrangements with an F as large.
         p_family: the same by the largest F of all pairs of classes of this variable.
         map: vertex by vertex; None where it was not asked for.
+        exploratory: whether no term of this effect is significant, so that its map shows nothing that is established.
     """
 
     name: str
@@ -160,6 +174,7 @@ class Effect:
     p: float
     p_family: float
     map: EffectMap | None = None
+    exploratory: bool = False
 
     __repr__ = short_repr
 
@@ -194,6 +209,8 @@ class Comparison:
         warnings: what makes the numbers less than they look, a sentence each.
         subjects: number of subjects; that of shapes where all are independent.
         notes: how repeated shapes of subjects were tested, a sentence each.
+        dispersions: tests of equal dispersion of the classes of each variable between subjects.
+        methods: sample sizes, tests and assumptions.
     """
 
     cohort: Cohort
@@ -205,7 +222,9 @@ class Comparison:
     angles: tuple[Angle, ...]
     warnings: tuple[str, ...]
     subjects: int
+    methods: Methods
     notes: tuple[str, ...] = ()
+    dispersions: tuple[DispersionTest, ...] = ()
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -255,8 +274,8 @@ def compare(
 
     Raises:
         InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
-            covariate, terms that follow from others, more columns than shapes, or an effect within subjects that too
-            few subjects show.
+            covariate, terms that follow from others, more columns than shapes, an effect within subjects that too few
+            subjects show, or unequal variances of a class of one or of an effect that all subjects share.
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
@@ -282,10 +301,33 @@ def compare(
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + options.maps)
     step = _Steps(total, on_step)
-    tests = tuple(test for stratum in strata for test in term_tests(stratum, options, step))
-    effects = tuple(e for family in families for e in _effects(cohort, family, options, step))
+    owners = subjects if repeated else None
+    tests = tuple(
+        test
+        for stratum in strata
+        for test in term_tests(
+            stratum, options, step, units_of(stratum, design, owners) if options.unequal_variances else None
+        )
+    )
+    effects = tuple(
+        replace(effect, exploratory=_is_exploratory(effect, design, tests, options))
+        for family in families
+        for effect in _effects(cohort, family, design, owners, options, step)
+    )
+    dispersions = tuple(
+        test
+        for stratum in strata
+        if is_between_units(stratum)
+        for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, options.permutations, options.seed)
+    )
+    methods = _methods(cohort, design, strata, subjects, dispersions, options)
     warnings = (
-        *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design)
+        *(
+            dispersion_sentence(one, options.unequal_variances, cohort.unit)
+            for one in methods.dispersions
+            if is_dispersion_warning(one, unequal_variances=options.unequal_variances)
+        ),
+        *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design),
     )  # fmt: skip
     return Comparison(
         cohort=cohort,
@@ -297,7 +339,9 @@ def compare(
         angles=(*_parallel(design, made, options), *_between(effects)),
         warnings=warnings,
         subjects=len(set(subjects)) if subjects is not None else len(cohort),
+        methods=methods,
         notes=made.notes,
+        dispersions=dispersions,
     )
 
 
@@ -326,26 +370,98 @@ def _with_sizes(cohort: Cohort) -> Cohort:
     return with_columns(cohort, {name: v for name, v in sizes.items() if name not in cohort.table.columns})
 
 
+def _methods(
+    cohort: Cohort,
+    design: Design,
+    strata: Sequence[Stratum],
+    subjects: Sequence[str] | None,
+    dispersions: Sequence[DispersionTest],
+    options: CompareOptions,
+) -> Methods:
+    """Return sample sizes, tests and assumptions of a comparison."""
+    owners = cohort.names if subjects is None else subjects
+    unit = options.blocks or "shape"
+    schemes: list[TestScheme] = []
+    for stratum in strata:
+        for term in stratum.terms:
+            reduced = stratum.reduced(term, options.squares)
+            flips = options.unequal_variances or stratum.flips(reduced)
+            schemes.append(
+                TestScheme(
+                    tested=(term.label,),
+                    statistic="F, unequal variances" if options.unequal_variances else "F",
+                    stratum=stratum.name,
+                    resampling="sign flips" if flips else "permutation",
+                    unit=unit if is_between_units(stratum) else f"difference within a {unit}",
+                    reduced_model=tuple(other.label for other in reduced),
+                    arrangements=options.permutations,
+                    unequal_variances=options.unequal_variances,
+                )
+            )
+    classes = [
+        (one.name, [str(value) for value in design.values[one.column]]) for one in design.variables if one.levels
+    ]
+    return methods_of(
+        cohort,
+        len(set(owners)),
+        level=options.level,
+        sizes=sample_sizes(owners, classes),
+        tests=tuple(schemes),
+        dispersions=tuple(dispersion_record(one, options.level) for one in dispersions),
+        unequal_variances=options.unequal_variances if classes else None,
+        effect_size=options.effect_size,
+        r2_strata=tuple(stratum.name for stratum in strata),
+        corrected_over=(
+            *(("the vertices of a map (family-wise error, or false discovery rate)",) if options.maps else ()),
+            "the pairs of classes of a variable (p of all pairs)",
+        ),
+    )
+
+
+def _is_exploratory(effect: Effect, design: Design, tests: Sequence[TermTest], options: CompareOptions) -> bool:
+    """Return whether no term that contains the variables of an effect is significant."""
+    names = {one.column for one in design.variables if one.name in effect.name.split(":")}
+    own = {term.label for term in design.terms if names <= term.variables}
+    return not any(test.term in own and test.p <= options.level for test in tests)
+
+
 def term_tests(
-    stratum: Stratum, options: CompareOptions, step: Callable[[], None] = lambda: None
+    stratum: Stratum,
+    options: CompareOptions,
+    step: Callable[[], None] = lambda: None,
+    units: Units | None = None,
 ) -> Iterator[TermTest]:
-    """Yield the tests of the terms of a stratum; `step` is called after each."""
+    """Yield the tests of the terms of a stratum.
+
+    Args:
+        stratum: the stratum.
+        options: of the comparison.
+        step: called after each term.
+        units: of the stratum, to test with unequal variances; None assumes equal ones.
+
+    Raises:
+        InputError: unequal variances, and a unit that the model fits exactly.
+    """
     total = float((stratum.shapes**2).sum())
     for term in stratum.terms:
         reduced = stratum.reduced(term, options.squares)
         residual = stratum.residual(reduced)
         own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        products = stratum.products(
-            np.hstack([own, rest]), residual, options.permutations, options.seed, flips=stratum.flips(reduced)
-        )
+        count = options.permutations if units is None else 1
+        products = stratum.products(np.hstack([own, rest]), residual, count, options.seed, flips=stratum.flips(reduced))
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)
         f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)
+        if units is not None:
+            # Columns of the reduced model are not tested, and the variance is that of each unit.
+            f = units.estimate(
+                units.own(term, reduced), [term], reduced, options.permutations, options.seed, term.label
+            ).statistic()
         yield TermTest(
-            term.label, stratum.name, df, float(explained[0]), float(explained[0] / total), float(f[0]), effect_size(f),
-            _share(f), read_only(f),
+            term.label, stratum.name, df, float(explained[0]), float(explained[0] / total), float(f[0]),
+            effect_size(f, options.effect_size), _share(f), read_only(f),
         )  # fmt: skip
         step()
 
@@ -475,9 +591,16 @@ def _interacting(design: Design) -> Iterator[tuple[Variable, Variable]]:
             yield one, other
 
 
-def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Callable[[], None]) -> Iterator[Effect]:
+def _effects(
+    cohort: Cohort,
+    family: _Family,
+    design: Design,
+    subjects: Sequence[str] | None,
+    options: CompareOptions,
+    step: Callable[[], None],
+) -> Iterator[Effect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, options) for own in parts]
+    made = [_tested_together(cohort, own, design, subjects, options) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
@@ -497,7 +620,7 @@ def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Cal
                 distance_mm=distance,
                 rms_mm=distance / math.sqrt(cohort.n_vertices),
                 f=float(f[0]),
-                z=effect_size(f),
+                z=effect_size(f, options.effect_size),
                 p=_share(f),
                 p_family=float((largest >= f[0] * (1 - _TIE)).mean()),
                 map=shown,
@@ -505,10 +628,16 @@ def _effects(cohort: Cohort, family: _Family, options: CompareOptions, step: Cal
 
 
 def _tested_together(
-    cohort: Cohort, family: Sequence[_Ends], options: CompareOptions
+    cohort: Cohort,
+    family: Sequence[_Ends],
+    design: Design,
+    subjects: Sequence[str] | None,
+    options: CompareOptions,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum."""
     stratum, beside = family[0].stratum, family[0].beside
+    if options.unequal_variances:
+        return _tested_unequal(cohort, family, units_of(stratum, design, subjects), options)
     residual, flips = stratum.residual(beside), stratum.flips(beside)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
@@ -522,9 +651,42 @@ def _tested_together(
     weights = [ends.weight for ends in family if ends.weight is not None]
     maps = effect_maps(
         cohort, stratum, residual, products, along, changes, options.bump_width_mm,
-        np.stack(weights) if weights else None,
+        np.stack(weights) if weights else None, level=options.level,
     )  # fmt: skip
     return f, changes, maps
+
+
+def _tested_unequal(
+    cohort: Cohort, family: Sequence[_Ends], units: Units, options: CompareOptions
+) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
+    """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum, with unequal variances."""
+    stratum = units.stratum
+    if stratum.width > 1:
+        raise InputError(
+            f"Unequal variances are not available for several contrasts of {stratum.name} at once; leave out "
+            "--unequal-variances."
+        )
+    statistics: list[FloatArray] = []
+    changes: list[FloatArray] = []
+    maps: list[EffectMap | None] = []
+    for ends in family:
+        tested = [term for term in stratum.terms if term not in ends.beside]
+        direction = stratum.direction(ends.contrast)
+        own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
+        label = f"{ends.low} to {ends.high}"
+        estimate = units.estimate(own, tested, ends.beside, options.permutations, options.seed, label)
+        statistics.append(estimate.statistic())
+        changes.append(direction @ stratum.shapes)
+        maps += (
+            effect_maps(
+                cohort, stratum, estimate.flips.residual, estimate.flips.fitted, estimate.along, changes[-1][None],
+                options.bump_width_mm, None if ends.weight is None else ends.weight[None], estimates=[estimate],
+                level=options.level,
+            )
+            if options.maps
+            else [None]
+        )  # fmt: skip
+    return np.stack(statistics), np.stack(changes), maps
 
 
 def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterator[Angle]:
@@ -543,7 +705,9 @@ def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterat
         pairs = list(itertools.combinations(range(len(levels)), 2))
         for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, options), strict=False):
             angles = _angles(*drawn)
-            yield Angle(words[first], words[second], float(angles[0]), float((angles >= angles[0] - _TIE).mean()))
+            # Their arrangements assume equal variances.
+            p = None if options.unequal_variances else float((angles >= angles[0] - _TIE).mean())
+            yield Angle(words[first], words[second], float(angles[0]), p)
 
 
 def _changes_in_pairs(
@@ -653,16 +817,6 @@ def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
                 f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
                 f"center({one.name}) in the formula, or take type II."
             )
-
-
-def effect_size(statistic: FloatArray) -> float:
-    """Return how many standard deviations the logarithm of the first of (P,) F lies above the mean of all.
-
-    Collyer, Sekora and Adams, Heredity 115, 2015. RRPP from 0.6 on makes them normal by a Box-Cox transform first.
-    """
-    logs = np.log(np.maximum(statistic, 1e-300))
-    spread = float(logs.std())
-    return float((logs[0] - logs.mean()) / spread) if spread > 0 else 0.0
 
 
 def _share(statistic: FloatArray) -> float:

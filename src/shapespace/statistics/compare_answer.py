@@ -22,8 +22,10 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.compare import Comparison, Effect
+from shapespace.statistics.compare_maps import EffectMap, Tested
+from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
 from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh
 
@@ -38,11 +40,12 @@ _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 def answer_of_comparison(comparison: Comparison) -> Answer:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects = comparison.effects
-    parts = [
+    parts: list[Part] = [
         *_of_terms(comparison),
         *_of_pairs(comparison),
         *_of_angles(comparison),
         *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
+        *methods_parts(comparison.methods),
     ]
     fitted = comparison.cohort.fitted
     answer = Answer(
@@ -63,50 +66,81 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
             "seed": comparison.options.seed,
             "bump_width_mm": comparison.options.bump_width_mm,
             "level": comparison.options.level,
+            "unequal_variances": comparison.options.unequal_variances,
+            "effect_size": comparison.options.effect_size,
             "gauge": comparison.cohort.gauge,
             "shapes": len(comparison.cohort),
             "subjects": comparison.subjects,
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        methods=comparison.methods,
     )
     return with_shape_data(answer, comparison.cohort)
 
 
 def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.options.effect_size]
     for test in comparison.tests:
-        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f}, {_p(test.p)}"
+        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
         where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
             yield f"Shape differs with {test.term}{where} ({told})."
         else:
             yield f"No difference of shape with {test.term}{where} is found ({told})."
     for effect in comparison.effects:
-        if effect.map is None:
-            continue
-        held = f"(family-wise {100 * level:g} %)"
-        found = effect.map.shown.p_family <= level
-        if found.any():
-            mm = np.where(found, effect.map.shown_mm, 0.0)
-            at = int(np.abs(mm).argmax())
-            yield (
-                f"{effect.label}: {100 * found.mean():.1f} % of the vertices differ {held}, by up to {mm[at]:+.2f} mm"
-                f"{_near(comparison.cohort, at)}."
-            )
-        else:
-            yield f"{effect.label}: no vertex is found to differ {held}."
-        if effect.map.blank is not None:
-            yield f"{effect.label}: {told_blank(int(effect.map.blank.sum()), len(effect.map.blank))}"
-        if effect.map.bump is not None and effect.map.bump_mm is not None:
-            at = int(effect.map.bump.f.argmax())
-            if effect.map.bump.p_family[at] <= level:
-                mm = effect.map.bump_mm[at]
-                yield f"{effect.label}: a bump of {mm:+.2f} mm or more is found{_near(comparison.cohort, at)} {held}."
-            else:
-                yield f"{effect.label}: no bump is found beside how shapes vary {held}."
+        if effect.map is not None:
+            yield _of_map(comparison, effect, effect.map)
+            if effect.map.blank is not None:
+                yield f"{effect.label}: {told_blank(int(effect.map.blank.sum()), len(effect.map.blank))}"
+            if effect.map.bump is not None and effect.map.bump_mm is not None:
+                yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
     yield from comparison.warnings
     of = f" of {comparison.subjects} subjects" if comparison.subjects < shapes else ""
     yield f"{shapes} shapes{of}, {comparison.options.permutations} arrangements, the observed one among them."
+    yield multiplicity_sentence(comparison.methods)
+
+
+_EXPLORATORY = "exploratory, since its term is not significant: "
+
+
+def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
+    """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
+    level = comparison.options.level
+    scope = f"family-wise error {100 * level:g} % within this map"
+    significant = shown.shown.p_family <= level
+    if not significant.any():
+        return f"{effect.label}: no vertex differs ({scope})."
+    return (
+        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
+        f"differ ({scope}), the clearest by {_clearest(comparison, shown)}."
+    )
+
+
+def _clearest(comparison: Comparison, shown: EffectMap) -> str:
+    """Return the change at the vertex with the largest F, with its simultaneous interval."""
+    lengths, at = _lengths(comparison), int(shown.shown.f.argmax())
+    low, high = shown.interval_mm(at)
+    sign = "" if shown.normal_mm is None else "+"
+    return (
+        f"{lengths.text(shown.shown_mm[at], sign)} (simultaneous {100 * (1 - comparison.options.level):g} % interval "
+        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near(comparison.cohort, at)}"
+    )
+
+
+def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: FloatArray) -> str:
+    level, at = comparison.options.level, int(bump.f.argmax())
+    scope = f"family-wise error {100 * level:g} % within this map"
+    if bump.p_family[at] > level:
+        return f"{effect.label}: no bump is found beyond the variation between shapes ({scope})."
+    return (
+        f"{effect.label}: a bump of {_lengths(comparison).text(bump_mm[at], '+')} or more is found"
+        f"{_near(comparison.cohort, at)} ({scope})."
+    )
+
+
+def _lengths(comparison: Comparison) -> Lengths:
+    return Lengths(comparison.cohort.unit)
 
 
 def _p(p: float) -> str:
@@ -127,7 +161,7 @@ def _column(name: str, kind: Any = "text") -> TableColumn:
 
 
 def _of_terms(comparison: Comparison) -> Iterator[Part]:
-    strata = any(test.stratum for test in comparison.tests)
+    strata, lengths = any(test.stratum for test in comparison.tests), _lengths(comparison)
     rows: list[tuple[Any, ...]] = []
     for left in comparison.remainders:
         own = [test for test in comparison.tests if test.stratum == left.stratum]
@@ -136,16 +170,17 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         rows.append(("residual", left.stratum, left.df, left.squares, left.squares / left.df, share, *[None] * 3))
         rows.append(("total", left.stratum, left.df_total, left.squares_total, None, None, *[None] * 3))
     columns = (
-        _column("term"), _column("tested"), _column("df", "count"), _column("sum of squares, mm²", "number"),
-        _column("mean square, mm²", "number"), _column("R²", "percent"), _column("F", "number"),
+        _column("term"), _column("tested"), _column("df", "count"),
+        _column(lengths.label("sum of squares", "²"), "number"),
+        _column(lengths.label("mean square", "²"), "number"), _column("R²", "percent"), _column("F", "number"),
         _column("Z", "number"), _column("p", "p"),
     )  # fmt: skip
     if not strata:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
     note = (
-        f"Type {comparison.options.squares} sums of squares of Procrustes distances, by permutation of residuals. Z is "
-        "by how many standard deviations log F lies above those of the arrangements."
+        f"Type {comparison.options.squares} sums of squares of Procrustes distances. {_of_f(comparison)} "
+        f"{effect_size_sentence(comparison.options.effect_size)} R² is the share of the total of its stratum."
     )
     yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
     for test in comparison.tests:
@@ -169,7 +204,8 @@ def _of_pairs(comparison: Comparison) -> Iterator[Part]:
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
         columns=(
-            _column("variable"), _column("from, to"), _column("Procrustes distance", "mm"), _column("RMS", "mm"),
+            _column("variable"), _column("from, to"), _lengths(comparison).column("Procrustes distance"),
+            _lengths(comparison).column("RMS"),
             _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
         ),
         rows=rows,
@@ -191,9 +227,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     yield TextPart(
         title=effect.label,
         level=2,
-        text=f"The largest change is {_largest(comparison, effect)}."
-        if effect.map is not None
-        else f"The change is {effect.rms_mm:.2f} mm (RMS over vertices).",
+        text=_of_size(comparison, effect),
     )
     if effect.map is not None:
         kept = _arrays(comparison, effect)
@@ -207,7 +241,13 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
         ):
             if values in kept:
                 yield SurfaceMapPart(
-                    title=title, arrays=file, values=values, mask=mask, signed=values != "length_mm", note=note
+                    title=title,
+                    arrays=file,
+                    values=values,
+                    mask=mask,
+                    signed=values != "length_mm",
+                    unit=_lengths(comparison).of_map,
+                    note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {note}" if effect.exploratory else note,
                 )
     if comparison.cohort.faces is not None:
         times = _times(comparison, effect)
@@ -222,12 +262,23 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     yield from _of_scores(comparison, effect)
 
 
-def _largest(comparison: Comparison, effect: Effect) -> str:
-    assert effect.map is not None
-    mm = effect.map.shown_mm
-    at = int(np.abs(mm).argmax())
-    way = "" if effect.map.normal_mm is None else ", outwards" if mm[at] > 0 else ", inwards"
-    return f"{abs(mm[at]):.2f} mm{way}{_near(comparison.cohort, at)}"
+def _of_size(comparison: Comparison, effect: Effect) -> str:
+    """Return how large a change is: over all vertices, and where it is clearest."""
+    whole = f"The change is {_lengths(comparison).text(effect.rms_mm)} (RMS over vertices)."
+    if effect.map is None:
+        return whole
+    way = "" if effect.map.normal_mm is None else ", outwards positive"
+    label = " The map is exploratory, since no term of this effect is significant." if effect.exploratory else ""
+    return f"{whole} It is clearest by {_clearest(comparison, effect.map)}{way}.{label}"
+
+
+def _of_f(comparison: Comparison) -> str:
+    if comparison.options.unequal_variances:
+        return (
+            "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
+            "squared Welch t), compared with sign flips of residuals."
+        )
+    return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
 
 
 def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
@@ -244,7 +295,7 @@ def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
         title=f"Regression score of {one.name}",
         note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
         x=one.name,
-        y="score, mm",
+        y=_lengths(comparison).label("score"),
         series=(
             Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
             Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
@@ -305,10 +356,23 @@ def _tables(comparison: Comparison) -> Mapping[str, Rows]:
         share = left.squares / left.squares_total
         terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
         terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
+    field = _lengths(comparison).field
     tables: dict[str, Rows] = {
-        "terms.csv": (("term", "stratum", "df", "squares_mm2", "r2", "f", "z", "p"), terms),
+        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p"), terms),
         "effects.csv": (
-            ("number", "variable", "from", "to", "stratum", "distance_mm", "rms_mm", "f", "z", "p", "p_of_all_pairs"),
+            (
+                "number",
+                "variable",
+                "from",
+                "to",
+                "stratum",
+                field("distance"),
+                field("rms"),
+                "f",
+                "z",
+                "p",
+                "p_of_all_pairs",
+            ),
             [
                 (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
                 for at, e in enumerate(comparison.effects, 1)

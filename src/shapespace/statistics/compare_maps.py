@@ -21,6 +21,7 @@ from shapespace.late import other_package
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
+from shapespace.statistics.dispersion import Estimate
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
 _VERTICES = 512
@@ -43,6 +44,8 @@ class Tested:
         p: (V,) share of arrangements with an F as large there.
         p_family: (V,) share of arrangements whose largest F of all vertices is as large: with `p_family` below 5 % a
             whole map without any effect shows a vertex in 5 % of studies.
+        critical: F above which `p_family` is at most the level of the intervals: the change ± its length times
+            sqrt(critical / f) is an interval that holds for all vertices at once.
         q: (V,) false discovery rate at which the vertex is found; of shares among all vertices of all arrangements,
             where F is spread alike without an effect, since those of one vertex end at 1 in as many as there are.
     """
@@ -51,6 +54,7 @@ class Tested:
     p: FloatArray
     p_family: FloatArray
     q: FloatArray
+    critical: float
 
     __repr__ = short_repr
 
@@ -87,6 +91,13 @@ class EffectMap:
 
     __repr__ = short_repr
 
+    def interval_mm(self, vertex: int) -> tuple[float, float]:
+        """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
+        f, shown = float(self.shown.f[vertex]), float(self.shown_mm[vertex])
+        half = float("inf") if f <= 0 else abs(shown) * float(np.sqrt(self.shown.critical / f))
+        # A length is not negative.
+        return (shown - half if self.normal_mm is not None else max(shown - half, 0.0)), shown + half
+
     @property
     def shown_mm(self) -> FloatArray:
         """(V,) along the normal where there is one, else the length; 0 where blank."""
@@ -108,6 +119,9 @@ def effect_maps(
     changes: FloatArray,
     bump_width_mm: float | None = None,
     weights: FloatArray | None = None,
+    *,
+    estimates: Sequence[Estimate] | None = None,
+    level: float = 0.05,
 ) -> Sequence[EffectMap]:
     """Return the maps of E effects that are tested beside the same other terms; memory does not grow with P times V.
 
@@ -120,6 +134,8 @@ def effect_maps(
         changes: (E, K) mm.
         bump_width_mm: standard deviation of the bumps; None seeks none.
         weights: (E, V) by which F is multiplied; None for 1.
+        estimates: E, whose statistics allow unequal variances; None takes the pooled variance of `residual`.
+        level: of significance, and one minus the confidence of intervals.
     """
     P, m, K = products.shape
     E, V = len(along), cohort.n_vertices
@@ -138,11 +154,15 @@ def effect_maps(
             seen[name][:, part] = (changes @ rows).reshape(E, -1, width) / np.reshape(unit, (-1, 1))
             squares = ((residual @ rows) ** 2).sum(axis=0).reshape(-1, width).sum(axis=1)
             for start in range(0, P, chunk):
-                drawn = (flat[start * m : (start + chunk) * m] @ rows).reshape(-1, m, len(squares), width)
-                effect = np.tensordot(along, drawn, axes=(1, 1))
-                explained = np.einsum("epvc,epvc->epv", effect, effect)
-                left = squares - np.einsum("pmvc,pmvc->pv", drawn, drawn)
-                f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)
+                if estimates is not None:
+                    stop = min(start + chunk, P)
+                    f = np.stack([estimate.statistic_of(rows, width, start, stop) for estimate in estimates])
+                else:
+                    drawn = (flat[start * m : (start + chunk) * m] @ rows).reshape(-1, m, len(squares), width)
+                    effect = np.tensordot(along, drawn, axes=(1, 1))
+                    explained = np.einsum("epvc,epvc->epv", effect, effect)
+                    left = squares - np.einsum("pmvc,pmvc->pv", drawn, drawn)
+                    f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)
                 if weights is not None:
                     f *= weights[:, None, part]
                 if start == 0:
@@ -156,7 +176,7 @@ def effect_maps(
     made: list[EffectMap] = []
     for at in range(E):
         tests = {
-            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at])
+            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at], level)
             for name in lenses
         }
         own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
@@ -243,10 +263,11 @@ def _bin(f: FloatArray) -> Any:
     return np.clip((np.log10(np.maximum(f, 1e-300)) + 6.0) * (_BINS / 12.0), 0, _BINS - 1).astype(np.intp)
 
 
-def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray) -> Tested:
+def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, level: float) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
     as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))
     of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
     q = false_discovery_control(of_all[_bin(f)])
-    return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q))
+    critical = float(np.sort(largest)[-(int(level * len(largest) * (1 + _TIE)) + 1)])
+    return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q), critical)

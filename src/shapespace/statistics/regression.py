@@ -16,7 +16,9 @@ from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
 from shapespace.reprs import listed_briefly, told_briefly
+from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
+from shapespace.statistics.methods import methods_of
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.statistics.smoothers import (
     CHOICES,
@@ -71,6 +73,7 @@ class Regression:
         level: of all intervals.
         folds: of the outer cross-validation.
         permutations: how many.
+        draws: of subjects, for intervals of figures.
         seed: of folds, permutations and draws.
         subject: column of the subjects, as given; None for the default.
     """
@@ -96,6 +99,7 @@ class Regression:
     level: float
     folds: int
     permutations: int
+    draws: int
     seed: int
     subject: str | None = None
 
@@ -108,6 +112,27 @@ class Regression:
     def small(self) -> bool:
         """Whether the sample is small: figures on fewer than `SMALL` subjects scatter widely from sample to sample."""
         return self.n_subjects < SMALL
+
+    @cached_property
+    def methods(self) -> Methods:
+        """Sample sizes, tests and assumptions."""
+        tests = (
+            (TestScheme(tested=("R²",), statistic="R²", reduced_model=None, arrangements=1 + self.permutations),)
+            if self.permutations
+            else ()
+        )
+        intervals = TestScheme(
+            tested=("intervals of R², errors, slope and coverage",), statistic="percentiles", resampling="bootstrap",
+            reduced_model=None, arrangements=self.draws,
+        )  # fmt: skip
+        return methods_of(
+            self.cohort, self.n_subjects, tests=(*tests, intervals),
+            assumptions=(
+                f"{self.target} is predicted by {self.choice.words()}, chosen in an inner cross-validation; all "
+                f"figures are of subjects left out in {self.folds} folds. R² is that of these predictions against the "
+                "mean of the training subjects, not a share of the sum of squares of shapes.",
+            ),
+        )  # fmt: skip
 
     def shape_at(self, value: float) -> FloatArray:
         """Return the mean shape (V, 3), mm, at a value of the target, by regression of shape on the target."""
@@ -226,6 +251,7 @@ def regress(
         level=level,
         folds=folds,
         permutations=permutations,
+        draws=draws,
         seed=seed,
         subject=subject,
     )

@@ -8,7 +8,8 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
 from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import Answer, Lengths, Rows
+from shapespace.statistics.methods_answer import methods_parts
 from shapespace.statistics.observed import blank_where, weights_of, with_shape_data
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
@@ -48,7 +49,7 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         question="regress",
         title=f"{found.target} from shape",
         summary=_summary(found, new),
-        parts=(*parts, *pictures),
+        parts=(*parts, *pictures, *methods_parts(found.methods)),
         tables=tables,
         arrays={_FILE: arrays},
         meshes=meshes,
@@ -59,6 +60,7 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
             "level": found.level, "choice": found.choice.words(), "seed": found.seed,
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        methods=found.methods,
     )  # fmt: skip
     return with_shape_data(answer, found.cohort)
 
@@ -186,7 +188,8 @@ def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
             note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
         ),
         SurfaceMapPart(
-            title=f"What one unit of {found.target} does", arrays=_FILE, values="per_unit_mm", unit="mm",
+            title=f"What one unit of {found.target} does", arrays=_FILE, values="per_unit_mm",
+            unit=Lengths(found.cohort.unit).of_map,
             note="Along the normals of the mean; shapespace compare tests where this is more than chance.",
         ),
     ]  # fmt: skip

@@ -22,7 +22,9 @@ from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
 from shapespace.late import late
 from shapespace.reprs import listed_briefly
+from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
+from shapespace.statistics.methods import methods_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
 FEWEST_PEOPLE, SMALL = 5, 30
@@ -134,6 +136,31 @@ class Scores:
     def beyond_2(self) -> FloatArray:
         """(M,) Share of the observed vertices beyond 2 standard deviations."""
         return read_only((np.abs(self.z) > 2).sum(axis=1) / np.maximum(np.isfinite(self.z).sum(axis=1), 1))
+
+    @property
+    def methods(self) -> Methods:
+        """Sample sizes, tests and assumptions."""
+        sizes = (
+            SampleSize(
+                variables=("cohort",), classes=("reference",), subjects=self.people, shapes=len(self.reference_names)
+            ),
+            SampleSize(variables=("cohort",), classes=("scored",), subjects=len(self.names), shapes=len(self.subjects)),
+        )
+        return methods_of(
+            self.subjects, len(self.names), dimensions=self.modes, analysed_variance_ratio=self.variance_share,
+            sizes=sizes,
+            tests=(
+                TestScheme(tested=("percentiles",), statistic="Mahalanobis distance", unit="person",
+                           resampling="leave-one-out"),
+                TestScheme(tested=("p (F)",), statistic="Mahalanobis distance", resampling="none"),
+            ),
+            corrected_over=("the vertices of a map (limit of |z|)",),
+            assumptions=(
+                "Percentiles leave each person of the reference out in turn and assume no distribution; p by the F "
+                "distribution assumes normal shapes. z of vertices and sizes are standard deviations of the reference, "
+                "not effect sizes.",
+            ),
+        )  # fmt: skip
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""

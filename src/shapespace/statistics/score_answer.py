@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer, Rows
+from shapespace.statistics.answer import Answer, Lengths, Rows
+from shapespace.statistics.methods_answer import methods_parts
 from shapespace.statistics.observed import with_shape_data
 from shapespace.statistics.score import SMALL, Scores
 
@@ -28,6 +29,7 @@ def answer_of_scores(scores: Scores) -> Answer:
         _histogram(scores),
         *_maps(scores, shown),
         *_morphs(scores, shown),
+        *methods_parts(scores.methods),
     ]
     fitted = scores.subjects.fitted
     many = len(scores.names) != 1
@@ -48,6 +50,7 @@ def answer_of_scores(scores: Scores) -> Answer:
             "seed": scores.options.seed,
         },
         model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        methods=scores.methods,
     )
     return with_shape_data(answer, scores.subjects)
 
@@ -94,7 +97,7 @@ def _table(scores: Scores) -> TablePart:
         TableColumn(name="Distance (SD)", kind="number"),
         TableColumn(name="Percentile", kind="percent"),
         TableColumn(name="p (F)", kind="p"),
-        TableColumn(name="Left by the modes", kind="mm"),
+        Lengths(scores.subjects.unit).column("Left by the modes"),
         TableColumn(name="Its percentile", kind="percent"),
         TableColumn(name="Beyond 2 SD", kind="percent"),
         TableColumn(name="Size (SD)", kind="number"),
@@ -188,9 +191,10 @@ def _arrays(scores: Scores, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
 
 
 def _tables(scores: Scores) -> dict[str, Rows]:
+    field = Lengths(scores.subjects.unit).field
     head = (
-        "subject", "distance_sd", "percentile", "p_left_out", "p_f", "rest_mm", "rest_p", "beyond_model_mm",
-        "beyond_model_p", "vertices_beyond_2sd", "centroid_size_mm", "size_sd", "outside", "map",
+        "subject", "distance_sd", "percentile", "p_left_out", "p_f", field("rest"), "rest_p", field("beyond_model"),
+        "beyond_model_p", "vertices_beyond_2sd", field("centroid_size"), "size_sd", "outside", "map",
     )  # fmt: skip
     rows = [
         (
@@ -208,8 +212,8 @@ def _tables(scores: Scores) -> dict[str, Rows]:
     reference = zip(scores.reference_names, scores.reference_distance, scores.reference_rest_mm, strict=True)
     return {
         "scores.csv": (head, rows),
-        "nearest.csv": (("subject", "rank", "reference", "distance_sd", "rms_mm"), near),
-        "reference.csv": (("reference", "distance_sd", "rest_mm"), list(reference)),
+        "nearest.csv": (("subject", "rank", "reference", "distance_sd", field("rms")), near),
+        "reference.csv": (("reference", "distance_sd", field("rest")), list(reference)),
     }
 
 

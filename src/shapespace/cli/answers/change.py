@@ -30,6 +30,8 @@ def add(sub: argparse.ArgumentParser) -> None:
                      help="CSV of name,vertex, or landmarks.csv of shapespace correspond (default: those of the "
                      "model)")  # fmt: skip
     sub.add_argument("--group", metavar="COLUMN", help="two groups whose changes are compared")
+    sub.add_argument("--unequal-variances", action="store_true",
+                     help="of --group: allow one to vary more than the other (Welch's t, sign flips)")  # fmt: skip
     sub.add_argument("--rate", action="store_true", help="mm per unit of time in the group, not last minus first")
     sub.add_argument("--permutations", type=int, default=1000, metavar="N", help="of the tests (default 1000)")
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the tests (default 0)")
@@ -56,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
         rate=arguments.rate,
         permutations=arguments.permutations,
         seed=arguments.seed,
+        unequal_variances=arguments.unequal_variances,
     )
     columns = [column for column in (arguments.subject, arguments.group) if column]
     if arguments.drop_missing:

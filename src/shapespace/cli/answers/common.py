@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,8 @@ def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
     """Add the choice between shapes and forms."""
     sub.add_argument("--gauge", choices=("form", "shape"), default=default,
                      help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
+    sub.add_argument("--no-unit", action="store_true",
+                     help="the coordinates have no unit: lengths are not written in mm")  # fmt: skip
 
 
 def cohort_of(
@@ -55,7 +58,8 @@ def cohort_of(
         arguments.shapes, arguments.model, arguments.surfaces, gauge or arguments.gauge, arguments.doubtful, least
     )
     with steps(None, "reading", "shape", quiet=arguments.quiet) as step:
-        return read_cohort(arguments.data, options, onto=onto, on_shape=step)
+        cohort = read_cohort(arguments.data, options, onto=onto, on_shape=step)
+    return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
 
 
 def finish(answer: Answer, arguments: argparse.Namespace) -> int:

@@ -22,6 +22,10 @@ def add(sub: argparse.ArgumentParser) -> None:
                      help="arrangements, the observed one among them (default 1000)")  # fmt: skip
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the arrangements")
     sub.add_argument("--level", type=float, default=0.05, metavar="P", help="of significance (default 0.05)")
+    sub.add_argument("--unequal-variances", action="store_true",
+                     help="allow classes of unequal dispersion (by a variance for each subject)")  # fmt: skip
+    sub.add_argument("--effect-size", choices=("box-cox", "log"), default="box-cox",
+                     help="transformation of F before Z is standardised (default box-cox, as in RRPP)")  # fmt: skip
     sub.add_argument("--no-maps", action="store_true", help="do not test each vertex")
     sub.add_argument("--bumps", type=float, metavar="MM",
                      help="of fits: also seek bumps of this width beside how shapes vary anyway")  # fmt: skip
@@ -44,6 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
         bump_width_mm=arguments.bumps,
         level=arguments.level,
         drop_missing=arguments.drop_missing,
+        unequal_variances=arguments.unequal_variances,
+        effect_size=arguments.effect_size,
     )
     cohort = cohort_of(arguments)
     with steps(None, "permuting", "step", quiet=arguments.quiet) as step:

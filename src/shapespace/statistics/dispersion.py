@@ -1,0 +1,370 @@
+"""Unequal group dispersion: a test for it, and statistics and null distributions that allow it.
+
+A permutation test of means assumes that residuals are exchangeable between groups. If the smaller group is more
+variable, it finds differences that are not there; if the larger group is, it misses differences. Here
+
+- dispersions are compared by the distances of residuals to their group mean (Anderson, Biometrics 62, 2006), each
+  divided by sqrt(1 - leverage) against the bias of small groups (Stier et al., Ecology 94, 2013);
+- a mean difference is divided by its variance with a variance for each row (the ANOVA-type statistic of Brunner,
+  Dette and Munk, JASA 92, 1997, with the leverage correction HC2 of MacKinnon and White, J. Econometrics 29, 1985; of
+  two groups the squared Welch t), and compared with sign flips of the residuals of the reduced model (the restricted
+  wild bootstrap of Davidson and Flachaire, J. Econometrics 146, 2008), which is fitted with a weight for each group.
+
+Sign flips keep the variance of each row, so covariances may differ between groups in size and in form.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.errors import InputError
+from shapespace.types import FloatArray
+
+Codes: TypeAlias = npt.NDArray[np.intp]
+
+FEWEST_OF_GROUP = 5
+"""Subjects of a class below which the test with unequal variances exceeds 7 % false positives (docs/compare.md)."""
+_TIE = 1e-9
+_FULL_LEVERAGE = 1e-8
+"""Rows with 1 - leverage below this are fitted exactly, and have no residual."""
+_BATCH = 50
+"""Sign flips that are drawn from one seed."""
+_FLOOR = 1e-12
+
+
+@dataclass(frozen=True)
+class DispersionTest:
+    """A test of equal dispersion of the classes of a variable.
+
+    Args:
+        variable: name of the variable.
+        stratum: in which residuals are taken; empty where there is one.
+        groups: classes with two or more members.
+        counts: members of each.
+        stddev_mm: standard deviation of the shapes of each class about their mean, RMS over the vertices.
+        f: F of the distances to the group mean.
+        p: share of permutations of the distances with an F as large.
+        permutations: number of them, the observed one among them.
+    """
+
+    variable: str
+    stratum: str
+    groups: tuple[str, ...]
+    counts: tuple[int, ...]
+    stddev_mm: tuple[float, ...]
+    f: float
+    p: float
+    permutations: int
+
+    @property
+    def ratio(self) -> float:
+        """The largest standard deviation divided by the smallest."""
+        return max(self.stddev_mm) / max(min(self.stddev_mm), 1e-300)
+
+    @property
+    def smaller_is_more_variable(self) -> bool | None:
+        """Whether smaller classes have the larger dispersion; None where size and dispersion are not related."""
+        counts, spread = np.array(self.counts, dtype=np.float64), np.array(self.stddev_mm)
+        together = float(((counts - counts.mean()) * (spread - spread.mean())).sum())
+        return None if np.ptp(counts) == 0 or together == 0 else together < 0
+
+
+def dispersion_test(
+    variable: str,
+    residual: FloatArray,
+    leverage: FloatArray,
+    codes: Codes,
+    groups: tuple[str, ...],
+    n_vertices: int,
+    permutations: int,
+    seed: int,
+    stratum: str = "",
+) -> DispersionTest | None:
+    """Return whether classes differ in how far their members are from the mean of their class.
+
+    Args:
+        variable: name of the variable.
+        residual: (n, K) mm, of the whole model.
+        leverage: (n,) diagonal of its hat matrix.
+        codes: (n,) class of each row.
+        groups: names of the classes.
+        n_vertices: of the shapes, for the root mean square.
+        permutations: the observed one among them.
+        seed: of these.
+        stratum: name of the stratum.
+
+    Returns:
+        the test; None where fewer than two classes have two members each with a residual.
+    """
+    free = 1.0 - leverage > _FULL_LEVERAGE
+    counts = np.bincount(codes[free], minlength=len(groups))
+    used = [k for k in range(len(groups)) if counts[k] > 1]
+    rows = free & np.isin(codes, used)
+    if len(used) < 2 or not float((residual[rows] ** 2).sum()):
+        return None
+    own = np.searchsorted(used, codes[rows])
+    squares = (residual[rows] ** 2).sum(axis=1) / (1.0 - leverage[rows])
+    variances = np.bincount(own, weights=squares) / np.bincount(own)
+    distances = np.sqrt(squares)
+    f = np.concatenate(
+        [_f_of_means(distances[rows], own) for rows in _permutations(len(distances), permutations, seed)]
+    )
+    return DispersionTest(
+        variable, stratum, tuple(groups[k] for k in used), tuple(int(counts[k]) for k in used),
+        tuple(float(v) for v in np.sqrt(variances / n_vertices)), float(f[0]),
+        float((f >= f[0] * (1 - _TIE)).mean()), permutations,
+    )  # fmt: skip
+
+
+def _permutations(n: int, permutations: int, seed: int) -> Iterator[Codes]:
+    """Yield orders (b, n) of n values; the first is as observed."""
+    for start in range(0, permutations, _BATCH):
+        rows = np.argsort(np.random.default_rng([seed, 3, start]).random((_BATCH, n)), axis=1)
+        if start == 0:
+            rows[0] = np.arange(n)
+        yield rows[: permutations - start]
+
+
+def _f_of_means(values: FloatArray, codes: Codes) -> FloatArray:
+    """Return F (b,) of the means of groups, of b arrangements of values (b, n)."""
+    counts = np.bincount(codes)
+    sums = values @ np.eye(len(counts))[codes]
+    total = values.sum(axis=1) ** 2 / len(codes)
+    explained = (sums**2 / counts).sum(axis=1)
+    between = (explained - total) / (len(counts) - 1)
+    within = ((values**2).sum(axis=1) - explained) / max(len(codes) - len(counts), 1)
+    return between / np.maximum(within, 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class UnequalVariances:
+    """Sign flips of the residuals of a reduced model, and the variance of an estimate in each of them.
+
+    Args:
+        full: (n, m) orthonormal columns of the whole model, the mean among them where it was removed.
+        residual: (n, K) mm, of the reduced model by weighted least squares.
+        scale: (n,) correction of residuals for their leverage.
+        leverage: (n,) diagonal of the hat matrix of the whole model.
+        permutations: number of sign flips, the observed data among them.
+        seed: of these.
+    """
+
+    full: FloatArray
+    residual: FloatArray
+    scale: FloatArray
+    leverage: FloatArray
+    permutations: int
+    seed: int
+
+    def signs(self) -> Iterator[tuple[int, FloatArray]]:
+        """Yield (start, factors (b, n)) by which residuals are multiplied, the same ones in each call; first are 1."""
+        n = len(self.residual)
+        for start in range(0, self.permutations, _BATCH):
+            drawn = np.random.default_rng([self.seed, 4, start]).choice((-1.0, 1.0), (_BATCH, n))
+            factors = (drawn * self.scale)[: self.permutations - start]
+            if start == 0:
+                factors[0] = 1.0
+            yield start, factors
+
+    def products(self, basis: FloatArray) -> FloatArray:
+        """Return the (permutations, m, K) products of `basis` (n, m) with the flipped residuals."""
+        out = np.empty((self.permutations, basis.shape[1], self.residual.shape[1]))
+        for start, factors in self.signs():
+            for column in range(basis.shape[1]):
+                out[start : start + len(factors), column] = (factors * basis[:, column]) @ self.residual
+        return out
+
+    @cached_property
+    def fitted(self) -> FloatArray:
+        """(permutations, m, K) products of `full` with the flipped residuals."""
+        return self.products(self.full)
+
+    def estimate(self, own: FloatArray) -> Estimate:
+        """Return the size and the variance of an estimate along `own` (n, q), orthonormal columns within `full`."""
+        weights = (own**2).sum(axis=1) / np.maximum(1.0 - self.leverage, _FULL_LEVERAGE)
+        return Estimate(self, own.T @ self.full, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The size of an estimate and its variance, in sign flips of residuals.
+
+    Args:
+        flips: of which model.
+        along: (q, m) the estimate in the columns of `full`.
+        weights: (n,) with which the squared residual of each row adds to its variance.
+    """
+
+    flips: UnequalVariances
+    along: FloatArray
+    weights: FloatArray
+
+    @cached_property
+    def _weighted(self) -> FloatArray:
+        return self.flips.products(self.weights[:, None] * self.flips.full)
+
+    @cached_property
+    def _between(self) -> FloatArray:
+        full = self.flips.full
+        return full.T @ (self.weights[:, None] * full)
+
+    def statistic(self) -> FloatArray:
+        """Return the (permutations,) squared length of the estimate divided by the trace of its covariance."""
+        rows = self.flips.residual
+        squares = (rows**2).sum(axis=1)
+        fitted, weighted = self.flips.fitted, self._weighted
+        explained = ((self.along @ fitted) ** 2).sum(axis=(1, 2))
+        variance = self._squares(squares[:, None], 0, self.flips.permutations)[:, 0]
+        variance = variance - 2.0 * np.einsum("pmk,pmk->p", weighted, fitted)
+        variance += np.einsum("pmk,pmk->p", self._between @ fitted, fitted)
+        return explained / np.maximum(variance, _FLOOR * float(self.weights @ squares) + 1e-300)
+
+    def statistic_of(self, columns: FloatArray, width: int, start: int, stop: int) -> FloatArray:
+        """Return the (stop - start, v) statistics of v vertices in a part of the sign flips.
+
+        Args:
+            columns: (K, v width) what the vertices take from the coefficients.
+            width: numbers of a vertex.
+            start: of the sign flips.
+            stop: of the sign flips.
+        """
+        fitted, weighted = (part[start:stop] @ columns for part in (self.flips.fitted, self._weighted))
+        squares = _of_vertices((self.flips.residual @ columns) ** 2, width)
+        explained = _of_vertices(((self.along @ fitted) ** 2).sum(axis=1), width)
+        variance = self._squares(squares, start, stop)
+        variance += _of_vertices(((self._between @ fitted - 2.0 * weighted) * fitted).sum(axis=1), width)
+        return explained / np.maximum(variance, _FLOOR * (self.weights @ squares) + 1e-300)
+
+    def _squares(self, squares: FloatArray, start: int, stop: int) -> FloatArray:
+        """Return the (stop - start, v) weighted sums of squares of the flipped residuals, before any model."""
+        flipped = (self.weights * self.flips.scale**2) @ squares
+        out = np.repeat(flipped[None], stop - start, axis=0)
+        if start == 0:
+            out[0] = self.weights @ squares
+        return out
+
+
+def _of_vertices(values: FloatArray, width: int) -> FloatArray:
+    return values.reshape(len(values), -1, width).sum(axis=2)
+
+
+def unequal_variances(
+    shapes: FloatArray,
+    full: FloatArray,
+    reduced: FloatArray,
+    groups: Codes | None,
+    permutations: int,
+    seed: int,
+    where: str,
+) -> UnequalVariances:
+    """Return the sign flips with which a term of a linear model is tested.
+
+    Args:
+        shapes: (n, K) mm.
+        full: (n, m) orthonormal columns of the whole model, the mean among them.
+        reduced: (n, r) orthonormal columns of the model without what is tested; r may be 0.
+        groups: (n,) class of each row, whose variances may differ; None takes all rows alike in the reduced model.
+        permutations: number of sign flips, the observed data among them.
+        seed: of these.
+        where: name of the term, for messages.
+
+    Raises:
+        InputError: a row that the model fits exactly, as the only member of a class.
+    """
+    leverage = (full**2).sum(axis=1)
+    if float(leverage.max()) > 1.0 - _FULL_LEVERAGE:
+        raise InputError(
+            f"Unequal variances of {where}: {int((leverage > 1 - _FULL_LEVERAGE).sum())} of {len(shapes)} subjects "
+            "are fitted exactly, as the only member of a class is, so their variance is unknown; leave them out, or "
+            "merge their classes."
+        )
+    weights = np.ones(len(shapes))
+    if groups is not None:
+        residual = shapes - full @ (full.T @ shapes)
+        variances = np.bincount(groups, weights=(residual**2).sum(axis=1)) / np.maximum(
+            np.bincount(groups, weights=1.0 - leverage), _FULL_LEVERAGE
+        )
+        weights = 1.0 / np.maximum(variances, _FLOOR * max(float(variances.max()), 1e-300))[groups]
+    residual, own = weighted_residual(shapes, reduced, weights)
+    return UnequalVariances(full, residual, 1.0 / np.sqrt(np.maximum(1.0 - own, _FULL_LEVERAGE)), leverage,
+                            permutations, seed)  # fmt: skip
+
+
+def weighted_residual(shapes: FloatArray, columns: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the residuals (n, K) of shapes on columns (n, r) by weighted least squares, and the leverages (n,)."""
+    if not columns.shape[1]:
+        return shapes, np.zeros(len(shapes))
+    root = np.sqrt(weights / weights.max())[:, None]
+    q = np.linalg.qr(root * columns)[0]
+    return shapes - (q @ (q.T @ (root * shapes))) / root, (q**2).sum(axis=1)
+
+
+def welch_flips(
+    maps: FloatArray, second: npt.NDArray[np.bool_], area: FloatArray, permutations: int, seed: int
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Return Welch's t (V,) of two groups, its largest |t| and the whole squared difference in each sign flip.
+
+    Args:
+        maps: (N, V) of the subjects; each group has two or more.
+        second: (N,) whether a subject is of the second group.
+        area: (V,) with which vertices count in the squared difference.
+        permutations: at most; all sign flips where they are no more.
+        seed: of random ones.
+
+    Returns:
+        t: (V,) as observed.
+        arrangements: (2, P) the largest |t|, and the squared difference by its variance; the observed ones first.
+        every: whether these are all sign flips.
+    """
+    n = len(maps)
+    every = 2 ** (n - 1) <= permutations
+    members = np.stack([~second, second]).astype(np.float64)
+    counts = members.sum(axis=1)
+    full = members.T / np.sqrt(counts)
+    mean = np.full((n, 1), 1.0 / np.sqrt(n))
+    rooted = maps * np.sqrt(area)
+    off = rooted - full @ (full.T @ rooted)
+    variances = ((off**2).sum(axis=1) @ members.T) / (counts - 1.0)
+    weights = 1.0 / np.maximum(variances, _FLOOR * max(float(variances.max()), 1e-300))[second.astype(np.intp)]
+    residual, own = weighted_residual(maps, mean, weights)
+    scale = 1.0 / np.sqrt(np.maximum(1.0 - own, _FULL_LEVERAGE))
+    squares = members @ residual**2
+    scaled = members @ (scale[:, None] * residual) ** 2
+
+    def draws() -> Iterator[FloatArray]:
+        yield np.ones(n)
+        if every:
+            signs = itertools.product((1.0, -1.0), repeat=n - 1)
+            next(signs)
+            yield from (scale * np.array((1.0, *rest)) for rest in signs)
+            return
+        rng = np.random.default_rng([seed, 4])
+        yield from (scale * rng.choice((-1.0, 1.0), n) for _ in range(permutations - 1))
+
+    observed = np.zeros(maps.shape[1])
+    arrangements: list[tuple[float, float]] = []
+    drawn = draws()
+    while block := list(itertools.islice(drawn, _BATCH)):
+        factors = np.stack(block)
+        means = [(factors * one) @ residual / count for one, count in zip(members, counts, strict=True)]
+        variance = np.zeros_like(means[0])
+        for k, (mean_k, count) in enumerate(zip(means, counts, strict=True)):
+            own_squares = np.repeat(scaled[k][None], len(block), axis=0)
+            if not arrangements:
+                own_squares[0] = squares[k]
+            within = np.maximum(own_squares - count * mean_k**2, _FLOOR * own_squares)
+            variance += within / (count - 1.0) / count
+        difference = means[1] - means[0]
+        t = np.divide(difference, np.sqrt(variance), out=np.zeros_like(difference), where=variance > 0)
+        whole = (difference**2 @ area) / np.maximum(variance @ area, 1e-300)
+        if not arrangements:
+            observed = t[0]
+        arrangements += zip(np.abs(t).max(axis=1).tolist(), whole.tolist(), strict=True)
+    return observed, np.array(arrangements).T, every

@@ -1,0 +1,72 @@
+"""Effect sizes Z: a statistic in standard deviations of its permutation distribution.
+
+Collyer, Sekora and Adams, Heredity 115, 2015; Box and Cox, JRSS B 26(2), 1964; RRPP (Collyer and Adams, Methods in
+Ecology and Evolution 9, 2018), function `effect.size`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from shapespace.types import FloatArray
+
+EffectSize: TypeAlias = Literal["box-cox", "log"]
+EFFECT_SIZES: tuple[EffectSize, ...] = ("box-cox", "log")
+"""Transformations of the statistic before it is standardised; RRPP from version 0.6 uses Box-Cox, earlier ones log."""
+
+_LAMBDA_BOUNDS = (-2.0, 2.0)
+"""Of the Box-Cox exponent, as in RRPP 2.1."""
+_LAMBDA_ZERO = 1e-3
+"""Exponents below this are the logarithm, as in RRPP 2.1."""
+_LAMBDA_TOLERANCE = 1e-5
+_SMALLEST = 1e-300
+
+
+def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:
+    """Return the first of (P,) positive statistics in standard deviations above the mean of all, transformed.
+
+    Args:
+        statistic: (P,) such as F, of the observed data first and then of each permutation.
+        kind: `box-cox` estimates the exponent from the permutations without the observed value; `log` takes logarithms.
+
+    Returns:
+        Z; 0 where all statistics are the same.
+    """
+    values = np.maximum(np.asarray(statistic, dtype=np.float64), _SMALLEST)
+    logs = np.log(values)
+    exponent = box_cox_exponent(values[1:]) if kind == "box-cox" and len(values) > 1 else 0.0
+    # Divided by their geometric mean, values of any size have powers that are finite; Z is the same.
+    logs -= logs.mean()
+    transformed = logs if exponent == 0 else np.expm1(exponent * logs) / exponent
+    spread = float(transformed.std())
+    if not np.isfinite(spread) or spread <= 1e-12 * max(float(np.abs(transformed).max()), _SMALLEST):
+        return 0.0
+    return float((transformed[0] - transformed.mean()) / spread)
+
+
+def box_cox_exponent(values: FloatArray) -> float:
+    """Return the exponent of the Box-Cox transformation of (P,) positive values that maximises the profile likelihood.
+
+    Returns:
+        the exponent from -2 to 2; 0, the logarithm, within 0.001 of it and for values that are all the same.
+    """
+    from scipy.optimize import minimize_scalar  # loads much
+
+    logs = np.log(np.maximum(values, _SMALLEST))
+    logs = logs - logs.mean()
+    if float(np.ptp(logs)) == 0:
+        return 0.0
+
+    def log_variance(exponent: float) -> float:
+        # Of values divided by their geometric mean, where the Jacobian of the transformation is 1.
+        powers = logs if abs(exponent) < _LAMBDA_ZERO else np.expm1(exponent * logs) / exponent
+        return float(np.log(powers.var()))
+
+    with np.errstate(over="ignore"):
+        optimum = minimize_scalar(
+            log_variance, bounds=_LAMBDA_BOUNDS, method="bounded", options={"xatol": _LAMBDA_TOLERANCE}
+        )
+    exponent = float(optimum.x)
+    return 0.0 if abs(exponent) < _LAMBDA_ZERO else exponent

@@ -1,0 +1,73 @@
+"""Facts for a methods section: sample sizes, the space that is analysed, and tests of equal dispersion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.schemas import Dispersion, Methods, SampleSize
+from shapespace.statistics.dispersion import DispersionTest
+
+
+def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
+    """Return the methods of an analysis of all coefficients of a cohort.
+
+    Args:
+        cohort: the shapes.
+        subjects: number of subjects.
+        **known: further fields of `Methods`, or others than those of the cohort.
+    """
+    facts: dict[str, Any] = {
+        "shapes": len(cohort),
+        "vertices": cohort.n_vertices,
+        "gauge": cohort.gauge,
+        "source": cohort.source.kind,
+        "modes": cohort.source.modes,
+        "explained_variance_ratio": cohort.source.explained_variance_ratio,
+        "dimensions": int(np.linalg.matrix_rank(cohort.coefficients - cohort.coefficients.mean(axis=0))),
+        "unit": cohort.unit,
+    }
+    return Methods(subjects=subjects, **{**facts, **known})
+
+
+def sample_sizes(
+    subjects: Sequence[str], variables: Sequence[tuple[str, Sequence[str]]], *, cells: bool = True
+) -> tuple[SampleSize, ...]:
+    """Return the subjects and shapes of each class of each variable, and of each combination of their classes.
+
+    Args:
+        subjects: of each shape.
+        variables: name and the class of each shape.
+        cells: whether to count combinations of two variables or more.
+    """
+    sizes: list[SampleSize] = []
+    sets: list[tuple[tuple[str, Sequence[str]], ...]] = [(one,) for one in variables]
+    if cells and len(variables) > 1:
+        sets.append(tuple(variables))
+    for chosen in sets:
+        members: dict[tuple[str, ...], list[str]] = {}
+        for subject, *classes in zip(subjects, *(values for _, values in chosen), strict=True):
+            members.setdefault(tuple(classes), []).append(subject)
+        names = tuple(name for name, _ in chosen)
+        sizes += [
+            SampleSize(variables=names, classes=classes, subjects=len(set(own)), shapes=len(own))
+            for classes, own in sorted(members.items())
+        ]
+    return tuple(sizes)
+
+
+def dispersion_record(test: DispersionTest, level: float) -> Dispersion:
+    """Return a test of equal dispersion as analysis.json has it.
+
+    Args:
+        test: the test.
+        level: of significance.
+    """
+    return Dispersion(
+        variable=test.variable, stratum=test.stratum, groups=test.groups, counts=test.counts, stddev=test.stddev_mm,
+        f=test.f, p=test.p, arrangements=test.permutations, equal=test.p > level,
+        smaller_is_more_variable=test.smaller_is_more_variable,
+    )  # fmt: skip
