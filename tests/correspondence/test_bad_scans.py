@@ -122,7 +122,8 @@ def test_an_open_template_goes_on_closed_scans_and_a_closed_one_on_open_scans() 
     on_open = ss.correspond(opened, ONE_ROUND, template=SCANS[3])
     for scan, raw in zip(on_open.scans, opened, strict=True):
         assert scan.seen < 0.97
-        shown = np.isfinite(np.array(scan.vertices)).all(axis=1)
+        assert scan.observed is not None
+        shown = np.array(scan.observed, dtype=bool)
         assert build_engine(raw).query(np.array(scan.vertices)[shown]).distance.max() < 3.0
 
 

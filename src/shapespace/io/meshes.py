@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,7 +33,8 @@ from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
 _PROBED_BYTES = 2**16
-_PROBES: Mapping[str, Callable[[bytes, int, Path], None]] = {".ply": probe_ply, ".stl": probe_stl}
+_Probe: TypeAlias = Callable[[bytes, int, Path], None]
+_PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
 
 
 @dataclass(frozen=True)
