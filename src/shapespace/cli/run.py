@@ -448,6 +448,8 @@ def recognise_train(arguments: argparse.Namespace) -> int:
         + f", {facts['modes']} modes"
         + (", relative to neutral" if facts["relative_to_neutral"] else "")
     )
+    for note in facts["notes_on_classes"]:
+        show(note)
     if checked["macro_accuracy"] is not None:
         left_out = "subjects" if checked["by"] == "subject" else "scans"
         show(f"macro accuracy on {left_out} left out: {100 * checked['macro_accuracy']:.1f} %")

@@ -100,7 +100,7 @@ def recognise_train(
     make_folder(output.absolute().parent)
     saved.save(output)
     classes = notes_on_classes("label", [scan.label for scan in scans])
-    return saved.facts(), [*problems, *notes, *classes]
+    return {**saved.facts(), "notes_on_classes": list(classes)}, [*problems, *notes]
 
 
 def recognise_predict(
