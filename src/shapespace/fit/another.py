@@ -119,7 +119,8 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
         target: the scan in its mm frame.
         fitted: result of the fit to it.
     """
-    if fitted.evidence["scan_near_share"] > _ALL_EXPLAINED:
+    # Heights are compared with those of neighbours, of which fewer points than these have too few.
+    if len(target.mesh.vertices) < _NEIGHBOURS or fitted.evidence["scan_near_share"] > _ALL_EXPLAINED:
         return {
             "displaced_share": 0.0, "displaced_inward_share": 0.0, "displaced_purity": 0.0, "scattered_share": 0.0,
         }  # fmt: skip
