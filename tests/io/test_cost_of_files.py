@@ -319,6 +319,22 @@ def test_twice_the_bytes_take_twice_the_memory_and_work(
     assert memories[1] <= MOST_FOR_A_BYTE * sizes[1] + TO_BEGIN_WITH
 
 
+def test_twice_the_materials_of_an_obj_take_twice_the_work(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image", reason="the extra 'report' is not installed")
+    image.new("RGB", (2, 2), (200, 0, 0)).save(tmp_path / "p.png")
+    path = tmp_path / "scan.obj"
+    works = []
+    for count in (400, 800):
+        # Each spelling of the picture names the same file.
+        names = [f".{'/' * (1 + k % 128)}{'./' * (k // 128)}p.png" for k in range(count)]
+        (tmp_path / "scan.mtl").write_text("".join(f"newmtl {k}\nmap_Kd {name}\n" for k, name in enumerate(names)))
+        rows = "".join(f"v 0 0 0\nusemtl {k}\nf {k + 1}/1 1/1 1/1\n" for k in range(count))
+        path.write_text(f"mtllib scan.mtl\nvt 0.1 0.1\n{rows}")
+        assert np.array_equal(read_mesh(path).colours, np.tile([200, 0, 0], (count, 1)))
+        works.append(work(path))
+    assert works[1] <= 2.3 * works[0]
+
+
 def test_the_ceilings_are_those_that_are_documented() -> None:
     said = " ".join((Path(__file__).parents[2] / "docs" / "cli.md").read_text().split())
     for ceiling in (

@@ -6,9 +6,7 @@ import json
 import struct
 import subprocess
 import sys
-import time
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -227,28 +225,6 @@ def test_colours_that_do_not_fit_the_vertices_are_refused() -> None:
     with pytest.raises(ValueError):
         PAINTED.colours[0, 0] = 1
     assert np.array_equal(replace(PAINTED, name="b").with_vertices(2 * SQUARE).colours, COLOURS)
-
-
-def seconds(call: Callable[[], object]) -> float:
-    start = time.process_time()
-    call()
-    return time.process_time() - start
-
-
-def test_an_obj_of_many_materials_is_read_in_time_that_grows_with_the_file(tmp_path: Path) -> None:
-    path = folder_of(tmp_path)
-
-    def scan(count: int) -> None:
-        # Each spelling of the picture names the same file.
-        names = [f".{'/' * (1 + k % 128)}{'./' * (k // 128)}p.png" for k in range(count)]
-        library = "".join(f"newmtl {k}\nmap_Kd {name}\n" for k, name in enumerate(names))
-        (tmp_path / "the one.mtl").write_text(library)
-        rows = "".join(f"v 0 0 0\nusemtl {k}\nf {k + 1}/1 1/1 1/1\n" for k in range(count))
-        path.write_text(f"mtllib the one.mtl\nvt 0.1 0.1\n{rows}")
-        assert np.array_equal(read_mesh(path).colours, np.tile(PIXELS[1, 0], (count, 1)))
-
-    few, many = (seconds(lambda n=n: scan(n)) for n in (1_000, 8_000))
-    assert many < 14 * few
 
 
 def test_a_materials_file_of_many_spellings_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
