@@ -16,7 +16,7 @@ from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 
-OF_OTHERS = {"--stl", "--version"}
+OF_OTHERS = {"--stl", "--version", "--nthreads"}
 
 
 def parsers(top: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:

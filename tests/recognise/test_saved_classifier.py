@@ -144,7 +144,7 @@ def cut_array(members):
 
 def huge_array(members):
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**9,)})
     members[an_array(members)] = stream.getvalue()
 
 
