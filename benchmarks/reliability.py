@@ -74,13 +74,13 @@ class Variant:
 
 VARIANTS: Mapping[str, tuple[Variant, ...]] = {
     "face": (
-        Variant(10), Variant(20), Variant(60, often=2), Variant(200, often=2), Variant(200, 30), Variant(200, 8),
+        Variant(10), Variant(20), Variant(60, often=2), Variant(200, often=2), Variant(200, 30),
         Variant(20, None, 3.0, 0.5), Variant(60, None, 1 / 3, 0.5), Variant(20, None, 1 / 30, 0.5),
         Variant(60, None, 1e-3, 0.5),
     ),
     "head": (Variant(20), Variant(60, often=2), Variant(60, 15), Variant(20, None, 1 / 10, 0.5)),
     "femur": (
-        Variant(10), Variant(20), Variant(60, often=2), Variant(60, 12), Variant(60, 5), Variant(20, None, 3.0, 0.5),
+        Variant(10), Variant(20), Variant(60, often=2), Variant(60, 12), Variant(20, None, 3.0, 0.5),
         Variant(20, None, 1 / 10, 0.5), Variant(60, None, 1e-3, 0.5),
     ),
 }  # fmt: skip
