@@ -121,7 +121,7 @@ def compared(design: Design, study: int, permutations: int) -> FloatArray:
         options = CompareOptions(permutations=permutations, seed=study, unequal_variances=unequal)
         found = compare(cohort, "~ group + age" if design.covariate else "~ group", options)
         maps = [effect.map for effect in found.effects if effect.name == "group" and effect.map is not None]
-        # Family-wise over the pairs of three groups is not promised: the first pair stands for them.
+        # The family-wise error does not include the pairs of three groups, so only the first pair is counted.
         out += [found.test("group").p <= LEVEL, bool((maps[0].any_way.p_family <= LEVEL).any())]
     return np.array([*out, found.dispersions[0].p <= LEVEL], dtype=np.float64)
 

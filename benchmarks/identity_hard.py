@@ -1,4 +1,4 @@
-"""Measure who-is-it where people look alike and scans are poor, so that every score makes errors.
+"""Measure verification and identification of similar people by poor scans, so that every score makes errors.
 
 People of ICT-FaceKit whose identity coefficients are multiplied by a factor below 1 (`spread`), with more noise and
 40 % of each scan missing. Other people with the same spread make the additive model; those tested are parted into four
@@ -42,7 +42,7 @@ FOLDS = 4
 
 @dataclass(frozen=True)
 class HardCase:
-    """A population of people who look alike, and how they are scanned.
+    """A population of similar people, and the settings of their scans.
 
     Args:
         spread: factor of the identity coefficients, 1 for people of ICT-FaceKit.
@@ -56,7 +56,7 @@ class HardCase:
 
     @property
     def name(self) -> str:
-        """Return what the row of the table is called."""
+        """Return the name of the row in the table."""
         return f"spread × {self.spread:g}, noise {self.noise_mm:g} mm, {100 * self.missing:.0f} % missing"
 
 
@@ -186,7 +186,7 @@ def main() -> int:
         scores = one["scores"]
         calibrated, score = scores["plda"]["cllr"][0], scores["plda"]["cllr_of_the_score"]
         print(f"{name}: fits {one['fits']}, pairs {scores['pairs']}")
-        print(f"{name}: Cllr of PLDA scores as they stand {score:.2f}, calibrated {calibrated:.2f} bits")
+        print(f"{name}: Cllr of uncalibrated PLDA scores {score:.2f}, calibrated {calibrated:.2f} bits")
     if chosen.json:
         chosen.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0

@@ -1,4 +1,4 @@
-"""How far landmarks move when a model stores them in triangles, and when it stores the nearest vertices (version 1).
+"""Displacement of landmarks that a model stores in triangles, and at the nearest vertices (version 1).
 
 Landmarks are random points of the surface of bundled faces (`--ict`: of ICT-FaceKit). Rows: on the first mesh after
 `build`, and in fits of raw scans of people who are not in the model. `--meshes` and `--landmarks` measure files of your

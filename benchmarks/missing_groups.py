@@ -77,7 +77,7 @@ class Population:
         return np.where(there[:, :, None], shapes, np.nan), groups
 
     def there(self, design: Design, rng: np.random.Generator) -> BoolArray:
-        """Return (N, V) which vertices are observed: in holed shapes one end is missing, by a varying amount."""
+        """Return (N, V) bool, which vertices are observed: holed shapes lack one end, by a varying amount."""
         chance = np.repeat([design.first_holed, design.second_holed], [design.first, design.second])
         holed = rng.random(len(chance)) < chance
         share = design.end * rng.uniform(0.7, 1.3, len(chance))

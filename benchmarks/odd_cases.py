@@ -328,7 +328,7 @@ def _axes(vertices: FloatArray) -> FloatArray:
 def _half_changed(
     mesh: Mesh, truths: Sequence[FloatArray], axis: FloatArray, factor: float
 ) -> tuple[Mesh, tuple[FloatArray, ...]]:
-    """Return scan and truth, that half scaled about the centroid which lies on the far side of it along `axis`."""
+    """Return scan and truth, with the half beyond the centroid along `axis` scaled about the centroid."""
     centre = truths[0].mean(axis=0)
 
     def changed(x: FloatArray) -> FloatArray:
@@ -370,7 +370,7 @@ def _object(
     rng: np.random.Generator,
     scanned: Callable[[Mesh], Mesh],
 ) -> Mesh:
-    """Return a scan of about the size of the family's shapes that shows something else."""
+    """Return a scan of another object with about the size of the family's shapes."""
     grown = float(np.exp(0.15 * rng.standard_normal()))
     if thing == "other organ":
         other = family_named(str(rng.choice([name for name in FAMILIES if name != family.name]))).draw(rng)
@@ -462,7 +462,7 @@ def measured(task: tuple[Kind, int, int]) -> dict[str, Any]:
 
 
 def measure(path: Path, cache: Path, wanted: Mapping[Kind, int], seed: int, jobs: int) -> None:
-    """Append the missing records to `path`: so many odd cases, and good ones until so many of their fits are right."""
+    """Append missing records to `path`: the wanted odd cases, and good cases until enough of their fits are right."""
     done = {(r["kind"], r["index"]): r["wrong"] for r in records(path) if r["seed"] == seed}
     prepare(cache)
     for name in FAMILIES:

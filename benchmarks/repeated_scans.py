@@ -31,12 +31,12 @@ IDENTITY_MM, NOISE_MM = 2.0, 1.0
 """Standard deviations of each coordinate: between subjects, and between scans of a subject in one condition."""
 ARRANGEMENTS, LEVEL = 200, 0.05
 EXPRESSION_MM = 6.0
-"""Mean effect of expressions, in designs in which it is not what is tested."""
+"""Mean effect of expressions, in designs that do not test it."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A design, and what is tested in it.
+    """A design, and its tested terms.
 
     Args:
         name: as it is printed.

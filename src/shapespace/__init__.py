@@ -1,4 +1,4 @@
-"""Turn any raw 3-D surface into a short vector that means something."""
+"""Statistical shape models from raw 3-D scans: correspondence, model building, robust fitting and shape statistics."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING

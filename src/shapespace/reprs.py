@@ -24,7 +24,7 @@ def short_repr(self: Any) -> str:
 
 
 def listed_briefly(parts: Sequence[str]) -> str:
-    """Return the first of `parts` in one line, and the number of the others."""
+    """Return the first of `parts`, and the number of the others, in one line."""
     more = f"; and {len(parts) - _MOST_NAMES} more" if len(parts) > _MOST_NAMES else ""
     return "; ".join(_clipped(part) for part in parts[:_MOST_NAMES]) + more
 

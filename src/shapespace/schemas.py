@@ -713,7 +713,7 @@ class MorphPart(Part, frozen=True, kw_only=True, tag="morph"):
         faces: (F, 3).
         low_label: what `low` is.
         high_label: what `high` is.
-        times: by how much the difference is multiplied in both; 1 is as it is, below 1 it is drawn smaller.
+        times: factor of the difference in both; 1 is the true difference, below 1 it is drawn smaller.
     """
 
     arrays: str
@@ -812,7 +812,8 @@ class TestScheme(Struct, frozen=True, kw_only=True):
         stratum: in which they are tested; empty where there is one.
         statistic: such as `F`, `Welch t` or `R2`; empty for p values of a distribution.
         resampling: permutations of rows, sign flips of rows, bootstrap draws, leaving out each unit, or none.
-        unit: what is permuted or flipped, such as `subject`.
+        unit: what is permuted or flipped, such as `subject`; `scan of a subject`: values are permuted within subjects,
+            and between subjects with the same number of scans.
         reduced_model: terms of the model whose residuals are resampled; empty for the mean; None where values
             themselves are.
         arrangements: number of them, the observed data among them.
@@ -862,7 +863,7 @@ class Dispersion(Struct, frozen=True, kw_only=True):
 
 
 class Methods(Struct, frozen=True, kw_only=True):
-    """What a methods section states about an analysis.
+    """The content of a methods section on an analysis.
 
     Args:
         subjects: number of subjects.
@@ -881,9 +882,10 @@ class Methods(Struct, frozen=True, kw_only=True):
         dispersions: tests of equal dispersion.
         unequal_variances: whether tests allow unequal dispersion; None where no groups are compared.
         effect_size: transformation before Z is standardised, `box-cox` or `log`; empty where no Z is given.
-        r2_strata: strata of whose total sum of squares R² is a share; an empty name is the whole. None where no R² is.
-        corrected_over: sets over which p values are corrected for multiple testing; all others are not corrected.
-        assumptions: what the tests assume beyond these, a sentence each.
+        r2_strata: strata whose total sums of squares are the reference of R²; an empty name means all shapes. None
+            without R².
+        corrected_over: sets over which p values are corrected for multiple testing; there is no other correction.
+        assumptions: sentences on further assumptions of the tests.
     """
 
     subjects: int

@@ -38,12 +38,12 @@ _FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
 
 
 def require(value: object, wanted: type, function: str, how: str) -> None:
-    """Refuse an argument of another type in a sentence, where Python would name a missing attribute.
+    """Raise an error in one sentence if an argument has the wrong type.
 
     Args:
         value: the argument.
         wanted: its type.
-        function: that takes it.
+        function: name of the function that takes it.
         how: the caller gets one, as the end of the sentence.
 
     Raises:
@@ -196,15 +196,15 @@ def _no_corners() -> IntArray:
 class SurfaceLandmarks(Mapping[str, int]):
     """Named points on a surface, each in a triangle by barycentric coordinates.
 
-    They stand for the same places on every surface with these vertices: `positions` returns them. As a mapping, it is
-    name -> nearest vertex (the corner with the largest barycentric coordinate), for uses that need a vertex.
+    They are the same anatomical places on every surface with these vertices: `positions` returns their positions. As a
+    mapping, it is name -> nearest vertex (the corner with the largest barycentric coordinate).
 
     Args:
         names: of the L landmarks, all different.
         corners: (L, 3) int32, the vertices of the triangle of each; they are put in order of falling coordinates. A
             landmark at a vertex has that vertex three times.
         barycentric: (L, 3) float64 coordinates in that triangle: not negative, with the sum 1.
-        distance_mm: (L,) float64, how far the point that was given lay from the surface; 0 for one given on it. Empty
+        distance_mm: (L,) float64, distance of the given point from the surface; 0 for one given on it. Empty
             for 0 of all.
 
     Raises:

@@ -57,7 +57,7 @@ Run = Callable[..., Outcome]
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """Run one command line in this process, with no word on what takes long: machines differ in that."""
-    monkeypatch.setattr(progress, "TOLD_AFTER_S", 3600.0)
+    monkeypatch.setattr(progress, "FIRST_LOG_LINE_S", 3600.0)
 
     def run(*arguments: object) -> Outcome:
         capsys.readouterr()

@@ -11,7 +11,7 @@ import pytest
 
 from conftest import Run, World
 from shapespace.batch import progress
-from shapespace.batch.progress import TOLD_AFTER_S
+from shapespace.batch.progress import FIRST_LOG_LINE_S
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -220,8 +220,8 @@ def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
     )
     for command, _ in commands:
         assert "..." not in run(*command).err, "short work is not worth a line"
-    assert TOLD_AFTER_S == 5.0
-    monkeypatch.setattr(progress, "TOLD_AFTER_S", 0.0)
+    assert FIRST_LOG_LINE_S == 5.0
+    monkeypatch.setattr(progress, "FIRST_LOG_LINE_S", 0.0)
     for command, line in commands:
         assert run(*command).err.splitlines().count(line) == 1
         assert "..." not in run(*command, "--quiet").err
@@ -230,8 +230,8 @@ def test_a_log_says_once_what_takes_long_unless_asked_for_quiet(
 def test_a_log_says_how_far_a_long_step_is_ever_more_rarely(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "TOLD_AFTER_S", 0.05)
-    monkeypatch.setattr(progress, "TOLD_EVERY_S", 0.1)
+    monkeypatch.setattr(progress, "FIRST_LOG_LINE_S", 0.05)
+    monkeypatch.setattr(progress, "LONGEST_PAUSE_S", 0.1)
     with progress.steps(None, "permuting", "step", quiet=False) as step:
         for done in range(1, 9):
             step(done, 8)

@@ -472,7 +472,7 @@ def test_a_new_shape_with_missing_vertices_is_completed_by_the_population() -> N
 def test_shapes_of_which_hardly_a_vertex_is_observed_are_refused_by_name() -> None:
     plain = training_meshes(4, vertices=60)
     bare = plain[2].with_vertices(np.full((60, 3), np.nan))
-    with pytest.raises(InputError, match=r"blob_2\.ply: hardly a vertex is observed"):
+    with pytest.raises(InputError, match=r"blob_2\.ply: too few vertices are observed"):
         Cohort.of_meshes([*plain[:2], bare, plain[3]], blank(4)[1])
     with pytest.raises(InputError, match="No vertex is observed by 50 % of the shapes"):
         Cohort.of_meshes([bare, bare, bare, plain[3]], blank(4)[1])

@@ -143,7 +143,7 @@ def test_white_space_of_cells_and_names_of_columns_makes_no_class(tmp_path: Path
     table, _ = read_table(written(tmp_path, "id, Group \na,Wild \nb,\xa0Wild\nc,Wild\n"))
     own = Table({" Group ": ("Wild ", " Wild", "Wild\t")}, ("a", "b", "c"))
     assert table.texts("Group") == own.texts("Group") == ("Wild",) * 3
-    with pytest.raises(InputError, match="two columns of one name"):
+    with pytest.raises(InputError, match="two columns whose names differ only in white space"):
         Table({"a": ("1",), "a ": ("2",)}, ("x",))
 
 

@@ -45,5 +45,5 @@ def test_scans_are_raw_and_the_table_names_their_groups(tmp_path: Path, capsys: 
 
 @pytest.mark.parametrize(("count", "effect"), [(1, 4.0), (4, 11.0), (4, float("nan"))])
 def test_numbers_out_of_range_are_refused(tmp_path: Path, count: int, effect: float) -> None:
-    with pytest.raises(InputError, match="must lie between"):
+    with pytest.raises(InputError, match="must be between"):
         write_bones(tmp_path, count=count, effect_mm=effect)

@@ -270,5 +270,5 @@ def test_shapes_of_volumes_that_are_long_in_one_direction_are_looked_at_in_parts
             assert tracemalloc.get_traced_memory()[1] < 40_000_000
         finally:
             tracemalloc.stop()
-    with pytest.raises(InputError, match="as pictures have"):
+    with pytest.raises(InputError, match="it is an image, not a segmentation"):
         labels_in(np.arange(200_000).reshape(200, 1000, 1) * 70_000)

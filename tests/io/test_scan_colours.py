@@ -135,10 +135,10 @@ def test_each_material_has_its_own_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mtl", "png", "said"),
     [
-        ("newmtl skin of face\nmap_Kd gone.png\n", None, "not beside it"),
-        ("newmtl skin of face\nmap_Kd \x1b[31m.png\n", None, "'?[31m.png' is not beside it"),
-        ("newmtl skin of face\nmap_Kd ../p.png\n", None, "outside of its folder"),
-        ("newmtl skin of face\nmap_Kd /etc/passwd\n", None, "outside of its folder"),
+        ("newmtl skin of face\nmap_Kd gone.png\n", None, "not in its folder"),
+        ("newmtl skin of face\nmap_Kd \x1b[31m.png\n", None, "'?[31m.png' is not in its folder"),
+        ("newmtl skin of face\nmap_Kd ../p.png\n", None, "outside its folder"),
+        ("newmtl skin of face\nmap_Kd /etc/passwd\n", None, "outside its folder"),
         ("newmtl skin of face\nmap_Kd p.png\n", b"no picture", "damaged or of a kind"),
         ("newmtl skin of face\nmap_Kd p.png\n", picture()[:45], "damaged or of a kind"),
         ("newmtl skin of face\nmap_Kd p.png\n", bomb(8193, 8192), "pixels, too many"),
@@ -159,7 +159,7 @@ def test_a_picture_that_cannot_be_read_is_a_note(mtl: str, png: bytes | None, sa
 def test_without_the_materials_an_obj_is_read_with_a_note(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text(TEXTURED)
     mesh = read_mesh(tmp_path / "a.obj")
-    assert mesh.colours is None and "its materials file 'the one.mtl' is not beside it" in mesh.notes[0]
+    assert mesh.colours is None and "its materials file 'the one.mtl' is not in its folder" in mesh.notes[0]
 
 
 def test_materials_without_a_picture_say_nothing(tmp_path: Path) -> None:

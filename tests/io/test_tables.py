@@ -110,7 +110,10 @@ HEAD = '<row r="1"><c r="A1" t="str"><v>id</v></c><c r="B1" t="str"><v>x</v></c>
         (f'{HEAD}<row r="2"><c r="A2" t="s"><v>-1</v></c></row>', "no shared string '-1'"),
         (f'{HEAD}<row r="2"><c r="A2" t="e"><v>#DIV/0!</v></c></row>', "has the error #DIV/0!"),
         (f'{HEAD}<row r="2"><c r="ZZZ2" t="str"><v>1</v></c></row>', "more columns than a sheet can have"),
-        (f'{HEAD}<row r="2"><c r="A2" t="str"><v>a</v></c><c r="C2"><v>1</v></c></row>', "has a cell beside its table"),
+        (
+            f'{HEAD}<row r="2"><c r="A2" t="str"><v>a</v></c><c r="C2"><v>1</v></c></row>',
+            "has a cell outside its table",
+        ),
         (f'{HEAD}<row r="2"><c', "damaged"),
     ],
 )

@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "TOLD_AFTER_S", 3600.0)
+    monkeypatch.setattr(progress, "FIRST_LOG_LINE_S", 3600.0)
 
 
 def build(*arguments: object) -> int:

@@ -698,7 +698,7 @@ def test_the_methods_name_the_sample_the_residuals_and_the_unit() -> None:
     text = " ".join(stated.text)
     for words in ("37 shapes of 37 subjects", "Exchangeability", "R² is the share", "Box-Cox", "Lengths are in mm"):
         assert words in text
-    assert "not corrected" not in text and "Nothing is corrected over the number of terms" in text
+    assert "not corrected" not in text and "not over the number of terms, maps or analyses" in text
 
 
 def test_lengths_of_landmarks_without_a_unit_are_never_mm() -> None:

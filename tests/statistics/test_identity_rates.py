@@ -245,7 +245,7 @@ def test_the_fnir_is_the_least_over_thresholds_that_hold_the_fpir(strangers, dig
 
 
 def test_a_gallery_of_one_person_is_refused():
-    with pytest.raises(InputError, match="two are the least"):
+    with pytest.raises(InputError, match="at least two are needed"):
         search(np.zeros((2, 3)), np.array([4, 4]), np.array([4, 5, 6]))
 
 

@@ -84,9 +84,9 @@ BAD = {
     "no such subject": (replace(FEW, subject="name"), "has no column 'name'"),
     "probe alone": (replace(FEW, probe="expression=fear"), "Probes need a gallery"),
     "trained and tested": (replace(FEW, train="expression=fear"), "both tested and learned from"),
-    "all learned from": (replace(FEW, train="expression!=sad"), "Nobody is left to be tested"),
-    "too many folds": (replace(FEW, folds=7), "cannot be parted into 7 folds"),
-    "one fold": (replace(FEW, folds=1), "cannot be parted into 1 folds"),
+    "all learned from": (replace(FEW, train="expression!=sad"), "No subject is left to test"),
+    "too many folds": (replace(FEW, folds=7), "cannot be split into 7 folds"),
+    "one fold": (replace(FEW, folds=1), "cannot be split into 1 folds"),
     "a score that is none": (replace(FEW, scores=("cosine", "sine")), "not sine"),
     "no score": (replace(FEW, scores=()), "none at all"),
     "too many modes": (replace(FEW, modes=7), "7 cannot be had"),
@@ -111,7 +111,7 @@ def test_a_subject_in_both_is_named():
 
 
 @pytest.mark.parametrize(
-    ("count", "scans", "expected"), [(3, 2, "four are the least"), (8, 1, "no two scans that are compared")]
+    ("count", "scans", "expected"), [(3, 2, "at least four are needed"), (8, 1, "no two of the compared scans")]
 )
 def test_too_few_people_or_scans_are_refused(count, scans, expected):
     with pytest.raises(InputError, match=expected):
@@ -202,7 +202,7 @@ def test_surfaces_without_fits_are_whitened_by_people_who_are_not_tested():
     np.testing.assert_allclose(np.cov(found.x[:18].T), np.eye(found.x.shape[1]), atol=1e-6)
     assert not found.variance.any()
     assert verify(surfaces, FEW)["plda"].eer.value < 0.3
-    with pytest.raises(InputError, match="three are the least"):
+    with pytest.raises(InputError, match="at least three are needed"):
         samples_of(surfaces, told.subjects, [0, 1])
 
 

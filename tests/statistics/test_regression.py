@@ -15,6 +15,7 @@ from shapespace.cohort.table import Table, numbers_as_text
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
+from shapespace.statistics.methods_answer import scheme_text
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known
 from shapespace.statistics.regression import Regression, compare_with, permutation_scheme, regress, share_of
 from shapespace.statistics.regression_answer import predicted_answer
@@ -164,6 +165,16 @@ def test_targets_of_subjects_are_exchanged_whatever_their_number_of_scans() -> N
     found = regress(cohort, "age", folds=5, permutations=99, draws=1)
     assert found.p is not None and found.p < 0.2, "no two subjects have as many scans"
     assert permutation_scheme(found.subjects, found.observed).endswith("the targets of all 20 subjects.")
+    assert scheme_text(found.methods.tests[0]) == "values permuted between subjects"
+
+
+def test_methods_state_the_scheme_of_targets_that_vary_within_subjects() -> None:
+    cohort = drawn(20, 9, repeats=2)
+    ages = numbers_as_text(cohort.table.numbers("age") + 0.1 * np.arange(40))
+    cohort = replace(cohort, table=Table({**cohort.table.columns, "age": ages}, cohort.names))
+    found = regress(cohort, "age", folds=5, permutations=9, draws=1)
+    text = scheme_text(found.methods.tests[0])
+    assert text == "values permuted within subjects, and between subjects with the same number of scans"
 
 
 def test_new_subjects_count_once_in_the_figures_of_new_shapes(learned: Regression) -> None:

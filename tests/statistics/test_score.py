@@ -218,7 +218,7 @@ def test_who_cannot_be_scored_is_refused_in_one_sentence() -> None:
     reference, subjects = population(20, rng), population(2, rng, name="s")
     with pytest.raises(InputError, match="reference of 4 shapes is too small"):
         score(reference.take(range(4)), subjects)
-    with pytest.raises(InputError, match="has 1 to 4 modes to measure by, not 9"):
+    with pytest.raises(InputError, match="has 1 to 4 modes, not 9"):
         score(reference, subjects, ScoreOptions(modes=9))
     with pytest.raises(InputError, match="r3 is in the reference too, as r3; leave it out"):
         score(reference, reference.take([3]))
@@ -289,7 +289,7 @@ def test_the_command_says_what_is_wrong_in_one_sentence(fits: Path, capsys: pyte
     for subjects, more, told in (
         (fits, [], "is in the reference too"),
         (fits.parent / "unsure", [], "0 of its fits can be used, and one is the least"),
-        (new, ["--modes", "99"], "modes to measure by"),
+        (new, ["--modes", "99"], "has 1 to 4 modes"),
         (new, ["--subject", "site"], "no column 'site'"),
     ):
         assert main(["score", str(subjects), "-o", str(out), "--reference", str(fits), "--quiet", *more]) == 2

@@ -125,7 +125,7 @@ class _Run:
                 self._suspects.extend(numbers)
             elif error is not None:
                 if not isinstance(error, ShapespaceError):
-                    # A worker of another version that came later may fail in any way, as where it loads the tasks.
+                    # A worker of another version that joined later may fail anywhere, such as when it loads the tasks.
                     self._check_versions()
                 raise error
             answers: list[Any] = [] if error is not None else future.result()
@@ -190,14 +190,14 @@ def _version_reader() -> Callable[[], str]:
 
 
 def _other_versions(by_version: Mapping[str, Sequence[str]]) -> str:
-    told = "; ".join(
+    others = "; ".join(
         f"{version} at {', '.join(workers[:_MOST_NAMED])}"
         + (f" and {len(workers) - _MOST_NAMED} more" if len(workers) > _MOST_NAMED else "")
         for version, workers in by_version.items()
     )
     return (
-        f"This process uses shapespace {__version__}, but Dask workers have another version ({told}); install the same "
-        "version on all of them and restart the workers."
+        f"This process uses shapespace {__version__}, but Dask workers have another version ({others}); install the "
+        "same version on all of them and restart the workers."
     )
 
 
@@ -205,7 +205,7 @@ def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None, 
     """Do some tasks at a worker of Dask, in a process below it that may die without it.
 
     Raises:
-        FitError: the worker, which may have come after the versions were checked, has another one than `version`.
+        FitError: the worker, which may have joined after the versions were checked, does not have `version`.
     """
     if version != __version__:
         from distributed import get_worker

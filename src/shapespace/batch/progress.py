@@ -1,4 +1,4 @@
-"""Progress of long steps: a bar in a terminal, and without one lines in a log, ever more rarely."""
+"""Progress of long steps: a bar in a terminal, otherwise log lines at growing intervals."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-TOLD_AFTER_S = 5.0
-"""Seconds after which a log is told of a step that still runs, where there is no terminal."""
-TOLD_EVERY_S = 60.0
-"""The longest pause between two lines of one step in a log, s; pauses double until then, so that logs stay short."""
+FIRST_LOG_LINE_S = 5.0
+"""Seconds until the first log line of a step, if there is no terminal."""
+LONGEST_PAUSE_S = 60.0
+"""Longest pause between two log lines of one step, s; pauses double up to it, so that logs stay short."""
 
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ else:
 
 
 class Bar(_Tqdm):
-    """A bar that counts also where it is not drawn."""
+    """A progress bar that also counts when it is not drawn."""
 
     counted: float = 0
     """How many are done."""
 
-    said = ""
+    shown_description = ""
     """The description that was set last."""
 
     def update(self, n: float | None = 1) -> bool | None:
@@ -39,13 +39,13 @@ class Bar(_Tqdm):
 
     def set_description_str(self, desc: str | None = None, refresh: bool | None = True) -> None:
         """Set the description."""
-        self.said = desc or ""
+        self.shown_description = desc or ""
         super().set_description_str(desc, bool(refresh))
 
 
 @contextmanager
 def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[Bar]:
-    """Yield a bar on standard error; without a terminal lines in a log say how far it is, with `quiet` nothing.
+    """Yield a progress bar on standard error; without a terminal, log lines instead; with `quiet`, neither.
 
     Args:
         total: how many there are, where that is known.
@@ -58,11 +58,11 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
     # disable=None is tqdm's way to ask whether there is a terminal.
     with Bar(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar:
 
-        def far() -> str:
-            said = f", {bar.said}" if bar.said else ""
-            return f"{said}: {bar.counted:g} of {bar.total:g} done" if bar.counted and bar.total else said
+        def state() -> str:
+            text = f", {bar.shown_description}" if bar.shown_description else ""
+            return f"{text}: {bar.counted:g} of {bar.total:g} done" if bar.counted and bar.total else text
 
-        with _telling_a_log(what, far, quiet=quiet):
+        with _logging_progress(what, state, quiet=quiet):
             yield bar
 
 
@@ -82,7 +82,7 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 def waiting(what: str, *, quiet: bool) -> Generator[None]:
     """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
     with (
-        _telling_a_log(what, lambda: "", quiet=quiet),
+        _logging_progress(what, lambda: "", quiet=quiet),
         tqdm(total=0, desc=f"{what} ...", bar_format="{desc}", leave=False, disable=True if quiet else None),
     ):
         yield
@@ -99,12 +99,12 @@ def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _telling_a_log(what: str, far: Callable[[], str], *, quiet: bool) -> Generator[None]:
-    """Print lines on standard error while the block runs: the first after `TOLD_AFTER_S`, then ever more rarely.
+def _logging_progress(what: str, state: Callable[[], str], *, quiet: bool) -> Generator[None]:
+    """Print lines on standard error while the block runs, first after `FIRST_LOG_LINE_S`, then at growing intervals.
 
     Args:
-        what: is being done.
-        far: returns how far it is, to stand after `what`; empty where that is not known.
+        what: the step.
+        state: returns the progress, which is printed after `what`; empty if it is unknown.
         quiet: whether to be silent.
     """
     if quiet or sys.stderr.isatty():
@@ -112,15 +112,14 @@ def _telling_a_log(what: str, far: Callable[[], str], *, quiet: bool) -> Generat
         return
     ended, began = threading.Event(), time.monotonic()
 
-    def tell() -> None:
-        pause, after = TOLD_AFTER_S, ""
+    def print_lines() -> None:
+        pause, after = FIRST_LOG_LINE_S, ""
         while not ended.wait(pause):
-            print(f"shapespace: {what}{far()} ...{after}", file=sys.stderr, flush=True)
-            pause = min(max(2 * pause, 1.0), TOLD_EVERY_S)
+            print(f"shapespace: {what}{state()} ...{after}", file=sys.stderr, flush=True)
+            pause = min(max(2 * pause, 1.0), LONGEST_PAUSE_S)
             after = f" ({time.monotonic() - began + pause:.0f} s)"
 
-    teller = threading.Thread(target=tell, name="shapespace progress", daemon=True)
-    teller.start()
+    threading.Thread(target=print_lines, name="shapespace progress", daemon=True).start()
     try:
         yield
     finally:

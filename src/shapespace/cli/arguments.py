@@ -18,7 +18,9 @@ _UNITS = ("auto", "um", "mm", "cm", "inch", "m")
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     top = argparse.ArgumentParser(
-        prog="shapespace", description="Turn any raw 3-D surface into a short vector that means something."
+        prog="shapespace",
+        description="Statistical shape models from raw 3-D scans: correspondence, model building, robust fitting and "
+        "shape statistics.",
     )
     top.add_argument("--version", action="version", version=f"shapespace {__version__}")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
@@ -35,24 +37,24 @@ def parser() -> argparse.ArgumentParser:
     _add_view(commands)
     _add_recognise(commands)
     compare.add(
-        _add(commands, "compare", "do groups differ, and with what: linear models of shape on covariates",
-             "shapespace compare people.csv --shapes fits --formula '~ sex + age' -o sex-and-age")
+        _add(commands, "compare", "test effects of groups and covariates on shape by linear models",
+             "shapespace compare people.csv --formula '~ sex + age' -o sex-and-age")
     )  # fmt: skip
     change.add(
-        _add(commands, "change", "what changed between visits of the same subjects, in mm, and what of it is noise",
-             "shapespace change visits.csv -o change --order before,after --stable forehead.csv")
+        _add(commands, "change", "measure change between visits of the same subjects, in mm, and its noise",
+             "shapespace change visits.csv -o change --order before,after")
     )  # fmt: skip
     asymmetry.add(
-        _add(commands, "asymmetry", "how symmetric are they: scores and maps, directional and fluctuating asymmetry",
-             "shapespace asymmetry people.csv --shapes fits --surfaces dense -o asymmetry")
+        _add(commands, "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
+             "shapespace asymmetry skulls.csv --surfaces dense -o asymmetry")
     )  # fmt: skip
     regress.add(
-        _add(commands, "regress", "predict a number, such as age, from shape, and say how well",
+        _add(commands, "regress", "predict a number, such as age, from shape, with its cross-validated accuracy",
              "shapespace regress people.csv --target age -o age --predict new.csv")
     )  # fmt: skip
     score.add(
-        _add(commands, "score", "where new subjects lie in a reference population: distance, percentile, map",
-             "shapespace score patients -o scored --reference controls.csv --reference-shapes fits")
+        _add(commands, "score", "score new subjects against a reference population: distance, percentile, z-map",
+             "shapespace score patients -o scored --reference controls.csv")
     )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
@@ -77,7 +79,7 @@ def _add(commands: Any, name: str, what: str, example: str, *, json_facts: bool 
 
 
 def _add_recursive(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--recursive", action="store_true", help="take what lies in folders below those given too")
+    sub.add_argument("--recursive", action="store_true", help="also search subfolders of the given folders")
 
 
 def _add_demo(commands: Any) -> None:
@@ -102,10 +104,10 @@ def _add_data(commands: Any) -> None:
         sub, "faces", "write simulated corresponded faces (PLY) with labels.csv",
         "shapespace data faces -o faces --subjects 100 --expressions neutral",
     )  # fmt: skip
-    faces.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    faces.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
     faces.add_argument("--subjects", type=_positive, default=100, metavar="N")
     faces.add_argument("--expressions", default="neutral", metavar="LIST", help="names with commas between them")
-    faces.add_argument("--seed", type=_natural, default=0, metavar="S")
+    faces.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     faces.add_argument("--source", choices=("bundled", "ict-facekit"), default="bundled")
     faces.add_argument("--area", choices=("face", "face_and_head"),
                        help="what to write (default: face of ict-facekit, face_and_head of bundled)")  # fmt: skip
@@ -120,42 +122,46 @@ def _add_data(commands: Any) -> None:
     faces.set_defaults(run=run.data_faces)
     organs = _add(sub, "organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
                   "shapespace data organs -o organs --count 40")  # fmt: skip
-    organs.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    organs.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
     organs.add_argument("--count", type=_positive, default=40, metavar="N")
-    organs.add_argument("--seed", type=_natural, default=0, metavar="S")
+    organs.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     organs.add_argument("--volumes", action="store_true", help="label volumes (NIfTI) of the same organs")
     organs.set_defaults(run=run.data_organs)
-    bones = _add(sub, "bones", "write raw scans (PLY) of simulated bones of two groups, with bones.csv",
+    bones = _add(sub, "bones", "write simulated bones of two groups: raw scans (PLY), and their table bones.csv",
                  "shapespace data bones -o bones --count 16")  # fmt: skip
-    bones.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    bones.add_argument("--count", type=_positive, default=16, metavar="N", help="of both groups in turn (default 16)")
-    bones.add_argument("--seed", type=_natural, default=0, metavar="S")
+    bones.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
+    bones.add_argument("--count", type=_positive, default=16, metavar="N",
+                       help="number of bones; the groups alternate (default 16)")  # fmt: skip
+    bones.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     bones.add_argument("--effect", type=float, default=4.0, metavar="MM",
-                       help="how much longer the snouts of the second group are (default 4)")  # fmt: skip
+                       help="difference of the snout length between the two groups (default 4)")  # fmt: skip
     bones.set_defaults(run=run.data_bones)
 
 
 def _add_surface(commands: Any) -> None:
-    sub = _add(commands, "surface", "surfaces of labels in volumes (NIfTI, NRRD), as PLY in RAS mm",
+    sub = _add(commands, "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in RAS mm",
                "shapespace surface masks -o surfaces --label 1\n"
                "         shapespace fit model.h5 surfaces -o out --unit mm")  # fmt: skip
     sub.add_argument("volumes", nargs="+", type=Path, metavar="MASK", help="label volumes, or folders of them")
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where NAME.ply is written")
+    sub.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="output folder; each surface is NAME.ply"
+    )
     _add_recursive(sub)
     sub.add_argument("--label", type=_labels, metavar="N|N,N|all",
-                     help="what to take as one object (default: the only label there is)")  # fmt: skip
+                     help="labels that form one object (default: the only label of the volume)")  # fmt: skip
     sub.add_argument("--smooth", type=_smoothing, default=1.3, metavar="S",
                      help="standard deviation of the smoothing in voxels (default 1.3; 0: none)")  # fmt: skip
     sub.add_argument("--keep-pieces", action="store_true",
-                     help="all pieces and cavities (default: the largest piece, cavities filled)")  # fmt: skip
+                     help="keep all pieces and cavities (default: the largest piece, cavities filled)")  # fmt: skip
     sub.add_argument("--max-memory", type=_memory_bytes, metavar="SIZE",
-                     help="memory that a volume and its surface may take, such as 8G or 500M; one that takes more is "
-                          "refused before it is read (default 4G, at most four fifths of the free memory)")  # fmt: skip
+                     help="memory limit for a volume and its surface, such as 8G or 500M; a volume that needs more is "
+                          "refused before it is read (default: 4G, or 80 %% of the free memory if that is "
+                          "less)")  # fmt: skip
     sub.set_defaults(run=run.surface)
 
 
 def _add_check(commands: Any) -> None:
-    sub = _add(commands, "check", "mesh doctor: what is in it, what is wrong, what fitting will do about it",
+    sub = _add(commands, "check", "check meshes: contents, defects, and their repair before a fit",
                "shapespace check scan.obj")  # fmt: skip
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _add_recursive(sub)
@@ -165,33 +171,36 @@ def _add_check(commands: Any) -> None:
 
 def _add_strict(sub: Any, more: str = "") -> None:
     sub.add_argument("--strict", action="store_true",
-                     help="refuse scans with coordinates that are NaN or infinite, instead of removing the triangles "
-                          f"that use them{more}")  # fmt: skip
+                     help="refuse scans with coordinates that are NaN or infinite (default: remove the triangles "
+                          f"that use them){more}")  # fmt: skip
 
 
 def _add_correspond(commands: Any) -> None:
-    sub = _add(commands, "correspond", "raw scans to the same surfaces in correspondence, with no model to begin with",
+    sub = _add(commands, "correspond", "bring raw scans into dense correspondence; no model is needed",
                "shapespace correspond scans -o same\n"
                "         shapespace build same -o model.h5")  # fmt: skip
     sub.add_argument("scans", nargs="+", metavar="SCAN",
-                     help="scans of one kind of object, folders, patterns, addresses or lists (.csv)")  # fmt: skip
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
+                     help="scans of one kind of object: files, folders, patterns, addresses or lists "
+                          "(.csv)")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
     _add_recursive(sub)
     sub.add_argument("--template", type=Path, metavar="FILE",
-                     help="a mesh to begin with, as it is (default: the scan nearest to all others)")  # fmt: skip
+                     help="template mesh, used unchanged (default: the scan closest to all others)")  # fmt: skip
     sub.add_argument("--model", type=Path, metavar="MODEL.h5",
-                     help="a model of such objects to begin with: its mean is the template")  # fmt: skip
+                     help="shape model of such objects; its mean is the template")  # fmt: skip
     sub.add_argument("--landmarks", type=Path, metavar="DIR",
-                     help="landmarks of all or some scans: files named as the scans, with other endings")  # fmt: skip
+                     help="landmarks of all or some scans: files with the names of the scans and another "
+                          "ending")  # fmt: skip
     sub.add_argument("--landmark-error", type=_share, default=0.02, metavar="SHARE",
-                     help="their standard deviation, as a share of the object's size (default 0.02)")  # fmt: skip
+                     help="standard deviation of the landmarks, as a share of the object's size (default "
+                          "0.02)")  # fmt: skip
     sub.add_argument("--symmetric", action="store_true", help="the object is its own mirror image")
     sub.add_argument("--vertices", type=_positive, default=10_000, metavar="N",
-                     help="of the template where a scan is chosen (default 10000)")  # fmt: skip
-    sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="at most (default 3)")
+                     help="vertices of the template if it is one of the scans (default 10000)")  # fmt: skip
+    sub.add_argument("--rounds", type=_positive, default=3, metavar="N", help="maximum number of rounds (default 3)")
     _add_strict(sub)
     _add_where(sub, "scans")
-    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     sub.set_defaults(run=run.correspond, goes_on="; the same command goes on from there")
 
 
@@ -236,12 +245,12 @@ def _add_build(commands: Any) -> None:
                      help="a part of the surface to hold fits to: a CSV file of vertices; can be repeated")  # fmt: skip
     sub.add_argument("--provenance", default="", metavar="TEXT", help="what the meshes are")
     sub.add_argument("--licence", default="", metavar="TEXT", help="of the meshes")
-    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     sub.set_defaults(run=run.build)
 
 
 def _add_quality(commands: Any) -> None:
-    sub = _add(commands, "quality", "how good a shape space is: compactness, generalisation, specificity",
+    sub = _add(commands, "quality", "measure a shape model: compactness, generalisation, specificity",
                "shapespace quality faces -o quality\n"
                "         shapespace quality registered_a registered_b --scans scans -o quality")  # fmt: skip
     sub.add_argument("targets", nargs="+", type=Path, metavar="TARGET",
@@ -267,7 +276,7 @@ def _add_quality(commands: Any) -> None:
 
 
 def _add_info(commands: Any) -> None:
-    sub = _add(commands, "info", "facts of a model, a mesh, a fit, a store or a folder in correspondence",
+    sub = _add(commands, "info", "print facts of a model, a mesh, a fit, a store or a folder of correspond",
                "shapespace info model.h5")  # fmt: skip
     sub.add_argument(
         "file", type=Path, metavar="FILE|DIR", help="a model, a mesh, a record, a store, or what correspond wrote"
@@ -284,48 +293,55 @@ def _add_fit(commands: Any) -> None:
     sub.add_argument("scans", nargs="+", metavar="SCAN",
                      help="scans, folders, patterns, addresses such as s3://bucket/x, or lists of these")  # fmt: skip
     sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
-                     help="where to write; results that are there already stay")  # fmt: skip
+                     help="output folder; existing valid results are reused")  # fmt: skip
     _add_recursive(sub)
     sub.add_argument(
         "--method",
         default="robust",
         metavar="NAME",
-        help="robust (default): pose and shape together, from both directions; paper: the paper's modified ICP",
+        help="robust (default): pose and shape jointly, from distances in both directions; paper: the paper's "
+        "modified ICP",
     )
-    sub.add_argument("--unit", choices=_UNITS, default="auto", help="of the scans (default: found)")
+    sub.add_argument("--unit", choices=_UNITS, default="auto",
+                     help="unit of the scans (default: detected)")  # fmt: skip
     sub.add_argument("--search", choices=("auto", "vertices", "surface"), default="auto",
-                     help="for --method paper: among the scan's vertices (auto) or on its triangles")  # fmt: skip
+                     help="closest points of --method paper: vertices of the scan (auto) or points on its "
+                          "triangles")  # fmt: skip
     sub.add_argument("--scale", choices=("auto", "free", "fixed"), default="auto",
-                     help="fit the scale or hold it; auto goes by the model's gauge")  # fmt: skip
-    sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N", help="cap of each phase")
+                     help="estimate the scale or keep it fixed; auto: free if the model's gauge is shape, fixed if "
+                          "it is form")  # fmt: skip
+    sub.add_argument("--max-iterations", type=_positive, default=500, metavar="N",
+                     help="maximum number of iterations of each phase (default 500)")  # fmt: skip
     sub.add_argument("--landmarks", type=Path, metavar="FILE|DIR",
-                     help="to start from and be held to, named as in the model: of one scan, or a folder with a file "
-                          "for each, named as it; or the column landmarks of a list of scans")  # fmt: skip
+                     help="landmarks that initialise and constrain the fit, with the names of the model's landmarks: "
+                          "a file for one scan, or a folder with a file for each scan, named after it; a list of "
+                          "scans may have a column landmarks instead")  # fmt: skip
     sub.add_argument("--landmark-sd", type=_stddev, metavar="MM",
-                     help="their standard deviation (default: 3 %% of the model's size); inf: none")  # fmt: skip
+                     help="standard deviation of the landmarks (default: 3 %% of the model's size); inf: they only "
+                          "initialise the fit")  # fmt: skip
     sub.add_argument("--crop", default="", metavar="KIND:NUMBERS",
-                     help="fit what lies in sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z (the scan's frame and unit), or within "
-                          "so many mm of the landmarks, landmarks:MM")  # fmt: skip
+                     help="fit only the part of the scan inside sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z (in its frame and "
+                          "unit), or landmarks:MM, within this distance in mm of the landmarks")  # fmt: skip
     sub.add_argument("--region", metavar="NAME|FILE.csv",
-                     help="hold fit, distances and verdict to a part of the model: a region that it has by name, or a "
-                          "CSV file of its vertices")  # fmt: skip
+                     help="restrict the fit, its distances and its status to a region of the model: its name, or a "
+                          "CSV file of vertices")  # fmt: skip
     _add_where(sub, "scans")
     results = sub.add_mutually_exclusive_group()
-    results.add_argument("--again", action="store_true", help="fit also scans whose results of earlier runs still hold")
+    results.add_argument("--again", action="store_true", help="fit all scans again, also those with valid results")
     results.add_argument("--resume", action="store_true",
-                         help="keep results of earlier runs that still hold; it is what is done anyway")  # fmt: skip
+                         help="keep valid results of earlier runs (the default)")  # fmt: skip
     sub.add_argument("--dense", action="store_true",
-                     help="also write NAME.dense.ply: the surface taken the rest of the way to the scan")  # fmt: skip
+                     help="also write NAME.dense.ply, the fitted surface deformed further onto the scan")  # fmt: skip
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")
     sub.add_argument("--store", action="store_true",
-                     help="keep results in few files, as is done by itself from 10,000 scans on")  # fmt: skip
+                     help="write the results to few files (the default from 10,000 scans on)")  # fmt: skip
     _add_strict(sub, "; exit with 1 when a fit is doubtful")
-    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     sub.set_defaults(run=run.fit, goes_on="; the same command goes on from there")
 
 
 def _add_view(commands: Any) -> None:
-    sub = _add(commands, "view", "a shape model, fits or surfaces in correspondence in the browser",
+    sub = _add(commands, "view", "view a shape model, fits or surfaces in correspondence in the browser",
                "shapespace view model.h5", json_facts=False)  # fmt: skip
     sub.add_argument(
         "path", type=Path, metavar="MODEL.h5|DIR", help="a model, or a folder that fit or correspond wrote"
@@ -339,7 +355,7 @@ def _add_view(commands: Any) -> None:
 
 
 def _add_report(commands: Any) -> None:
-    sub = _add(commands, "report", "one HTML file on the results in a folder: fits, a correspondence, a study",
+    sub = _add(commands, "report", "write one HTML report of the fits, correspondence or study in a folder",
                "shapespace fit model.h5 scans -o out --stages\n         shapespace report out")  # fmt: skip
     sub.add_argument("folder", type=Path, metavar="DIR", help="written by shapespace fit, correspond or demo")
     sub.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the report (default DIR/report.html)")
@@ -351,7 +367,7 @@ def _add_report(commands: Any) -> None:
 
 
 def _add_export(commands: Any) -> None:
-    sub = _add(commands, "export", "fits of a store as single files again, or all of them as one table",
+    sub = _add(commands, "export", "export the fits of a store as single files, or as one table",
                "shapespace export out anna ben -o single\n"
                "         shapespace export out --table fits.csv")  # fmt: skip
     sub.add_argument("store", type=Path, metavar="STORE", help="a folder that shapespace fit wrote")
@@ -365,7 +381,7 @@ def _add_export(commands: Any) -> None:
 
 
 def _add_convert(commands: Any) -> None:
-    sub = _add(commands, "convert", "a shape model from the format of another tool, or to one",
+    sub = _add(commands, "convert", "convert a shape model from or to the format of another tool",
                "shapespace convert femur.h5.json femur.h5\n"
                "         shapespace convert model.h5 model.bin --to eos")  # fmt: skip
     sub.add_argument("source", type=Path, metavar="IN", help="a model in any format that is read")
@@ -378,18 +394,20 @@ def _add_convert(commands: Any) -> None:
 
 
 def _add_recognise(commands: Any) -> None:
-    sub = commands.add_parser("recognise", help="tell expressions or other classes apart by fitted coefficients")
+    sub = commands.add_parser(
+        "recognise", help="classify scans (for example, facial expressions) by fitted coefficients"
+    )
     sub = sub.add_subparsers(required=True, metavar="train|predict|transfer|study|verify|identify")
     _add_recognise_train(sub)
     _add_recognise_predict(sub)
     _add_recognise_transfer(sub)
     _add_recognise_study(sub)
     identity.add_verify(
-        _add(sub, "verify", "are two scans of one subject: error rates and calibrated likelihood ratios",
-             "shapespace recognise verify scans.csv -o verified --gallery expression=neutral")
+        _add(sub, "verify", "test whether two scans are of one subject: error rates, likelihood ratios",
+             "shapespace recognise verify scans.csv -o verified --gallery session=1")
     )  # fmt: skip
     identity.add_identify(
-        _add(sub, "identify", "which of the enrolled subjects does a scan show: ranks, and what is missed",
+        _add(sub, "identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
              "shapespace recognise identify scans.csv -o identified --gallery expression=neutral")
     )  # fmt: skip
 
@@ -412,7 +430,7 @@ def _add_recognise_train(commands: Any) -> None:
     sub.add_argument("--modes", type=_positive, metavar="K", help="leading coefficients to see (default: all)")
     sub.add_argument("--expression-of", type=Path, metavar="MODEL.h5",
                      help="see the expression alone, as parted by this model of build --additive")  # fmt: skip
-    sub.add_argument("--seed", type=_natural, default=0, metavar="S")
+    sub.add_argument("--seed", type=_natural, default=0, metavar="S", help="random seed (default 0)")
     sub.set_defaults(run=run.recognise_train)
 
 
@@ -454,14 +472,17 @@ def _add_recognise_study(commands: Any) -> None:
 
 
 def _add_where(sub: argparse.ArgumentParser, what: str) -> None:
-    sub.add_argument("--jobs", type=_natural, default=0, metavar="N", help=f"{what} at a time (default: one a core)")
+    sub.add_argument(
+        "--jobs", type=_natural, default=0, metavar="N", help=f"{what} in parallel (default: one per core)"
+    )
     sub.add_argument("--executor", choices=_EXECUTORS, default="local",
-                     help="local (default): processes here; serial: one after the other; dask: a cluster")  # fmt: skip
+                     help="local (default): processes on this machine; serial: one after the other; dask: a Dask "
+                          "cluster")  # fmt: skip
     sub.add_argument("--dask", metavar="ADDRESS",
-                     help="of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file (.json); "
-                          "without it --executor dask makes a cluster of this machine")  # fmt: skip
+                     help="address of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file (.json); "
+                          "without it --executor dask starts a cluster on this machine")  # fmt: skip
     sub.add_argument("--timeout", type=_seconds, metavar="S",
-                     help=f"give up any of the {what} that takes longer, and go on with the others")  # fmt: skip
+                     help=f"skip any of the {what} that takes longer than S seconds")  # fmt: skip
 
 
 def _seconds(text: str) -> float:

@@ -100,11 +100,7 @@ def data_faces(arguments: argparse.Namespace) -> int:
         intensities=arguments.intensity,
         effect_mm=arguments.effect,
     )
-    if arguments.json:
-        show_json({"folder": str(arguments.output), "faces": count})
-    else:
-        show(f"{count} {'face' if count == 1 else 'faces'} in {arguments.output}")
-    return 0
+    return _show_written(arguments, "face", count)
 
 
 def data_organs(arguments: argparse.Namespace) -> int:
@@ -113,11 +109,7 @@ def data_organs(arguments: argparse.Namespace) -> int:
 
     out, count = arguments.output, arguments.count
     write_simulated_organs(out, count=count, seed=arguments.seed, volumes=arguments.volumes, quiet=arguments.quiet)
-    if arguments.json:
-        show_json({"folder": str(out), "organs": count})
-    else:
-        show(f"{count} {'organ' if count == 1 else 'organs'} in {out}")
-    return 0
+    return _show_written(arguments, "organ", count)
 
 
 def data_bones(arguments: argparse.Namespace) -> int:
@@ -126,10 +118,15 @@ def data_bones(arguments: argparse.Namespace) -> int:
 
     out, count = arguments.output, arguments.count
     write_simulated_bones(out, count=count, seed=arguments.seed, effect_mm=arguments.effect, quiet=arguments.quiet)
+    return _show_written(arguments, "bone", count)
+
+
+def _show_written(arguments: argparse.Namespace, what: str, count: int) -> int:
+    """Print how many simulated shapes were written, and where."""
     if arguments.json:
-        show_json({"folder": str(out), "bones": count})
+        show_json({"folder": str(arguments.output), f"{what}s": count})
     else:
-        show(f"{count} bones in {out}")
+        show(f"{count} {what}{'' if count == 1 else 's'} in {arguments.output}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Classes of a table that may be misspelt: their counts, classes of one shape, and classes that are nearly the same."""
+"""Classes of a table: counts, and likely misspellings (classes with one shape, and classes with similar names)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from itertools import combinations
 from shapespace.cohort.table import Table, is_number
 
 _LISTED = 12
-"""Classes whose counts are listed, the largest first."""
+"""Largest number of classes whose counts are listed."""
 _COMPARED = 60
-"""Classes of which every two are compared letter by letter; columns with more hold names."""
+"""Largest number of classes that are compared letter by letter; columns with more contain names."""
 _LONG = 5
-"""Letters from which words that differ in one are likely to be the same; shorter ones such as left and lent are not."""
+"""Shortest words that count as similar if one letter differs; shorter ones, such as left and lent, do not."""
 
 
 def class_notes(table: Table, columns: Iterable[str]) -> tuple[str, ...]:
@@ -28,7 +28,7 @@ def class_notes(table: Table, columns: Iterable[str]) -> tuple[str, ...]:
 def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
     """Return the number of shapes in each class, and sentences on classes that may be misspelt.
 
-    Where more than half of all shapes have a class of their own, the column holds names, whose counts are not listed.
+    If more than half of all shapes are the only ones of their class, the column contains names and no counts are given.
 
     Args:
         column: its name.
@@ -60,7 +60,7 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
 
 
 def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str]]:
-    """Return pairs of names that are nearly the same, and in what they differ."""
+    """Return pairs of similar names, and their difference."""
     plain: dict[str, list[str]] = {}
     for name in names:
         plain.setdefault("".join(name.casefold().split()), []).append(name)
@@ -75,7 +75,7 @@ def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str
 
 
 def _one_edit(one: str, other: str) -> bool:
-    """Return whether inserting, removing or replacing one letter, or exchanging two neighbours, makes one the other."""
+    """Return whether words differ by one inserted, removed or replaced letter, or by two exchanged neighbours."""
     start = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
     rest, left = one[start:], other[start:]
     replaced = rest[1:] == left[1:]

@@ -36,7 +36,7 @@ ShapeKind: TypeAlias = Literal["coefficients", "fitted", "dense", "corresponding
 
 _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _UNIT_SIZE = 1e-2
-"""Tolerance of unit centroid sizes, by which aligned coordinates are known; tangent projection changes them by less."""
+"""Tolerance of unit centroid sizes, which identify aligned coordinates; tangent projection changes sizes by less."""
 _ORTHONORMAL = 1e-9
 # Of the size; single precision keeps a copy nearer than this.
 _SAME = 1e-6
@@ -133,7 +133,7 @@ class Cohort:
         landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
         fitted: of fits; None for other surfaces.
         notes: who was left out and why, a sentence each.
-        source: where the shapes come from.
+        source: source of the shapes.
         unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
         analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
@@ -208,7 +208,7 @@ class Cohort:
         return 1.0 - mask.mean(axis=1)
 
     def observed_in(self, rows: Sequence[int]) -> BoolArray | None:
-        """Return (V,) whether all of some shapes observe a vertex that is analysed; None if they observe all."""
+        """Return (V,) bool, whether all of these shapes observe an analysed vertex; None if they observe all."""
         if self.observed is None and self.analysed is None:
             return None
         seen: BoolArray = np.ones(self.n_vertices, np.bool_)

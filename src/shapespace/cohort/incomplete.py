@@ -21,11 +21,11 @@ from shapespace.model.ppca import ppca
 from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
 _FEWEST_SHAPES = 2
-"""Shapes that must observe a vertex: one shows no variation."""
+"""Fewest shapes that must observe a vertex; a single one shows no variation."""
 _FEWEST_VERTICES = 3
-"""Vertices of a shape that determine its pose."""
+"""Fewest observed vertices of a shape, which determine its pose."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
-"""As of `complete`: the prior removes modes without evidence."""
+"""As in `complete`: the prior removes modes without evidence."""
 _POSES, _SETTLED = 50, 1e-9
 _ANCHOR = 1e-9
 """Weight of the centroid where vertices without any position are filled: it makes isolated parts determinate."""
@@ -67,7 +67,7 @@ def completed_shapes(
         names: N.
         gauge: as of `align_in_place`.
         faces: (F, 3) triangles; None for points.
-        align: False takes the shapes as they stand.
+        align: whether to align the shapes; otherwise they are used unchanged.
 
     Raises:
         InputError: too little of a shape is observed to align it, or no vertex is observed often enough.
@@ -77,7 +77,7 @@ def completed_shapes(
     _refuse_unobserved(known, names)
     masked = np.where(known[:, :, None], shapes, np.nan)[:, analysed]
     found = complete(masked, names, gauge, align=align)
-    # Estimates do not take part in the poses of the originals, from which size and other vertices come.
+    # Poses of the original shapes, which determine size and other vertices, do not depend on estimates.
     poses = [
         fit_similarity(own[there], aligned[there], with_scale=align and gauge == "shape") if align else None
         for own, aligned, there in zip(masked, found.shapes, found.shown, strict=True)
@@ -100,7 +100,7 @@ def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
         )
     few = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
     if few:
-        raise InputError(f"{named(few)}: hardly a vertex is observed; leave it out.")
+        raise InputError(f"{named(few)}: too few vertices are observed; leave it out.")
 
 
 def _one_position(moved: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:

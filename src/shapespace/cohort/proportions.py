@@ -1,4 +1,4 @@
-"""Intervals of shares near 0 and 1, where drawing subjects anew finds no spread.
+"""Intervals of shares near 0 and 1, where the bootstrap over subjects has no spread.
 
 The bootstrap of a share without a single error is the interval [0, 0]. The exact interval of Clopper and Pearson
 ("The use of confidence or fiducial limits", Biometrika 26, 1934) for 0 errors among n independent units ends at
@@ -15,10 +15,10 @@ from shapespace.types import FloatArray
 
 
 def zero_bound(subjects: int, level: float = 0.95) -> float:
-    """Return the upper end of the exact interval of a share, where none of `subjects` has an error.
+    """Return the upper end of the exact interval of a share if none of `subjects` has an error.
 
     Args:
-        subjects: number of independent units; with none of them nothing is known, and the bound is 1.
+        subjects: number of independent units; if it is 0, the bound is 1.
         level: of the two-sided interval.
     """
     return 1.0 - float((0.5 * (1.0 - level)) ** (1.0 / subjects)) if subjects > 0 else 1.0
@@ -27,12 +27,12 @@ def zero_bound(subjects: int, level: float = 0.95) -> float:
 def widen_share(
     low: FloatArray | float, high: FloatArray | float, subjects: int, level: float = 0.95
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of intervals of shares, at least as far from 0 and 1 as the exact ones without an error.
+    """Return intervals of shares that are at least as wide as the exact ones without an error.
 
-    Some errors are no better known than none: the upper end is at least `zero_bound`, the lower at most 1 less that.
+    The upper end is at least `zero_bound`, and the lower end at most 1 - `zero_bound`, also if there are some errors.
 
     Args:
-        low, high: any shape, ends by drawing subjects anew; NaN stays.
+        low, high: ends of bootstrap intervals, of any shape; NaN stays NaN.
         subjects: number of independent units.
         level: of the intervals.
     """

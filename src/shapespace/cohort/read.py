@@ -39,7 +39,7 @@ class CohortOptions:
         shapes: folder of the results of fits, or of meshes in correspondence; None for that of the table.
         model: file of the model of the fits; None goes by their records.
         surfaces: one of `SURFACES`; `auto` takes dense surfaces where all fits have one, else coefficients, and is
-            the kind of the shapes of a cohort that these are compared with.
+            the kind of the cohort with which these shapes are compared.
         gauge: `shape` divides size out, `form` keeps it.
         doubtful: take doubtful fits too.
         least: shapes that there must be; one will do where it is compared with what is known already.
@@ -229,7 +229,7 @@ def _of_results(
 def _kind(
     asked: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
 ) -> Literal["coefficients", "fitted", "dense"]:
-    """Return which shapes of fits are taken: those asked for, or for `auto` the ones that lose least."""
+    """Return the kind of shapes of fits to read: the requested one, or for `auto` the most complete one."""
     if asked != "auto":
         return asked
     if onto is not None and onto.fitted is not None and onto.source.kind in ("coefficients", "fitted", "dense"):

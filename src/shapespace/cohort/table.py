@@ -26,7 +26,7 @@ _NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What is known of N shapes, as text without white space at its ends.
+    """Covariates of N shapes, as text without white space at its ends.
 
     Args:
         columns: name -> N cells; a missing one is empty.
@@ -52,7 +52,9 @@ class Table:
                 )
         plain = {name.strip(): tuple(map(str.strip, cells)) for name, cells in self.columns.items()}
         if len(plain) < len(self.columns):
-            raise InputError(f"{self.where} has two columns of one name but for white space; rename one of them.")
+            raise InputError(
+                f"{self.where} has two columns whose names differ only in white space; rename one of them."
+            )
         object.__setattr__(self, "columns", plain)
 
     def __len__(self) -> int:
@@ -161,8 +163,10 @@ def _with_folders(place: PurePath) -> str:
 
 
 def plain_cell(cell: str) -> str:
-    """Return the text of a cell without white space at its ends, characters without a shape as spaces; empty where it
-    stands for a missing value."""
+    """Return the text of a cell without white space at its ends and with spaces for characters that do not print.
+
+    It is empty for a missing value.
+    """
     text = cell if cell.isprintable() else "".join(c if c.isprintable() else " " for c in cell)
     text = text.strip()
     return "" if text.lower() in MISSING else text

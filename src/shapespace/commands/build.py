@@ -449,7 +449,7 @@ def _landmarks(
     settings: BuildSettings,
     notes: list[str],
 ) -> SurfaceLandmarks:
-    """Return the landmarks: as given, or from beside the first mesh, or those of the model that fitted the meshes."""
+    """Return the landmarks: the given ones, those next to the first mesh, or those of the model of the fits."""
     mm = MM_PER_UNIT[settings.unit]
     if settings.landmarks is not None:
         return _read_landmarks(settings.landmarks, first, mm, notes)
@@ -493,7 +493,7 @@ def _landmarks_of_parent(
 def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> SurfaceLandmarks:
     """Return landmarks from a file of vertices or triangles, or of points on the first mesh in the meshes' own unit.
 
-    Of points the notes say how far they lie from the surface on which they are placed.
+    For points, the notes state their distances from the surface.
     """
     if path.suffix.lower() == ".csv" and is_of_vertices(path):
         return read_surface_landmarks(path)
@@ -504,7 +504,7 @@ def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> Sur
 
 
 def _placing_notes(landmarks: SurfaceLandmarks, surface: Mesh) -> list[str]:
-    """Return how far landmarks that were given as points lie from the surface, and which are too far to be on it."""
+    """Return sentences on the distances of given points from the surface, and on points that are too far from it."""
     distance, worst = landmarks.distance_mm, int(landmarks.distance_mm.argmax())
     notes = [
         f"Landmarks were placed on the surface of {surface.name}; the given points are {distance.mean():.2g} mm from "

@@ -50,10 +50,10 @@ from shapespace.version import __version__
 
 _KEPT = ".rounds"
 _BROKEN = "broken: "
-"""How the reason of a scan begins that cannot be used at all."""
+"""Beginning of the reason for a scan that cannot be used."""
 _UNREADABLE = "unreadable"
 _WITH_OTHER_FILES = (".gltf",)
-"""Endings of meshes whose vertices may lie in other files."""
+"""Endings of mesh formats that can store vertices in other files."""
 _LISTED = 10
 _ANOTHER_SHAPE = 0.25
 """The mean change of another object, as a share of its size."""
@@ -173,7 +173,7 @@ def _corresponding(
 def _inputs_hash(
     jobs: Sequence[Job], marks: LandmarkFiles, files: CorrespondFiles, settings: CorrespondSettings
 ) -> str:
-    """Return the SHA-256 of all inputs of a run, without parsing the scans; where it runs makes no difference."""
+    """Return the SHA-256 of all inputs of a run, without parsing the scans; it does not depend on the executor."""
 
     def landmarks_hash(scan: Path, own: Path | None) -> str:
         file = own or marks.of_scan(scan)
@@ -261,7 +261,7 @@ class _Read:
 
 
 def _say_excluded(reasons: Mapping[str, str], scans: int, say: _Say) -> None:
-    """Name the scans that are excluded, with the reason, before anything long begins."""
+    """Print the excluded scans, with the reason, before the first round."""
     for name, reason in reasons.items():
         say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
     if reasons:
@@ -291,7 +291,7 @@ def _read_all(jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, quiet:
 
 
 def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
-    """Return the repaired scan, and what the user should know of it.
+    """Return the repaired scan, and notes for the user.
 
     Raises:
         MeshError: it cannot be used.
@@ -315,7 +315,7 @@ def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
 
 
 def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Say) -> None:
-    """Say how far the given landmarks are from the scans, and from their places on the corresponding surfaces."""
+    """Print the distances of the given landmarks from the scans, and from those of the corresponding surfaces."""
     shares = {
         (name, scan): distance / rms_size(read.scans[scan].vertices)
         for scan, distances in read.landmark_distances.items()

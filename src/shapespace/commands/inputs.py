@@ -21,7 +21,7 @@ _LISTS = (".csv", ".tsv", ".txt", ".xlsx")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
 _LARGEST_BYTES = 2**26
-"""Of a list of scans; a million rows take less."""
+"""Largest size of a list of scans in bytes; a million rows need less."""
 _LONGEST = 200
 
 
@@ -182,7 +182,7 @@ def _scan_at(file: Path, place: str) -> Path | str:
         meshes = [one for one in there if one.name.lower().endswith(MESH_FILE_ENDINGS)]
         return meshes[0] if len(meshes) == 1 and not found.exists() else found
     except (OSError, ValueError):
-        return found  # the reader of the scans says what is wrong with such a name
+        return found  # the reader of the scans reports such a name
 
 
 def _beside(file: Path, text: str) -> Path | str:

@@ -189,7 +189,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
 
 
 def _landmark_distances(model: ShapeModel) -> dict[str, dict[str, float]]:
-    """Return how far the given landmarks were from the surface; nothing where none was off it."""
+    """Return the distances of the given landmarks from the surface; empty if all were on it."""
     distances = model.landmarks.distance_mm.tolist()
     return {"landmark_distances_mm": dict(zip(model.landmarks, distances, strict=True))} if any(distances) else {}
 

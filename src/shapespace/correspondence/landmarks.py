@@ -158,12 +158,12 @@ def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArra
         mean: with triangles.
         shapes: (V, 3) vertices of each, and its landmarks in the same frame.
     """
-    told = [(place_landmarks(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
-    names = list(dict.fromkeys(name for _, points in told for name in points))
+    placed = [(place_landmarks(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
+    names = list(dict.fromkeys(name for _, points in placed for name in points))
     if not names:
         return SurfaceLandmarks()
-    at = np.full((len(told), len(names), 3), np.nan)
-    for own, (places, points) in zip(at, told, strict=True):
+    at = np.full((len(placed), len(names), 3), np.nan)
+    for own, (places, points) in zip(at, placed, strict=True):
         own[[names.index(name) for name in points]] = places.interpolate(mean.vertices)
     off = np.sqrt(np.array([np.nansum((at - own) ** 2, axis=(1, 2)) for own in at]))
     shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])

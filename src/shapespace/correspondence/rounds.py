@@ -92,7 +92,7 @@ class Corresponding:
         name: of the scan.
         reason: why it is set aside; empty where it is not.
         vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
-            estimates, the conditional means given the observed vertices; None if set aside.
+            estimates, the conditional means given the observed vertices; None if excluded.
         T_scan_template: to the scan's own frame; None where no pose was found.
         seen: share of the template's vertices that the scan shows.
         covered: share of the scan that the template reaches.
@@ -101,7 +101,7 @@ class Corresponding:
         seconds: CPU time of each round.
         landmarks: RMS distance of the scan's landmarks from their places on the surface, in the scan's unit;
             not-a-number where it has none.
-        observed: (V,) bool, False where `vertices` are estimates; None if set aside.
+        observed: (V,) bool, False where `vertices` are estimates; None if excluded.
     """
 
     name: str
@@ -143,7 +143,7 @@ class Correspondence:
         return late("html_of_correspondence")(self)
 
     def meshes(self) -> list[Mesh]:
-        """Return the complete surfaces of scans that are not set aside, in their own frames, with `Mesh.observed`.
+        """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.
 
         They have the landmarks in whose triangles all vertices are observed.
         """

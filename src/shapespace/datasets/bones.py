@@ -1,7 +1,8 @@
-"""Simulated bones of two groups: raw scans of small skulls, mirror-symmetric but for what is put in.
+"""Simulated bones of two groups: raw scans of small skulls, with a known difference and a known asymmetry.
 
-A skull is a star about its middle: an ellipsoid with bumps for snout, crest, cheek arches and condyles, and pits for
-the orbits. The second group has a longer snout; in all skulls the left arch stands out further than the right one.
+A skull is a star-shaped surface about its centre: an ellipsoid with bumps for snout, crest, cheek arches and condyles,
+and pits for the orbits. The second group has a longer snout; in all skulls the left arch protrudes further than the
+right one.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ GROUPS = ("coast", "island")
 """The second group has the longer snout."""
 EFFECT_MM = 4.0
 LEFT_ARCH_MM = 1.5
-"""How much further the left arch stands out than the right one, on average."""
+"""Mean difference of the protrusion of the left and the right arch."""
 
 _HALF_MM = np.array([17.0, 15.0, 26.0])
-"""Of the axes: to the left (x), up (y) and to the snout (z)."""
+"""Half axes of the ellipsoid: to the left (x), up (y) and to the snout (z)."""
 _SNOUT, _LEFT, _RIGHT = 0, 2, 3
 _BUMPS = np.array(
     [
@@ -51,7 +52,7 @@ _WAVES, _WAVE_WIDTH, _WAVE, _WAVE_ONE_SIDE = 24, 0.3, 0.02, 0.004
 _SIZE = 0.08
 _POINTS = 2500
 _CUT_EVERY, _CUT_MM = 3, 9.0
-"""One bone in so many has a hole, and its mean radius."""
+"""Every n-th bone has a hole; n, and the mean radius of the hole."""
 _MOST = 10_000
 
 
@@ -63,7 +64,7 @@ class Bone:
         half_mm: (3,) of the axes of the ellipsoid.
         heights: (8,) of the bumps, logarithms of the radius.
         waves: (W,) logarithms of the radius at W directions.
-        directions: (W, 3) of these, of unit length.
+        directions: (W, 3) unit vectors of these directions.
     """
 
     half_mm: FloatArray
@@ -124,9 +125,9 @@ def write_bones(
         FileError: the folder cannot be written.
     """
     if not 2 <= count <= _MOST:
-        raise InputError(f"The number of bones must lie between 2 and {_MOST}, not at {count}.")
+        raise InputError(f"The number of bones must be between 2 and {_MOST}, not {count}.")
     if not -10.0 <= effect_mm <= 10.0:
-        raise InputError(f"The effect must lie between -10 and 10 mm, not at {effect_mm:g}.")
+        raise InputError(f"The effect must be between -10 and 10 mm, not {effect_mm:g}.")
     make_folder(folder)
     rows: list[tuple[str, str]] = []
     for k in range(count):

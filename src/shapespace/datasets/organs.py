@@ -97,7 +97,7 @@ class Organ:
 
 
 class Star(Protocol):
-    """An object whose surface is met once in each direction from its middle."""
+    """A star-shaped object: each ray from its centre meets the surface once."""
 
     def surface(self, directions: FloatArray) -> FloatArray:
         """Return the points (M, 3), mm, of the surface in `directions` (M, 3) of unit length."""

@@ -1,6 +1,6 @@
-"""Parts of a scan that the fit does not explain: a second instance, two surfaces on top of each other, displaced parts.
+"""Parts of a scan that the fit does not explain: a second instance, overlapping surfaces, displaced parts.
 
-They are searched for only where the evidence of the fit leaves room for them: much of the scan far from the fitted
+They are searched for only if the evidence of the fit suggests them: much of the scan far from the fitted
 surface, or matched points far apart. All lengths are shares of the model's size.
 """
 
@@ -55,15 +55,15 @@ class SecondInstance:
     gap_mm: float
 
     def as_evidence(self) -> dict[str, float]:
-        """Return the figures by name."""
+        """Return the values by name, as evidence of a fit."""
         return {"second_instance_mm": self.away_mm, "second_instance_gap_mm": self.gap_mm}
 
     @property
     def note(self) -> str:
-        """A sentence on it."""
+        """Sentence for the notes of a fit."""
         return (
-            f"The scan shows another one that the model fits as well, {self.away_mm:.0f} mm away; crop it to the one "
-            "you mean (--crop)."
+            f"The scan shows a second instance that the model fits as well, {self.away_mm:.0f} mm away; crop it to the "
+            "one you mean (--crop)."
         )
 
 
@@ -72,7 +72,7 @@ def find_second_instance(
 ) -> SecondInstance | None:
     """Return the second instance that the model fits about as well as the first; None where there is none.
 
-    The model is fitted to the part of the scan that the fit left unexplained, and that fit is judged as any other.
+    The model is fitted to the unexplained part of the scan, and the status of that fit is estimated as usual.
 
     Args:
         model: the shape space.
@@ -107,7 +107,7 @@ def find_second_instance(
 
 
 def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return how much of the scan runs along the fitted surface at a distance, and how much scatters, by name.
+    """Return the shares of the scan that run along the fitted surface at a distance, and that scatter, by name.
 
     Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
     a distance. Around a point of them the heights over the fitted surface are alike, and little else of the scan is
@@ -119,7 +119,7 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
         target: the scan in its mm frame.
         fitted: result of the fit to it.
     """
-    # Heights are compared with those of neighbours, of which fewer points than these have too few.
+    # Heights are compared with those of neighbours; fewer points than these have too few neighbours.
     if len(target.mesh.vertices) < _NEIGHBOURS or fitted.evidence["scan_near_share"] > _ALL_EXPLAINED:
         return {
             "displaced_share": 0.0, "displaced_inward_share": 0.0, "displaced_purity": 0.0, "scattered_share": 0.0,

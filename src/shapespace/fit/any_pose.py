@@ -118,7 +118,7 @@ def refine(
     step: Step = LONG,
     seed: int = 0,
 ) -> list[Pose]:
-    """Return the pose to which one step of the search leads from each of `starts`, in their order.
+    """Return the poses after one step of the search from each of `starts`, in their order.
 
     Args:
         model: the shape space.
@@ -283,7 +283,7 @@ class _Sides:
     def refined(
         self, step: Step, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
     ) -> Pose:
-        """Return the pose to which `step` leads from a pose and the coefficients `b` of the leading modes."""
+        """Return the pose after `step`, from a pose and the coefficients `b` of the leading modes."""
         begun = Similarity(scale, R, t)
         shape = self.model.shapes[min(step.modes, max(self.model.shapes))]
         R, t, out = np.array(R), np.array(t), np.empty(3)

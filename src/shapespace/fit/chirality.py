@@ -34,9 +34,9 @@ _LEAST_OF_SPREAD = 0.2
 _CLEARLY_WORSE = 1.1
 """Ratio of the scores of the search above which the reflected scan is not fitted completely."""
 _PATCHES = 100.0
-"""Independent residuals of a surface, as the fewest in `posterior`."""
+"""Number of independent residuals of a surface; the smallest number in `posterior`."""
 _CAP, _POINTS, _VERTICES = 0.05, 2_000, 1_000
-"""Distances count up to this share of the size, at so many points of the scan and vertices of the model."""
+"""Cap of the distances as a share of the size, and number of points of the scan and vertices of the model."""
 
 _asymmetric: WeakKeyDictionary[ShapeModel, bool] = WeakKeyDictionary()
 
@@ -58,7 +58,7 @@ def is_asymmetric(model: ShapeModel) -> bool:
 def mirrored_log_odds(
     model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
 ) -> float | None:
-    """Return how much better the reflected scan fits, in nats; None where the model is too symmetric to decide.
+    """Return the log odds (nats) that the scan is mirrored; None if the model is too symmetric to decide.
 
     Args:
         model: the shape space.
@@ -108,7 +108,7 @@ def _reflected_pose(T: Similarity, flip: FloatArray, Q: FloatArray, centre: Floa
 
 
 def _cost(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> float:
-    """Return the negative log posterior of a fit, in nats, but for a constant of model and scan.
+    """Return the negative log posterior of a fit, in nats, up to a constant of model and scan.
 
     The standard deviation of the residuals is unknown, so they contribute with the logarithm of their RMS.
     """

@@ -62,7 +62,7 @@ class FitConfig:
         modes: how many coefficients to report, from the first; None for all. The robust method fits with all in any
             case; the paper's fits with these alone.
         unit: of the scan: a name of `MM_PER_UNIT`, or `auto` to find it.
-        scale: `free` fits a similarity, `fixed` a rigid motion; `auto` goes by the model's gauge.
+        scale: `free` fits a similarity, `fixed` a rigid motion; `auto` is `free` for a model with the gauge `shape`.
         max_iterations: cap of each phase.
         seed: of the subsample that the start is searched on.
         landmark_stddev_mm: of landmarks that are given, mm of the scan: how well they are placed. The robust method is

@@ -56,7 +56,7 @@ class Marks:
         )
 
     def off_mm(self, surface: MovingSurface, T_scan_model: Similarity) -> FloatArray:
-        """Return (L,) how far each landmark of the surface lies from that of the scan, mm of the scan."""
+        """Return (L,) the distance of each landmark of the surface from that of the scan, mm of the scan."""
         at = self.landmarks.interpolate(surface.vertices)
         return np.linalg.norm(T_scan_model.apply(at) - self.points_mm, axis=1)
 

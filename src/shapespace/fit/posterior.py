@@ -120,7 +120,7 @@ def posterior(
 def covariance_of_landmarks(known: Posterior, surface: MovingSurface, landmarks: SurfaceLandmarks) -> FloatArray:
     """Return the covariance (L, 3, 3), mm^2 of the model's frame, of the positions of landmarks.
 
-    Pose, coefficients and modes beside the model move a landmark together, so it is that of their sum.
+    It is the covariance of the sum of the effects of pose, coefficients and off-model modes.
     """
     pose = small_poses(landmarks.interpolate(surface.vertices)).reshape(len(landmarks), 3, POSE)
     rows = np.concatenate([pose, landmarks.interpolate(surface.modes)], axis=2)

@@ -188,9 +188,9 @@ class FitResult:
 
     @property
     def chirality(self) -> Chirality:
-        """Whether the scan is `mirrored` or `as scanned`; `undecidable` where its mirror image fits about as well.
+        """Whether the scan is `mirrored` or `as scanned`; `undecidable` if its mirror image fits about as well.
 
-        That is so for a model that is mirror-symmetric, such as one of faces, for a region of a model, and by the
+        It is `undecidable` for a mirror-symmetric model, such as one of faces, for a region of a model, and for the
         paper's method, which does not test it.
         """
         return chirality_of(self.evidence)

@@ -73,7 +73,7 @@ class Fitted:
 
 
 def last_of(states: Generator[IcpState, None, Fitted]) -> Fitted:
-    """Return the end of a fit, whose states nobody follows."""
+    """Run a fit to its end, and return its result."""
     while True:
         try:
             next(states)

@@ -28,7 +28,7 @@ _ALL_OVER = 0.8
 _LAYERED = 0.16
 """Share of a scan over which it has two surfaces; chosen on fits of `benchmarks/reliability.py`."""
 _PROBABLY_FAILED = 0.5
-"""Failure probability above which a fit is doubted, whatever its score is."""
+"""Failure probability above which a fit is doubtful, whatever its score is."""
 _DISPLACED, _PURE, _PURE_INWARD = 0.035, 0.6, 0.35
 """Share of the scan that is displaced, and of its unexplained parts, above which its parts do not fit together. Correct
 fits of the development seeds of `benchmarks/odd_cases.py` stay below one or the other. Hair lies outside the surface
@@ -198,7 +198,7 @@ def doubts_of_layers(evidence: Mapping[str, float]) -> list[str]:
 
 
 def doubts_of_inconsistent_parts(evidence: Mapping[str, float]) -> list[str]:
-    """Return reasons to doubt a fit whose scan has parts that fit the model only apart from each other."""
+    """Return reasons to doubt a fit whose scan has parts that no single instance of the model explains."""
     found: list[str] = []
     if evidence.get("second_instance_gap_mm", 0.0) < 0.0:
         found.append(
@@ -236,7 +236,7 @@ def doubts_of_reliability(evidence: Mapping[str, float]) -> list[str]:
     if evidence["failure_probability"] <= _PROBABLY_FAILED:
         return []
     return [
-        f"its vertices are expected to be {evidence['expected_error_mm']:.1f} mm off (90 % interval "
+        f"its expected vertex error is {evidence['expected_error_mm']:.1f} mm (90 % interval "
         f"{evidence['error_low_mm']:.1f} to {evidence['error_high_mm']:.1f} mm), where "
         f"{FAILED_SHARE * evidence['size_mm']:.1f} mm is the limit; build a model of more shapes or modes"
     ]

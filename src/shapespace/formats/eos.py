@@ -84,13 +84,13 @@ class Eos:
 
 
 def _moved_landmarks(model: LinearModel) -> list[str]:
-    """Return a sentence on how far landmarks move to the vertices that eos stores; none where all are at vertices."""
+    """Return a sentence on the distances by which landmarks move to vertices; none if all are at vertices."""
     vertices = model.mean[list(model.landmarks.values())]
     moved_mm = np.linalg.norm(model.landmarks.interpolate(model.mean) - vertices, axis=1) * (model.mm or 1.0)
     if not moved_mm.any():
         return []
     return [
-        f"Landmarks are moved to the nearest vertices, which is all that eos stores: {moved_mm.mean():.2g} mm on "
+        f"Landmarks are moved to the nearest vertices, since eos stores vertices only: {moved_mm.mean():.2g} mm on "
         f"average, at most {moved_mm.max():.2g} mm ({model.landmarks.names[int(moved_mm.argmax())]})."
     ]
 

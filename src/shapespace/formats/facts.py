@@ -15,7 +15,7 @@ from shapespace.types import SurfaceLandmarks
 KEY: Final = "shapespace"
 """Under which the facts stand."""
 _PLACES: Final = "landmark_triangles"
-"""Of landmarks off the vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
+"""Landmarks between vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
 _LONGEST_WORDS = 20_000
 _MOST_LANDMARKS = 10_000
 

@@ -40,7 +40,7 @@ _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
 _ON_PARTICLES = 1e-6
 MOST_DENSE = 2_000
-"""Particles through which one spline passes; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
+"""Largest number of particles for one spline; it takes 1.0 s for 2,000 and would take 45 s for 12,000."""
 NEIGHBOURS = 32
 """Particles of a local spline: within 0.1 % (RMS) of the dense one, by tests/formats/test_shapeworks_projects.py."""
 _BATCH = 512

@@ -29,7 +29,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 _AGAIN = "export it again from where it was made"
 _LARGEST_BYTES = 2**31
 _POINTS_AT = 1e-3
-"""Share of the extent of the model; landmarks farther from its surface are not on it."""
+"""Share of the extent of the model; landmarks farther from its surface are left out."""
 _SINGLE = 2e-6
 """Share of the size of the model by which single precision may move a point."""
 _UNIT_LENGTH = 1e-2

@@ -101,7 +101,7 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
         growing.add_catalogue("shape", "color", "expression")
         said.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
     if model.landmarks:
-        # On the surface as single precision has it, so that they lie on that of the file.
+        # Placed on the surface in single precision, as in the file.
         at = model.landmarks.positions(model.mean.astype(np.float32).astype(np.float64))
         growing.texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(at)
     blocks = [model.shape] if model.expression is None else [model.shape, model.expression]

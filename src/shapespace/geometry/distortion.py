@@ -64,10 +64,10 @@ def _turned_back(vectors: FloatArray, faces: IntArray, vertices: int) -> BoolArr
 
 
 def flip_factor(vertices: FloatArray, change: FloatArray, faces: IntArray) -> float:
-    """Return the factor of `change` at which the first triangle turns over; infinity where none ever does.
+    """Return the smallest factor of `change` at which a triangle flips; infinity if none does.
 
-    A triangle is turned over where its normal is at 90 degrees or more to that of the same triangle of `vertices`. With
-    the factor s its area vector is quadratic in s, so the first root is found without search.
+    A triangle flips if its normal is at 90 degrees or more to that of the same triangle of `vertices`. Its area vector
+    is quadratic in the factor, so the first root has a closed form.
 
     Args:
         vertices: (V, 3) of the surface that is changed.
@@ -97,7 +97,7 @@ def factor_to_draw(wanted: float, flips_at: float) -> float:
 
     Args:
         wanted: the factor by which a change would be drawn, positive.
-        flips_at: the factor at which the first triangle turns over, as `flip_factor` returns it.
+        flips_at: the factor at which the first triangle flips, from `flip_factor`.
     """
     steps = sorted(step * 10.0**power for power in range(-6, 4) for step in (1, 2, 3, 5))
     return max((step for step in steps if step <= wanted * (1 + 1e-9) and step < flips_at), default=steps[0])

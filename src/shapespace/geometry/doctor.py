@@ -13,7 +13,7 @@ from shapespace.geometry.surface import without_vertices
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 NON_FINITE = "coordinates that are NaN or infinite"
-"""How findings name vertices that have no place."""
+"""Text of findings on vertices without a position."""
 
 # Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
 _DEGENERATE = 1e-12

@@ -13,7 +13,7 @@ from shapespace.geometry.surface import rms_size
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 
 _FAR_SHARE = 0.01
-"""Share of the object's size (RMS): a landmark farther than this and than a mean edge is likely not of the surface."""
+"""Share of the object's size (RMS): a landmark farther than this and than a mean edge is probably off the surface."""
 
 
 def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: float = 1e-12) -> SurfaceLandmarks:
@@ -25,11 +25,11 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: 
     Args:
         mesh: the surface, in mm.
         points: name -> (3,) in the frame of `mesh`, mm.
-        precision: of the coordinates, as a share of the object's size (RMS); a point that is nearer than this to a
-            vertex or to the surface is at it. The default is the rounding of float64.
+        precision: of the coordinates, as a share of the object's size (RMS); a point closer than this to a vertex or to
+            the surface is placed exactly there. The default is the rounding of float64.
 
     Returns:
-        The landmarks; their `distance_mm` is how far each point lies from the surface.
+        The landmarks; their `distance_mm` are the distances of the points from the surface.
 
     Raises:
         InputError: a point that is not three finite numbers.

@@ -41,9 +41,9 @@ _ROUNDS = 3
 _FEWEST = 8
 _HALVINGS, _STEP = 20, 0.1
 _BLOCK = 1 << 20
-"""Voxels of the volume that are looked at together."""
+"""Voxels of a volume that are processed together."""
 _MOST_LABELS = 1 << 16
-"""A volume with more labels than this is a picture."""
+"""A volume with more labels than this is an image, not a segmentation."""
 _BASE_BYTES = 1 << 27
 _VOXEL_BYTES, _VERTEX_BYTES = 32, 400
 """Memory of smoothing and marching cubes: for each voxel of the box around the labels, and for each vertex of the
@@ -104,7 +104,7 @@ def surface_of_volume(
         labels: one, or several that are taken as one object; "all" but 0; None for the only one there is.
         smooth: standard deviation of the smoothing in voxels, of their mean size where they are not cubes; 0 for none.
         keep_pieces: keep all pieces and cavities, instead of the largest piece without them.
-        max_memory_bytes: the volume and what is made of it may take so much memory; it is estimated from the size of
+        max_memory_bytes: memory limit for the volume and its surface; the need is estimated from the size of
             the box around the labels and the area of their border, before memory is allocated.
 
     Raises:
@@ -148,7 +148,7 @@ def surface_of_volume(
 
 @dataclass(frozen=True)
 class _Memory:
-    """What a surface may take.
+    """Memory limit of a surface.
 
     Args:
         volume_bytes: of the volume.
@@ -161,7 +161,7 @@ class _Memory:
     name: str
 
     def check(self, box: Sequence[int], vertices: int = 0) -> None:
-        """Refuse a box of voxels around the labels, and vertices of their border, that take too much memory.
+        """Check the memory for a box of voxels around the labels and for the vertices of their border.
 
         Raises:
             InputError: they do.
@@ -219,7 +219,9 @@ def labels_in(labels: _Labels) -> tuple[int, ...]:
             else:
                 found.update(np.unique(values).tolist())
         if len(found) > _MOST_LABELS:
-            raise InputError(f"It has more than {_MOST_LABELS:,} labels, as pictures have; give the label map.")
+            raise InputError(
+                f"It has more than {_MOST_LABELS:,} labels, so it is an image, not a segmentation; give the label map."
+            )
     return tuple(sorted(found - {0}))
 
 
@@ -283,7 +285,7 @@ def _is_one_of(values: _Labels, wanted: _Labels) -> BoolArray:
 
 
 def count_crossings(mask: BoolArray) -> int:
-    """Return how many pairs of neighbours lie on both sides of the border: the vertices of marching cubes."""
+    """Return the number of pairs of neighbours on both sides of the border: the vertices of marching cubes."""
     count = 0
     for axis in range(3):
         along = np.moveaxis(mask, axis, 0)

@@ -50,7 +50,7 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
 
 
 class _AsMeshes(Sequence[Mesh]):
-    """A sequence whose items become meshes when they are asked for."""
+    """A sequence of meshes that are converted when they are accessed."""
 
     def __init__(self, items: Any) -> None:
         self._items = items
@@ -69,14 +69,14 @@ class _AsMeshes(Sequence[Mesh]):
 
 
 def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
-    """Return a sequence of whatever `as_mesh` takes as one of meshes, each converted when it is asked for.
+    """Return a sequence of meshes from anything that `as_mesh` takes; each is converted when it is accessed.
 
     Args:
         items: a list, or anything with a length and items; an array (N, V, 3) too.
         function: that was given it, for the message.
 
     Raises:
-        InputError: it is no such sequence. An item that is no mesh is refused when it is asked for.
+        InputError: it is no such sequence. An item that is no mesh raises when it is accessed.
     """
     if isinstance(items, str | os.PathLike | Mesh) or not (hasattr(items, "__len__") and hasattr(items, "__getitem__")):
         raise InputError(

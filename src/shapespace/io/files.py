@@ -20,7 +20,7 @@ from shapespace.errors import FileError
 
 _TEMPORARY = ".shapespace-"
 _LEFT_S = 3600.0
-"""Temporary files of another machine, where no process can be asked, are removed after this time in seconds."""
+"""Age in seconds at which temporary files of other machines, whose processes cannot be checked, are removed."""
 _WRITE_HINTS = {
     errno.ENOSPC: "the disk is full; free some space and run again",
     errno.EACCES: "no permission; choose another folder",
@@ -192,7 +192,7 @@ def _prefix(stem: str) -> str:
 
 def _temporary_beside(path: Path) -> Path:
     _sweep_once(path.parent)
-    # Of the temporary file for a temporary one, the name says what it is for too.
+    # The temporary file of a temporary file also contains the name of its target.
     stem = path.stem.split("-", 3)[-1] if path.name.startswith(_TEMPORARY) else path.stem
     try:
         handle, name = tempfile.mkstemp(prefix=_prefix(stem[:40]), suffix=path.suffix, dir=path.parent)
@@ -226,7 +226,7 @@ def sweep(folder: Path) -> None:
     for path in folder.glob(f"{_TEMPORARY}*-*-*"):
         host, pid = path.name.removeprefix(_TEMPORARY).split("-")[:2]
         with contextlib.suppress(OSError, ValueError, OverflowError):
-            known = host == _HOST and os.name != "nt"  # Windows has no harmless signal to ask with
+            known = host == _HOST and os.name != "nt"  # Windows has no harmless signal that tests a process
             if _has_ended(int(pid)) if known else time.time() - path.lstat().st_mtime > _LEFT_S:
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)

@@ -469,7 +469,7 @@ def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[
 
 
 def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
-    """Return the content of a picture that lies in a buffer or in the JSON."""
+    """Return the content of a picture that is stored in a buffer or in the JSON."""
     if "bufferView" in image:
         length = int(gltf.tree["bufferViews"][image["bufferView"]]["byteLength"])
         return gltf.view(image["bufferView"], 0, np.dtype(np.uint8), length, 1).tobytes()

@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes import stem_of
+from shapespace.io.parsing import is_number
 from shapespace.io.tables import KEYS, key_column, table_rows
 
 LABELS_FILE = "labels.csv"
@@ -96,20 +97,12 @@ def label_of(labels: Mapping[str, Label], file: Path) -> Label | None:
 
 
 def _first_classes(heads: Sequence[str], rows: Sequence[Sequence[str]], others: set[int | None]) -> int | None:
-    """Return the first column of words of which some stand in several rows; None where there is none."""
+    """Return the first column of words with repeated values, or None."""
     for at, head in enumerate(heads):
         cells = [row[at] for row in rows if row[at]]
-        if head and at not in others and len(set(cells)) < len(cells) and not any(map(_is_number, cells)):
+        if head and at not in others and len(set(cells)) < len(cells) and not any(map(is_number, cells)):
             return at
     return None
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _intensity(text: str | None) -> float | None:

@@ -17,7 +17,7 @@ import numpy as np
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import read_bytes, write_text
 from shapespace.io.limits import LARGEST_LANDMARK_FILE_BYTES
-from shapespace.io.parsing import damaged, json_value, xml_root
+from shapespace.io.parsing import damaged, is_number, json_value, xml_root
 from shapespace.io.tables import as_written, rows_text
 from shapespace.types import FloatArray, SurfaceLandmarks
 
@@ -425,18 +425,10 @@ def _csv_rows(data: bytes, path: Path) -> list[list[str]]:
         raise damaged(path, "it is not comma-separated text") from error
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _read_csv(data: bytes, path: Path) -> Pairs:
     rows = _csv_rows(data, path)
     columns = [1, 2, 3]
-    if rows and not all(_is_number(cell) for cell in rows[0][1:4]):
+    if rows and not all(is_number(cell) for cell in rows[0][1:4]):
         header = [cell.lower() for cell in rows[0]]
         if header[:2] == ["name", "vertex"]:
             raise damaged(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
@@ -571,7 +563,7 @@ def _read_points(data: bytes, path: Path) -> Pairs:
             continue
         words = re.split(r"[\s,;]+", row.rstrip(",;"))
         name = words[0] if len(words) == 4 else f"point_{len(out)}"
-        if not out and not any(map(_is_number, words)):
+        if not out and not any(map(is_number, words)):
             continue  # names of columns
         if len(words) not in (3, 4):
             raise damaged(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")

@@ -91,7 +91,7 @@ def read_mesh(path: Path | str) -> Mesh:
 
 
 def probe_mesh(path: Path) -> None:
-    """Check a mesh file by its first 64 KiB and its size, where reading all of it would take too long.
+    """Check a mesh file by its first 64 KiB and its size, without reading all of it.
 
     The file must open, have a known ending, not be empty and not be too long; PLY and binary STL must be as long as
     their header declares. A file that passes may still be damaged further on.

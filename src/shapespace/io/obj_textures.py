@@ -17,7 +17,7 @@ from shapespace.types import GREY, ByteArray
 
 _LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _LARGEST_LIBRARIES = 2**22
-"""Bytes of all materials files of one surface together (4 MiB); those of scanners have some hundred."""
+"""Limit of the bytes of all materials files of one surface (4 MiB); those of scanners have some hundred."""
 _LIBRARY, _PICTURE = "its materials file", "its picture"
 
 

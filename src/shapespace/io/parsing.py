@@ -32,6 +32,15 @@ def damaged(path: Path, what: str) -> FileFormatError:
     return FileFormatError(f"Cannot read {path}: {what}.")
 
 
+def is_number(text: str) -> bool:
+    """Return whether text is a number, not-a-number and infinity included."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def plain_text(data: bytes) -> bytes:
     """Return `data` without the mark with which some programs begin text in UTF-8."""
     return data.removeprefix(_BYTE_ORDER_MARK)

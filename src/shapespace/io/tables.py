@@ -1,4 +1,4 @@
-"""Tables: one reader of CSV and Excel files, and one writer of CSV whose cells no spreadsheet runs as formulas.
+"""Tables: a reader of CSV and Excel files, and a writer of CSV that escapes formulas.
 
 Tables may have a column `CHECKSUM` that shows any later change of a row; they are plain CSV to other programs.
 """
@@ -17,23 +17,23 @@ from shapespace.io.files import write_text
 from shapespace.io.workbook import WORKBOOK_START, sheet_rows
 
 CHECKSUM: Final = "checksum"
-"""The column of a table that shows of each row whether it was changed."""
+"""The column with a checksum of each row, which reveals changes."""
 
 KEYS: Final = ("file", "scan", "specimen", "name", "id")
-"""The columns that may name the shape of a row, in any case; the first of these that a table has is its key."""
+"""Possible key columns, which name the shape of a row, in upper or lower case; the first one in a table is its key."""
 
 MISSING: Final = frozenset({"", "na", "nan", "n/a", "null", "none"})
-"""Cells, in lower case, that stand for a missing value."""
+"""Cells, in lower case, that mean a missing value."""
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
-"""What a spreadsheet would run (OWASP, CSV injection), with any apostrophes before it."""
+"""Beginning of cells that a spreadsheet would run (OWASP, CSV injection), with any apostrophes before it."""
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|nan)")
 _DELIMITERS = (",", ";", "\t")
 _INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
 _MOST_LACKING = 2**18
-"""Cells that all rows of a table together may be shorter than its header; they take memory that the file has not."""
+"""Limit of the cells that rows lack, over all rows of a table; filling them takes memory beyond the file's size."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _OLD_EXCEL = b"\xd0\xcf\x11\xe0"
 _SEPARATOR = re.compile(r'"?sep=(.)"?')
@@ -81,7 +81,7 @@ def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence
 
 
 def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
-    """Return what writes a row of CSV to `stream`."""
+    """Return a function that writes a row of CSV to `stream`."""
     plain = csv.writer(stream, lineterminator="\n")
     # The csv module leaves a lone carriage return without quotes, and reads it as the end of a line.
     quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
@@ -114,7 +114,7 @@ def row_checksum(header: Sequence[str], cells: Sequence[str]) -> str:
 
 
 def key_column(header: Sequence[str], names: Sequence[str] = KEYS) -> int | None:
-    """Return the place of the first of `names` in a header, in any case; None where it has none of them."""
+    """Return the index of the first of `names` in a header, in upper or lower case, or None."""
     lower = [name.lower() for name in header]
     return next((lower.index(name) for name in names if name in lower), None)
 
@@ -188,7 +188,7 @@ def _csv_lines(text: str) -> Iterator[list[str]]:
 
 
 def _delimiter(text: str) -> str:
-    """Return the delimiter that stands most often in the header outside quotes; the comma where none does."""
+    """Return the most frequent delimiter in the header outside quotes; the comma if there is none."""
     start = text.lstrip("\r\n \ufeff")
     end = re.search(r"[\r\n]", start)
     header = re.sub(r'"[^"]*"', "", start[: end.start()] if end else start)
@@ -221,8 +221,8 @@ def _sheet(content: bytes) -> Iterator[list[str]]:
     for row in rows:
         last = max(row) + 1
         if last > width:
-            # Cells beside the table, such as notes, would be lost without a name.
-            raise ValueError(f"has a cell beside its table ({row[last - 1][:40]!r}); give that column a name")
+            # Cells outside the table, such as notes, would be lost without a column name.
+            raise ValueError(f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name")
         line = [row.get(at, "") for at in range(width)]
         if any(cell.strip() for cell in line):
             yield line

@@ -26,10 +26,10 @@ MOST_PIXELS_IN_ALL = 2**28
 """All pictures of one surface have no more than these."""
 
 MOST_BYTES_IN_ALL = 2**29
-"""All files of materials and pictures of one surface have no more than these (512 MiB)."""
+"""Limit of the bytes of all files of materials and pictures of one surface (512 MiB)."""
 
 MOST_NAMES = 2**14
-"""A surface names no more files of materials and pictures than this; finding one takes some 40 microseconds."""
+"""Limit of the files of materials and pictures that a surface names; finding one takes some 40 microseconds."""
 
 _SIDE = 2048
 _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
@@ -69,9 +69,9 @@ class FilesBeside:
         try:
             target = (self._folder / PurePosixPath(name.replace("\\", "/"))).resolve()
             if "://" in name or not target.is_relative_to(self._folder):
-                raise TextureError(f"{what} '{short}' lies outside of its folder, where nothing is read")
+                raise TextureError(f"{what} '{short}' is outside its folder, where nothing is read")
             if not target.is_file():
-                raise TextureError(f"{what} '{short}' is not beside it")
+                raise TextureError(f"{what} '{short}' is not in its folder")
         except (OSError, ValueError, RuntimeError) as error:
             raise TextureError(f"{what} '{short}' cannot be read") from error
         self._found[name] = target

@@ -234,7 +234,7 @@ def _filled(stream: IO[bytes], view: memoryview) -> int:
 
 @dataclass
 class _Values:
-    """What has been seen of values that are stored as floats, or with a slope, and stand for labels."""
+    """Statistics of label values that are stored as floats or with a slope."""
 
     low: float = math.inf
     high: float = -math.inf
@@ -262,7 +262,7 @@ class _Values:
         if not self._are_labels():
             raise InputError(
                 f"{path} has values between {self.low:.4g} and {self.high:.4g} that are not whole numbers, such as "
-                "probabilities; make labels of them first, by a threshold say."
+                "probabilities; convert them to labels first, for example by a threshold."
             )
 
 

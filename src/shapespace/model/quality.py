@@ -448,7 +448,7 @@ def measure_quality(
 
     Args:
         target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and
-            what is measured on `unseen` can be told, as it does not keep its training shapes.
+            the measures on `unseen` are available, since a model does not keep its training shapes.
         settings: folds, modes, samples, seed, and what model to make; None for the usual ones.
         scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
         unseen: meshes in correspondence that no model saw.

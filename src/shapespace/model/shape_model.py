@@ -184,7 +184,7 @@ class ShapeModel:
 
         Args:
             meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
-                and items that loads a mesh when it is asked for it. Items are whatever `as_mesh` takes: meshes, paths,
+                and items that loads a mesh when it is accessed. Items are anything that `as_mesh` takes: meshes, paths,
                 arrays (V, 3) of points, or objects of other tools. Vertices that are not-a-number or not
                 observed are missing: a model of vertices learns from the others, one of B-splines from filled ones.
             modes: a number; a float below 1 for a share of the variance; "auto" for cross-validation on held-out

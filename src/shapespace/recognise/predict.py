@@ -179,9 +179,7 @@ def _calibrate(
     splits = subject_folds(groups, folds, seed) if folds >= 2 else []
     # A fold that would leave one class alone to train on teaches nothing.
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
-        note = (
-            "There are too few subjects to leave some out, so accuracy is not known and probabilities not calibrated."
-        )
+        note = "There are too few subjects for cross-validation: accuracy is unknown, probabilities are not calibrated."
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
     probabilities = left_out(z, labels, splits, classes, classifier, {}, seed)
     temperature = fit_temperature(labels.tolist(), probabilities, classes)

@@ -249,7 +249,7 @@ class FolderPage:
         """Return which share of the surface lies within each distance."""
         from shapespace.report import figures
 
-        # Without stages each curve takes the time to read a scan and to measure to it.
+        # Without stages, each curve needs the scan to be read and the distances to be measured.
         pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
         shown, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
         if not shown:
@@ -264,7 +264,7 @@ class FolderPage:
         )
 
     def without_stages(self) -> list[Block]:
-        """Return which fits have no pictures and why, and the command that adds the stages where none were saved."""
+        """Return notices on fits without pictures, and on the command that adds the stages if none were saved."""
         fitted = [fit for fit in self.fits if fit.fitted]
         if not fitted:
             return [Text("There is no fit to show.", "broken")]

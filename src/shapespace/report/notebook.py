@@ -159,7 +159,7 @@ def notebook_html(
     *,
     blocks: Sequence[Block] = (),
 ) -> str:
-    """Return what a notebook shows of an object; its repr where the extra `report` is not installed.
+    """Return the notebook view of an object; its repr if the extra `report` is not installed.
 
     Args:
         of: the object.

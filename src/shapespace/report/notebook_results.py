@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from shapespace.store.results import Results
 
 MOST_TABLES, MOST_ROWS = 2, 12
-"""Tables of an analysis, and rows of a table, that a notebook shows; reports have all."""
+"""Largest number of tables of an analysis, and of rows of a table, in a notebook; reports have all."""
 
 _MOST_NOTES = 6
 _MOST_COLUMNS = 8
@@ -36,12 +36,12 @@ class Answered(Protocol):
     """The result of an analysis."""
 
     def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
+        """Return the answer that is saved and reported."""
         ...
 
 
 def html_of_analysis(result: Answered) -> str:
-    """Return the result of an analysis for a notebook: what its report says first, and its first tables."""
+    """Return the notebook view of an analysis: its summary and its first tables."""
     try:
         answer = result.answer()
     except ShapespaceError as error:
@@ -59,7 +59,7 @@ def html_of_analysis(result: Answered) -> str:
 
 
 def html_of_cohort(cohort: Cohort) -> str:
-    """Return a cohort for a notebook: what it consists of, and the first rows of its table."""
+    """Return the notebook view of a cohort: its size and source, and the first rows of its table."""
     rows = [
         ("Shapes", f"{len(cohort):,} {'surfaces' if cohort.fitted is None else 'fits'}"),
         ("Surface", f"{cohort.n_vertices:,} vertices, {0 if cohort.faces is None else len(cohort.faces):,} triangles"),
@@ -79,7 +79,7 @@ def html_of_cohort(cohort: Cohort) -> str:
 
 
 def html_of_results(results: Results) -> str:
-    """Return the results of a folder for a notebook: how many fits have which status, and the first of them."""
+    """Return the notebook view of a folder of results: number of fits by status, and the first fits."""
     rows = [("Folder", str(results.folder)), ("Fits", f"{len(results):,}")]
     rows += [(status.capitalize(), f"{count:,}") for status, count in results.counts().items()]
     cells: list[list[str]] = []
@@ -94,7 +94,7 @@ def html_of_results(results: Results) -> str:
 
 
 def html_of_correspondence(found: Correspondence) -> str:
-    """Return scans in correspondence for a notebook: the mean shape, and how each scan is covered."""
+    """Return the notebook view of scans in correspondence: the mean shape, and the coverage of each scan."""
     kept = [scan for scan in found.scans if not scan.reason]
     rows = [
         ("Scans", f"{len(kept)} of {len(found.scans)} in correspondence"),
@@ -114,7 +114,7 @@ def html_of_correspondence(found: Correspondence) -> str:
 
 
 def html_of_volume_surface(surface: VolumeSurface) -> str:
-    """Return the surface of a volume for a notebook: its picture and what it encloses."""
+    """Return the notebook view of the surface of a volume: its picture, labels and volume."""
     mesh = surface.mesh
     rows = [
         ("Labels", listed([str(label) for label in surface.labels])),
@@ -123,11 +123,11 @@ def html_of_volume_surface(surface: VolumeSurface) -> str:
         ("Pieces", str(surface.pieces)),
     ]
     rows += [("Note", note) for note in surface.notes]
-    return notebook_html(surface, mesh.name, [], rows, _surface(mesh, "The surface, as its axes stand."))
+    return notebook_html(surface, mesh.name, [], rows, _surface(mesh, "The surface in its own axes."))
 
 
 def html_of_additive_model(model: AdditiveModel) -> str:
-    """Return an additive model for a notebook."""
+    """Return the notebook view of an additive model."""
     shape = model.shape
     rows = [
         ("Coefficients", f"{model.n_identity} of identity, {shape.n_modes - model.n_identity} of expression"),
@@ -140,7 +140,7 @@ def html_of_additive_model(model: AdditiveModel) -> str:
 
 
 def html_of_predictor(predictor: Predictor) -> str:
-    """Return a predictor for a notebook: what it predicts, from what, and where it may be used."""
+    """Return the notebook view of a predictor: its target, training data and range."""
     rows = [
         ("Subjects", str(predictor.subjects)),
         ("Method", predictor.method),
@@ -153,7 +153,7 @@ def html_of_predictor(predictor: Predictor) -> str:
 
 
 def html_of_predictions(found: Predictions) -> str:
-    """Return predictions for a notebook: value and interval of the first shapes."""
+    """Return the notebook view of predictions: value and interval of the first shapes."""
     cells = [
         [name, f"{found.value[k]:.4g}", f"{found.low[k]:.4g} to {found.high[k]:.4g}", found.outside[k]]
         for k, name in enumerate(found.names[:MOST_ROWS])

@@ -33,7 +33,7 @@ Measure: TypeAlias = Literal["mean", "median", "rms", "p95", "max", "fraction"]
 
 
 class ScanNotFoundError(FileFormatError):
-    """The scan of a fit is no longer where it was, or has changed; the message begins with a small letter."""
+    """The scan of a fit was moved or changed; the message begins with a lower-case letter."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
 
 
 def staged_fit(folder: Folder, fit: SavedFit) -> StagedFit:
-    """Return what pictures of `fit` need: its saved stages, or else its saved surfaces and its scan.
+    """Return the data for pictures of `fit`: its saved stages, or else its saved surfaces and its scan.
 
     Raises:
         FileError: a file cannot be read.
@@ -291,7 +291,7 @@ def _in_model_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
 
 
 def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
-    """Return the scan of `fit` as its file has it, if it is still where it was, with the content it had.
+    """Return the scan of `fit` from its file, if the file was neither moved nor changed.
 
     Raises:
         FileError: it cannot be read.

@@ -276,7 +276,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
 def pack_surfaces(
     surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, why: str, largest: int | None = None
 ) -> bytes:
-    """Return what the widget of a fit needs where there is no scan to show: as `pack_fit`, without scan and distances.
+    """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
     Args:
         surfaces: `final`, and `dense` where there is one, with the same triangles, in the model's frame.

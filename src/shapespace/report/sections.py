@@ -225,7 +225,7 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
 
 
 def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why: str) -> Turning | Figure:
-    """Return the fitted surface of a fit whose scan cannot be shown, as a still where nothing turns.
+    """Return the fitted surface of a fit whose scan cannot be shown, with a still image as the fallback.
 
     Args:
         page: that it goes to.
@@ -301,7 +301,7 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
 
 
 _OF_STAGES = ("stages_figure", "regions_figure", "history_figure")
-"""Figures that need what only --stages saves."""
+"""Figures that need the output of --stages."""
 _CAPTIONS = {
     "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
     "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "
@@ -325,7 +325,7 @@ _OF_PAPER = {
 
 
 def region_shares(fit: StagedFit) -> str:
-    """Return the share of each region in words; of a fit without saved stages, that they are not known."""
+    """Return the share of each region in words, or that they are unknown if the stages were not saved."""
     if fit.regions is None:
         return "not saved"
     counts = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)

@@ -129,8 +129,8 @@ class StagedFit:
                 nearest = engine.query(surface.vertices)
                 along = np.einsum("ij,ij->i", nearest.points - surface.vertices, vertex_normals(surface))
                 sideways = np.sqrt(np.maximum(nearest.distance**2 - along**2, 0.0))
-                beside = sideways > _SIDEWAYS_SHARE * rms_size(surface.vertices)
-                unseen = on_boundary(nearest, scan, boundary_vertices(scan)) & beside
+                is_sideways = sideways > _SIDEWAYS_SHARE * rms_size(surface.vertices)
+                unseen = on_boundary(nearest, scan, boundary_vertices(scan)) & is_sideways
             forward[stage] = np.where(unseen, np.nan, distances.model_to_scan_signed_mm)
             backward[stage] = distances.scan_to_model_signed_mm
         return StagedFit(

@@ -209,7 +209,7 @@ class StudyParts:
             f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
         ]
         said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
-        about = "Share of right answers on subjects who were not learned from, against how many were."
+        about = "Accuracy on subjects who were not in the training set, by the number of training subjects."
         return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
 
     def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
@@ -352,18 +352,18 @@ class StudyParts:
         return [turning]
 
     def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
-        """Return how values are spread."""
+        """Return a histogram."""
         from shapespace.report import figures
 
         figure = figures.histogram_figure(
             part.edges, [(one.label, one.counts) for one in part.series], x=part.x, observed=part.observed,
             observed_label=part.observed_label or "observed",
         )  # fmt: skip
-        about = f"How {part.x} is spread."
+        many = [f"{one.label} {sum(one.counts):g}".strip() for one in part.series]
+        about = f"Counts: {listed(many)}."
         if part.observed is not None:
-            about += f" Dashed: {part.observed_label or 'what was observed'}, {part.observed:.3g}."
-        many = [f"{one.label or 'all'} {sum(one.counts):g}" for one in part.series]
-        alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}; {listed(many)}. {about}"
+            about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
+        alt = f"Histogram of {part.x} from {part.edges[0]:.3g} to {part.edges[-1]:.3g}. {about}"
         return [self.drawn((figure, about, alt), note)]
 
     def _arrays(self, name: str, names: Sequence[str]) -> list[npt.NDArray[Any]]:

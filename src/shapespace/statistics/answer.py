@@ -24,13 +24,13 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
 
 
-LESS_SO_THAT_NONE_FLIPS = "Drawn smaller than it is, so that no triangle turns over."
-"""The note of a morph whose full size would turn triangles over."""
+NOTE_OF_REDUCED_MORPH = "Drawn smaller than it is, so that no triangle flips."
+"""The note of a morph whose full size would flip triangles."""
 
 
 @dataclass(frozen=True)
 class Lengths:
-    """How lengths are written: in mm, or without a unit where the coordinates have none.
+    """Format of lengths: in mm, or without a unit if the coordinates have none.
 
     Args:
         unit: `mm`, or empty.
@@ -39,11 +39,11 @@ class Lengths:
     unit: str
 
     def number(self, value: float, sign: str = "") -> str:
-        """Return a length without its unit; those of coordinates without a unit are small shares of the size.
+        """Return a length without its unit, with more decimals if the coordinates have no unit.
 
         Args:
             value: the length.
-            sign: `+` for a sign of positive lengths too.
+            sign: `+` to write the sign of positive lengths.
         """
         return f"{value:{sign}.{2 if self.unit else 4}f}"
 
@@ -90,7 +90,7 @@ class Answer:
         notes: who was left out and why, a sentence each.
         settings: all that the result depends on, seeds among it.
         model_hashes: of the models of the fits.
-        methods: sample sizes, tests and assumptions, which the last parts state in words; None of predictions alone.
+        methods: sample sizes, tests and assumptions, as in the last parts; None for predictions.
     """
 
     question: str

@@ -37,7 +37,7 @@ LEVEL = 0.95
 _BLOCK = 100
 _FEWEST = 3
 _MOSTLY = 0.5
-"""Share of the shapes of a subject."""
+"""Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Asymmetry:
 
     @property
     def blank(self) -> BoolArray | None:
-        """(M,) where maps of the group are blank, as too few subjects observe both sides; None for nowhere."""
+        """(M,) bool, where maps of the group are blank because too few subjects observe both sides; None if nowhere."""
         blank = weights_of(self.observed_share) == 0
         return blank if blank.any() else None
 
@@ -339,7 +339,7 @@ def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatA
     mean = both.mean(axis=0)
     difference = both[:n] - both[n:]
     if cohort.analysed is not None:
-        # A vertex that nobody knows on both sides says nothing of how the sides differ.
+        # A vertex that no shape observes on both sides contains no information on their difference.
         known = cohort.analysed[sides.vertices]
         known = known & np.logical_or(known[sides.corners], sides.weights == 0).all(axis=1)
         difference[:, ~known] = 0.0
@@ -443,7 +443,7 @@ def _family_wise(
 ) -> FloatArray:
     """Return p (M,) of the mean of fields (n, M) or (n, M, 3), by the permutation maximum over random signs.
 
-    The statistic of a vertex is multiplied by its `weight` (M,), where there is one.
+    The statistic of a vertex is multiplied by its `weight` (M,), unless that is None.
     """
     n, m = own.shape[:2]
     flat, square = own.reshape(n, -1), (own**2).reshape(n, m, -1).sum(axis=(0, 2))

@@ -20,10 +20,10 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Lengths, Rows
+from shapespace.statistics.answer import NOTE_OF_REDUCED_MORPH, Answer, Lengths, Rows
 from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
 from shapespace.statistics.methods_answer import methods_parts
-from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
+from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
@@ -31,7 +31,7 @@ _SHOWN = 2
 _LISTED = 10
 _BINS = 20
 _MORPH_SHARE = 0.05
-"""Of the size (RMS distance from the middle): the largest displacement that a morph is exaggerated to."""
+"""Largest displacement in an exaggerated morph, as a share of the size (RMS distance from the centroid)."""
 _FILE = "asymmetry.npz"
 _FEW_REPEATS = 10
 
@@ -214,7 +214,7 @@ def _histogram(found: Asymmetry) -> HistogramPart:
     if not found.in_reference.all():
         series.append(("others", ~found.in_reference))
     return HistogramPart(
-        title="How far subjects lie from their mirror images",
+        title="Distances of subjects from their mirror images",
         edges=tuple(edges.tolist()),
         series=tuple(
             Counts(label=label, counts=tuple(np.histogram(found.scores.mm[who], edges)[0].astype(float).tolist()))
@@ -267,12 +267,12 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if unshown else "shown",
             note="Mean over the subjects, along the normals." + (
-                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}.") + _told_grey(found),
+                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}.") + _blank_note(found),
         ),
         SurfaceMapPart(
             title="Fluctuating asymmetry", arrays=_FILE, values="fluctuating_mm", signed=False,
             note="Standard deviation over the subjects, about the directional asymmetry, with measurement error."
-            + _told_grey(found),
+            + _blank_note(found),
         ),
     ]  # fmt: skip
 
@@ -293,7 +293,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
                 low_label=low,
                 high_label=high,
                 times=times,
-                note=note if times >= 1 else f"{note} {LESS_SO_THAT_NONE_FLIPS}",
+                note=note if times >= 1 else f"{note} {NOTE_OF_REDUCED_MORPH}",
             )
         )
 
@@ -330,8 +330,8 @@ def _unobserved(found: Asymmetry) -> BoolArray | None:
     return None if found.observed is None else ~found.observed
 
 
-def _told_grey(found: Asymmetry) -> str:
-    return "" if found.blank is None else f" {told_blank(int(found.blank.sum()), len(found.blank))}"
+def _blank_note(found: Asymmetry) -> str:
+    return "" if found.blank is None else f" {blank_sentence(int(found.blank.sum()), len(found.blank))}"
 
 
 def _points(found: Asymmetry) -> TablePart:

@@ -282,7 +282,7 @@ def _dispersion(
 
 
 def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
-    """Return (V,) where maps of the group are blank: too few subjects observe the vertex, over all or in a group."""
+    """Return (V,) bool, where maps are blank: too few subjects, of all or of a group, observe the vertex."""
     every = np.ones(len(subjects[0].area_mm2), dtype=np.bool_)
     observed = np.stack([every if one.observed is None else one.observed for one in subjects])
     groups = np.array([one.group for one in subjects])
@@ -302,7 +302,7 @@ def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
     blank, landmarks = _blank(subjects), answer.landmarks
     at_landmarks = landmarks.interpolate(maps.T)
     at_landmarks[blank[landmarks.corners].any(axis=1)] = 0.0
-    # Without variation a vertex is found nowhere, and takes no part in the maxima.
+    # Vertices without variation are never significant, and are excluded from the maxima.
     maps[:, blank] = 0.0
     volumes = np.stack([one.volumes_mm3 for one in asked])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)

@@ -21,7 +21,7 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import LESS_SO_THAT_NONE_FLIPS, Answer, Rows
+from shapespace.statistics.answer import NOTE_OF_REDUCED_MORPH, Answer, Rows
 from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
 from shapespace.statistics.change_group import LEVEL, MapTest
 from shapespace.statistics.methods_answer import (
@@ -30,7 +30,7 @@ from shapespace.statistics.methods_answer import (
     methods_parts,
     multiplicity_sentence,
 )
-from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
+from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
 from shapespace.types import FloatArray, Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
@@ -40,7 +40,7 @@ LISTED, CURVES = 50, 12
 _LEVEL = LEVEL
 _MM3_PER_ML = 1000.0
 _LEAST_ML_MM3 = 100.0
-"""Volumes below this, mm³, are stated in mm³ and others in ml: two decimals of 0.1 ml say too little."""
+"""Volumes below this limit (mm³) are written in mm³, others in ml; 0.1 ml needs more than two decimals."""
 _FEW = 10
 _SOURCES = {
     "rescans": "Standard deviations are those of rescans.",
@@ -112,7 +112,7 @@ def _summary(change: Found) -> list[str]:
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
     who = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
-    told = [
+    sentences = [
         f"{who} changed by {rms:.2f} mm (RMS along the normals{'' if len(subjects) == 1 else ', median'}), and on "
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     ]
@@ -120,59 +120,59 @@ def _summary(change: Found) -> list[str]:
         volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects])
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
-        told.append(_of_test(change, change.group, "the mean change", "none"))
+        sentences.append(_of_test(change, change.group, "the mean change", "none"))
         what = "The volume changed by" if change.closed else "The open surface swept"
-        told.append(
-            f"{what} {unit.told(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.told(low)} to "
-            f"{unit.told(high)}), "
+        sentences.append(
+            f"{what} {unit.text(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.text(low)} to "
+            f"{unit.text(high)}), "
             f"{_p(float(change.group_volumes.p[0]))}."
         )
     if change.between is not None and change.between_volumes is not None:
         first, second = change.groups
-        told.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
+        sentences.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
         difference = float(change.between_volumes.effect[0])
         unit = _VolumeUnit.of(difference)
-        told.append(
-            f"The volume of {second} changed by {unit.told(difference)} {unit.name}{_per(change)} "
+        sentences.append(
+            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per(change)} "
             f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
         )
         unequal = change.settings.unequal_variances
-        told += [
+        sentences += [
             dispersion_sentence(one, unequal, "mm")
             for one in change.methods.dispersions
             if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
         ]
     if change.repeatability is None:
-        told.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
+        sentences.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:
         known, smallest = change.repeatability, change.repeatability.smallest_mm
         least = float(known.volumes_smallest_mm3[0])
         unit = _VolumeUnit.of(least)
-        told.append(
+        sentences.append(
             f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
-            f"surface; {smallest.max():.2f} mm at most), and {unit.told(least).lstrip('+')} {unit.name} of "
+            f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
         )
     if change.group is not None:
-        told.append(multiplicity_sentence(change.methods))
-    return told
+        sentences.append(multiplicity_sentence(change.methods))
+    return sentences
 
 
 @dataclass(frozen=True)
 class _VolumeUnit:
-    """A unit of volumes, by its name, and how many mm³ it is."""
+    """A unit of volumes: its name and its size in mm³."""
 
     name: str
     mm3: float
 
     @staticmethod
     def of(*mm3: float | FloatArray) -> _VolumeUnit:
-        """Return ml where one of some volumes, mm³, is at least `_LEAST_ML_MM3`, else mm³."""
+        """Return ml if the largest of the volumes (mm³) is at least `_LEAST_ML_MM3`, else mm³."""
         largest = max((float(np.abs(one).max(initial=0.0)) for one in map(np.asarray, mm3)), default=0.0)
         return _VolumeUnit("mm³", 1.0) if largest < _LEAST_ML_MM3 else _VolumeUnit("ml", 1000.0)
 
-    def told(self, mm3: float) -> str:
+    def text(self, mm3: float) -> str:
         """Return a volume, mm³, in this unit with its sign."""
         return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
 
@@ -213,7 +213,7 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
         "mean_p": test.p,
         "mean_found": test.p <= _LEVEL,
     }
-    grey = "" if change.blank is None else f" {told_blank(int(change.blank.sum()), len(change.blank))}"
+    grey = "" if change.blank is None else f" {blank_sentence(int(change.blank.sum()), len(change.blank))}"
     least = 1 / test.permutations
     marked = (
         f"No p can be below {least:.2g} with so few, so that nothing is marked."
@@ -405,7 +405,7 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
 def _morph(
     title: str, arrays: dict[str, npt.NDArray[Any]], low: str, high: str, low_label: str, high_label: str
 ) -> MorphPart:
-    """Return the morph between two shapes of `arrays`; where triangles would turn over, a part of the way is drawn."""
+    """Return the morph between two shapes of `arrays`; if triangles would flip, the difference is drawn smaller."""
     before, change = arrays[low], arrays[high] - arrays[low]
     times = factor_to_draw(1.0, flip_factor(before, change, arrays["faces"]))
     if times < 1:
@@ -413,7 +413,7 @@ def _morph(
         arrays[high] = before + times * change
     return MorphPart(
         title=title, arrays=ARRAYS, low=low, high=high, low_label=low_label, high_label=high_label, times=times,
-        note="" if times == 1 else LESS_SO_THAT_NONE_FLIPS,
+        note="" if times == 1 else NOTE_OF_REDUCED_MORPH,
     )  # fmt: skip
 
 

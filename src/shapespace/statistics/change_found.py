@@ -143,7 +143,7 @@ class SubjectChange:
 
     @property
     def unobserved(self) -> BoolArray | None:
-        """(V,) where maps of the subject are blank; None for nowhere."""
+        """(V,) bool, where maps of the subject are blank; None if nowhere."""
         return None if self.observed is None else ~self.observed
 
     __repr__ = short_repr
@@ -185,7 +185,7 @@ class Found:
         unit: of time, as in `mm per year`; empty where times are words.
         closed: whether the surface is.
         model_only: whether the surfaces hold nothing but what the model of the fits can make.
-        blank: (V,) where maps of the group are blank, as too few subjects observe the vertex; None for nowhere.
+        blank: (V,) bool, where maps are blank because too few subjects observe the vertex; None if nowhere.
     """
 
     cohort: Cohort
@@ -247,10 +247,12 @@ class Found:
 
     def __repr__(self) -> str:
         tests = {"mean change": self.group, " and ".join(self.groups) + " differ": self.between}
-        told = listed_briefly([f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None])
+        p_values = listed_briefly(
+            [f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None]
+        )
         return (
             f"<{type(self).__name__} of {len(self.subjects)} subjects, {len(self.cohort)} scans; uncertainty from "
-            f"{self.uncertainty}{f'; {told}' if told else ''}>"
+            f"{self.uncertainty}{f'; {p_values}' if p_values else ''}>"
         )
 
     def surfaces(self, name: str) -> tuple[Mesh, Mesh]:

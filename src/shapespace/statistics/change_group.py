@@ -36,7 +36,7 @@ class MapTest:
         permutations: that were made, the data's own among them.
         every: whether these are all there are.
         n: subjects, or subjects of each group.
-        critical_t: of |t|, above which `p` is at most `LEVEL`; effect ± |effect / t| critical_t are simultaneous
+        critical_t: |t| above which `p` is at most `LEVEL`; effect ± |effect / t| critical_t are simultaneous
             intervals.
         unequal_variances: whether t is Welch's, compared with sign flips, which allows groups of unequal variance.
     """
@@ -158,7 +158,7 @@ def _permuted(
     t_of: Callable[[FloatArray], FloatArray],
     on_step: Callable[[int, int], None] | None,
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Return t of the first of `draws`, its p (V,) against the maxima of all, the omnibus p and the critical |t|."""
+    """Return t of the first of `draws`, its p (V,) by the maxima of all draws, the omnibus p and the critical |t|."""
     gram = (maps * area) @ maps.T
     observed, own = np.zeros(maps.shape[1]), 0.0
     maxima: list[float] = []

@@ -60,7 +60,7 @@ def aligned(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) ->
         for row in visit.rows:
             x = fixed
             if row != visits[0].rows[0]:
-                # Estimates carry no alignment.
+                # Estimated vertices are not used in the alignment.
                 both = cohort.observed_in([visits[0].rows[0], row])
                 T, weights = align_by(cohort.vertices(row), fixed, area if both is None else area * both, stable)
                 x = T.apply(cohort.vertices(row))

@@ -57,8 +57,8 @@ class CompareOptions:
 
     Args:
         squares: one of `TYPES`.
-        blocks: column with the subject of each scan, whose responses to all conditions within subjects may differ; None
-            takes all shapes for independent.
+        blocks: column with the subject of each scan; subjects may respond differently to all conditions within
+            subjects. None if all shapes are independent.
         permutations: arrangements, the observed one among them.
         seed: of the arrangements.
         maps: whether to test each vertex.
@@ -108,7 +108,7 @@ class TermTest:
         df: degrees of freedom.
         squares: sum of squares, mm².
         r2: its share of the total of the stratum.
-        f: mean square by that of the residuals; with unequal variances, squared effect by its variance.
+        f: mean square divided by that of the residuals; with unequal variances, squared effect divided by its variance.
         z: F in standard deviations above the mean of its arrangements, after `CompareOptions.effect_size`.
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
@@ -157,7 +157,7 @@ class Effect:
         p: share of arrangements with an F as large.
         p_family: the same by the largest F of all pairs of classes of this variable.
         map: vertex by vertex; None where it was not asked for.
-        exploratory: whether no term of this effect is significant, so that its map shows nothing that is established.
+        exploratory: whether no term of this effect is significant; its map is then exploratory.
     """
 
     name: str
@@ -208,7 +208,7 @@ class Comparison:
         angles: between effects.
         warnings: what makes the numbers less than they look, a sentence each.
         subjects: number of subjects; that of shapes where all are independent.
-        notes: how repeated shapes of subjects were tested, a sentence each.
+        notes: sentences on the tests of repeated shapes of subjects.
         dispersions: tests of equal dispersion of the classes of each variable between subjects.
         methods: sample sizes, tests and assumptions.
     """
@@ -274,8 +274,9 @@ def compare(
 
     Raises:
         InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
-            covariate, terms that follow from others, more columns than shapes, an effect within subjects that too few
-            subjects show, or unequal variances of a class of one or of an effect that all subjects share.
+            covariate, terms that are linear combinations of others, more columns than shapes, an effect within subjects
+            that too few subjects show, or unequal variances with a class of one shape or for an effect that is assumed
+            to be the same in all subjects.
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
@@ -455,7 +456,7 @@ def term_tests(
         explained = squares[:, :df].sum(axis=1)
         f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)
         if units is not None:
-            # Columns of the reduced model are not tested, and the variance is that of each unit.
+            # Columns of the reduced model are not tested; each unit has its own variance.
             f = units.estimate(
                 units.own(term, reduced), [term], reduced, options.permutations, options.seed, term.label
             ).statistic()
@@ -476,12 +477,12 @@ def _remainder(stratum: Stratum) -> Remainder:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """A contrast of a stratum, in whose reduced model some terms are, with the weight (V,) of each vertex."""
+    """A contrast of a stratum, the terms of its reduced model, and the weight (V,) of each vertex."""
 
     low: str
     high: str
     stratum: Stratum
-    beside: tuple[Term, ...]
+    reduced: tuple[Term, ...]
     contrast: FloatArray
     weight: FloatArray | None = None
 
@@ -506,9 +507,9 @@ def _families(design: Design, strata: Strata) -> Iterator[_Family]:
             continue
         for stratum in strata.every:
             if any(term in stratum.terms for term in wanted):
-                beside = tuple(stratum.without(both))
+                reduced = tuple(stratum.without(both))
                 ends = [
-                    _Ends(one.told(low), one.told(high), stratum, beside, design.contrast(one.column, low, high))
+                    _Ends(one.told(low), one.told(high), stratum, reduced, design.contrast(one.column, low, high))
                     for low, high in _pairs(one)
                 ]
                 yield _Family(one.name, tuple(ends))
@@ -548,7 +549,7 @@ def _weighted(cohort: Cohort, design: Design, family: _Family) -> _Family:
 
 
 def _within_ends(within: Within, one: Variable, low: str | float, high: str | float) -> _Ends:
-    """Return the change of a variable within subjects, at the average of the variables between them."""
+    """Return the change of a variable within subjects, at the average of the variables between subjects."""
     own = frozenset({one.column})
     stratum, between = within.contrast_stratum(
         within.effects.contrast(one.column, low, high), own, _told(one, low, high)
@@ -635,10 +636,10 @@ def _tested_together(
     options: CompareOptions,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum."""
-    stratum, beside = family[0].stratum, family[0].beside
+    stratum, reduced = family[0].stratum, family[0].reduced
     if options.unequal_variances:
         return _tested_unequal(cohort, family, units_of(stratum, design, subjects), options)
-    residual, flips = stratum.residual(beside), stratum.flips(beside)
+    residual, flips = stratum.residual(reduced), stratum.flips(reduced)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
     along = (directions / lengths[:, None]) @ stratum.basis
@@ -670,11 +671,11 @@ def _tested_unequal(
     changes: list[FloatArray] = []
     maps: list[EffectMap | None] = []
     for ends in family:
-        tested = [term for term in stratum.terms if term not in ends.beside]
+        tested = [term for term in stratum.terms if term not in ends.reduced]
         direction = stratum.direction(ends.contrast)
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
-        estimate = units.estimate(own, tested, ends.beside, options.permutations, options.seed, label)
+        estimate = units.estimate(own, tested, ends.reduced, options.permutations, options.seed, label)
         statistics.append(estimate.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (
@@ -713,9 +714,9 @@ def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterat
 def _changes_in_pairs(
     design: Design, strata: Strata, one: Variable, other: Variable, options: CompareOptions
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield what a variable changes (P, K) in the two classes of each pair of another, in each arrangement.
+    """Yield the changes (P, K) by a variable in the two classes of each pair of another, in each arrangement.
 
-    There are none where the changes of the two variables are not of one stratum.
+    There are none if the changes of the two variables belong to different strata.
     """
     both = frozenset({one.column, other.column})
     low, high = _pairs(one)[0]
@@ -735,7 +736,7 @@ def _changes_in_pairs(
         contrasts = [between.average({other.column: level}) for level in levels]
         yield from itertools.combinations(_changes_of(stratum, both, contrasts, options), 2)
         return
-    # Both within subjects: in each arrangement some subjects change their two changes for each other.
+    # Both within subjects: each arrangement exchanges the two changes in some subjects.
     own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
     for first, second in itertools.combinations(own, 2):
         half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
@@ -750,10 +751,10 @@ def _changes_of(
     stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], options: CompareOptions
 ) -> list[FloatArray]:
     """Return contrasts (P, K) in each arrangement of the model without the terms of some variables."""
-    beside = stratum.without(variables)
-    residual = stratum.residual(beside)
+    reduced = stratum.without(variables)
+    residual = stratum.residual(reduced)
     products = stratum.products(
-        stratum.basis, residual, options.permutations, options.seed, flips=stratum.flips(beside)
+        stratum.basis, residual, options.permutations, options.seed, flips=stratum.flips(reduced)
     )
     products += stratum.basis.T @ (stratum.shapes - residual)
     return [np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(one), products) for one in contrasts]

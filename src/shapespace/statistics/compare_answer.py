@@ -26,7 +26,7 @@ from shapespace.statistics.answer import Answer, Lengths, Rows
 from shapespace.statistics.compare import Comparison, Effect
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
-from shapespace.statistics.observed import blank_where, told_blank, with_shape_data
+from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHOWN_SHARE = 0.05
@@ -82,17 +82,17 @@ def _summary(comparison: Comparison) -> Iterator[str]:
     level, shapes = comparison.options.level, len(comparison.cohort)
     kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.options.effect_size]
     for test in comparison.tests:
-        told = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
+        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
         where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
-            yield f"Shape differs with {test.term}{where} ({told})."
+            yield f"Shape differs with {test.term}{where} ({figures})."
         else:
-            yield f"No difference of shape with {test.term}{where} is found ({told})."
+            yield f"No difference of shape with {test.term}{where} is found ({figures})."
     for effect in comparison.effects:
         if effect.map is not None:
             yield _of_map(comparison, effect, effect.map)
             if effect.map.blank is not None:
-                yield f"{effect.label}: {told_blank(int(effect.map.blank.sum()), len(effect.map.blank))}"
+                yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
                 yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
     yield from comparison.warnings
@@ -232,7 +232,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     if effect.map is not None:
         kept = _arrays(comparison, effect)
         blank = effect.map.blank
-        note = _PALE if blank is None else f"{_PALE} {told_blank(int(blank.sum()), len(blank))}"
+        note = _PALE if blank is None else f"{_PALE} {blank_sentence(int(blank.sum()), len(blank))}"
         for title, values, mask in (
             (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
             (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),

@@ -38,11 +38,11 @@ FUNCTIONS: Mapping[str, str] = {
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
 _MOST_CELLS = 100_000
 _MOST_COLUMNS = 5000
-"""Before repeated or implied ones are left out; more take seconds to expand, and as many shapes to estimate."""
+"""Limit before repeated or implied columns are removed; more take seconds to expand, and need as many shapes."""
 _DEEPEST = 30
-"""Brackets in brackets."""
+"""Limit of nested brackets."""
 _SPLINE = 4
-"""Columns of a polynomial or spline of which no number is given; 3 for cubic ones."""
+"""Number of columns of a polynomial or spline if the formula has none; 3 for cubic ones."""
 _TOKEN = re.compile(r"\s*(`[^`]*`|[\w.]+|\*\*|[-+*:/^()])")
 _PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="'`]*""")
 _POWER = re.compile(r"\*\*|\^")
@@ -232,8 +232,8 @@ def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], 
     """Return the effects that vary by subject, as products of factors, and the column that names the subject.
 
     Args:
-        random: such as `1 + time | subject`; the 1, the mean of each subject, is always one of them.
-        table: whose columns it names.
+        random: random terms such as `1 + time | subject`; they must contain the 1, the mean of each subject.
+        table: with the columns that the terms name.
 
     Raises:
         InputError: it cannot be read, leaves out the 1, or names something that is no column.
@@ -389,14 +389,14 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
 
 @dataclass(frozen=True)
 class _Size:
-    """Upper bounds of the columns of a part of a formula, and of the product of all its factors."""
+    """Upper bounds of the number of columns of a part of a formula, and of the product of all its factors."""
 
     columns: int
     product: int
 
 
 class _Bound:
-    """Bounds the number of columns of a formula without expanding it: its operators are those of R, by precedence."""
+    """Upper bound of the number of columns of a formula, without expanding it; operators are those of R."""
 
     def __init__(self, text: str, table: Table, where: str) -> None:
         self.table, self.where = table, where
@@ -427,7 +427,7 @@ class _Bound:
         return InputError(f"{self.where} cannot be read near {near[:20]!r}; write one such as '~ sex + age'.")
 
     def _next(self, *wanted: str) -> str:
-        """Return the next token and pass it if it is one of those wanted, else nothing."""
+        """Return the next token and go past it if it is one of those wanted, else an empty text."""
         token = self.tokens[self.at] if self.at < len(self.tokens) else ""
         if token not in wanted:
             return ""
@@ -465,7 +465,7 @@ class _Bound:
             exponent = self._next("2", "3")
             if not exponent:
                 raise self._unreadable()
-            # Products of different terms, in whatever order.
+            # Products of different terms, in any order.
             each = range(1, int(exponent) + 1)
             size = _Size(sum(size.columns**k // math.factorial(k) + 1 for k in each), size.product)
         return size

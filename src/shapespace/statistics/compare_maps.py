@@ -71,8 +71,8 @@ class EffectMap:
         any_way: test of `change_mm`, in whatever direction.
         bump_mm: (V,) height of the bump there that explains the change best; None where none were sought.
         bump: test of `bump_mm`.
-        weight: (V,) by which F is multiplied, the share of the information that observations carry (`information`); 0
-            where the map is blank. None if all vertices are observed.
+        weight: (V,) factor of F, the share of the information that the observations contain (`information`); 0 where
+            the map is blank. None if all vertices are observed.
     """
 
     change_mm: FloatArray
@@ -86,7 +86,7 @@ class EffectMap:
 
     @property
     def blank(self) -> BoolArray | None:
-        """(V,) where the map is blank, as too few shapes observe the vertex; None for nowhere."""
+        """(V,) bool, where the map is blank because too few shapes observe the vertex; None if nowhere."""
         return None if self.weight is None or self.weight.all() else self.weight == 0
 
     __repr__ = short_repr
@@ -133,7 +133,7 @@ def effect_maps(
         along: (E, m) unit vectors: each effect in these columns.
         changes: (E, K) mm.
         bump_width_mm: standard deviation of the bumps; None seeks none.
-        weights: (E, V) by which F is multiplied; None for 1.
+        weights: (E, V) factors of F; None for 1.
         estimates: E, whose statistics allow unequal variances; None takes the pooled variance of `residual`.
         level: of significance, and one minus the confidence of intervals.
     """

@@ -25,7 +25,7 @@ from shapespace.types import FloatArray
 
 Rows: TypeAlias = npt.NDArray[np.intp]
 Scheme: TypeAlias = Literal["permute", "flip", "subjects"]
-"""Rows are permuted, or their signs are flipped; of subjects, the one or the other, depending on the reduced model."""
+"""How rows are arranged: permuted, or with flipped signs; subjects either way, depending on the reduced model."""
 
 _ALIASED = 1e-8
 _CONSTANT = 1e-9
@@ -43,14 +43,14 @@ class Stratum:
         matrix: (n, p) of these terms, less the same means.
         columns: (p,) of the design.
         terms: tested here.
-        groups: (n / width,) units of one number are exchangeable.
+        groups: (n / width,) group of each unit; units of a group are exchangeable.
         removed: number of means removed.
         number: of the stratum, for its seed.
         nuisance: terms that are in the model but not tested here.
         scheme: how units are arranged.
         width: consecutive rows of one unit, which stay together.
-        units: (n / width,) of all units for which arrangements are drawn; None where each is one of them.
-        n_units: number of these.
+        units: (n / width,) index of each unit among those for which arrangements are drawn; None if they are the same.
+        n_units: number of units for which arrangements are drawn.
         constant: (n,) the row of the constant in the first row of each unit; None where means are removed.
     """
 
@@ -83,11 +83,11 @@ class Stratum:
 
     @cached_property
     def fewest_log_arrangements(self) -> float:
-        """Logarithm of how many arrangements of a term differ, of the term that has fewest."""
+        """Logarithm of the number of different arrangements, for the term with the fewest."""
         return min(self.log_arrangements(flips=self.flips(self.reduced(term, "III"))) for term in self.terms)
 
     def log_arrangements(self, *, flips: bool = False) -> float:
-        """Return the logarithm of how many arrangements differ; of equal covariates, or of all signs, there is one."""
+        """Return the logarithm of the number of arrangements that differ."""
         if flips:
             return (len(self.groups) - 1) * math.log(2)
         matrix = self.matrix[:: self.width]
@@ -127,8 +127,8 @@ class Stratum:
     def flips(self, reduced: Sequence[Term]) -> bool:
         """Return whether the arrangements of the residuals of a reduced model are flips of signs.
 
-        Contrasts of subjects are exchangeable between subjects where the reduced model contains their mean. Where their
-        mean is itself tested, each is as likely with the other sign.
+        Contrasts of subjects are exchangeable between subjects if the reduced model contains their mean. If their mean
+        is tested, each contrast is equally likely with either sign.
         """
         if self.scheme != "subjects" or self.constant is None:
             return self.scheme == "flip"
@@ -154,8 +154,8 @@ class Stratum:
     ) -> Iterator[tuple[int, Rows, FloatArray | None]]:
         """Yield (start, rows (b, n), signs (b, n)) of arrangements; the first is as observed.
 
-        They are the same on each call. Signs are None where rows are permuted, and rows stay in order where signs are
-        flipped. Strata of the same units arrange them alike.
+        They are the same on each call. If rows are permuted, signs are None; if signs are flipped, rows stay in order.
+        Strata of the same units have the same arrangements.
         """
         n = len(self.groups)
         own = np.arange(n) if self.units is None else self.units
@@ -275,7 +275,7 @@ def common_stratum(
     Args:
         shapes: (C, K) mm, of the cells of subjects.
         matrix: (C, P) of the design.
-        own_columns: (C, q) columns whose slopes each subject has of its own, beside its mean.
+        own_columns: (C, q) columns whose slopes, in addition to the mean, differ between subjects.
         at: (C,) subject of each cell, from 0.
         design: of the model.
         terms: of these effects.

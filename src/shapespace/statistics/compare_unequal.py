@@ -23,9 +23,9 @@ class Units:
 
     Args:
         stratum: the stratum.
-        shapes: (s, d K) mm, the d contrasts of a unit beside each other.
+        shapes: (s, d K) mm, the d contrasts of a unit in one row.
         matrix: (s, p) of its terms.
-        full: (s, m) orthonormal columns of the whole model, the mean among them where it was removed.
+        full: (s, m) orthonormal columns of the whole model, with the mean if it was removed.
         rows: (s,) a row of the table of each unit.
         design: of the whole model.
         varying: names inside of the variables that differ within subjects.
@@ -45,12 +45,12 @@ class Units:
         return (self.full**2).sum(axis=1)
 
     def columns(self, terms: Sequence[Term]) -> FloatArray:
-        """Return the (s, r) columns of the model of some terms, the mean among them where it was removed."""
+        """Return the (s, r) columns of the model of some terms, with the mean if it was removed."""
         own = self.matrix[:, self.stratum.at(terms)[:: self.stratum.width] // self.stratum.width]
         return np.hstack([self._mean, own])
 
     def own(self, term: Term, reduced: Sequence[Term]) -> FloatArray:
-        """Return the (s, q) orthonormal columns of a term beside those of its reduced model."""
+        """Return the (s, q) orthonormal columns of a term, orthogonal to those of its reduced model."""
         u, size, _ = np.linalg.svd(less(self.columns([term]), self.columns(reduced)), full_matrices=False)
         return u[:, size > _RANK * max(float(size.max(initial=0.0)), 1e-300)]
 
@@ -78,7 +78,7 @@ class Units:
             reduced: terms of the reduced model.
             permutations: number of sign flips, the observed data among them.
             seed: of these.
-            name: of what is tested, for messages.
+            name: name of the tested effect, for messages.
 
         Raises:
             InputError: a unit that the model fits exactly.
@@ -146,5 +146,5 @@ def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -
 
 
 def is_between_units(stratum: Stratum) -> bool:
-    """Return whether the rows of a stratum are of independent units, which may all be exchanged for each other."""
+    """Return whether the rows of a stratum belong to independent units that are all exchangeable."""
     return stratum.scheme != "flip" and int(stratum.groups.max()) == 0

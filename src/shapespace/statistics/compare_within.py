@@ -1,8 +1,8 @@
 """Effects within subjects, tested on one contrast or slope per subject.
 
-A subject's scans are not independent observations of a condition: subjects respond differently, and the difference of
-two conditions is known no better than the responses of the subjects vary. So each subject's response is estimated from
-its own scans first, and the responses are the observations of the test, as in the analysis of variance of repeated
+A subject's scans are not independent observations of a condition: subjects respond differently, and this variation of
+responses limits the precision of a mean difference of two conditions. Each subject's response is therefore estimated
+from its own scans first, and the responses are the observations of the test, as in the analysis of variance of repeated
 measures with the error of subject by condition, and in the two-stage analysis of slopes (Laird and Ware, Biometrics 38,
 1982; Holmes and Friston, NeuroImage 7, 1998).
 """
@@ -31,7 +31,7 @@ from shapespace.types import FloatArray
 _ESTIMABLE = 1e-6
 """Share of a column's standard deviation below which a subject's own variation of it is rounding."""
 _SHARES = np.append(np.linspace(0.0, 0.95, 20), 0.99)
-"""Of the variance of a typical subject's response, that of its estimate; 1 would trust one subject without limit."""
+"""Shares of the variance of a typical response due to its estimate; 1 would give one subject all the weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Responses:
     Args:
         subjects: (s,) which subjects these are.
         values: (s, d, K) mm; d orthonormal contrasts.
-        variances: (s,) of the estimates by unit variance of the cells, mean of the contrasts; by the median of all.
+        variances: (s,) of the estimates for unit variance of the cells, mean of the contrasts, divided by their median.
     """
 
     subjects: Rows
@@ -79,7 +79,7 @@ class Within:
         return int(self.at.max()) + 1
 
     def label(self, effect: int) -> str:
-        """Return an effect as it stands in the formula."""
+        """Return the name of an effect in the formula."""
         return self.effects.terms[effect].label
 
     def strata(self, squares: str) -> tuple[Stratum, ...]:
@@ -141,7 +141,7 @@ class Within:
         return frozenset(name for term in self.effects.terms for name in term.variables)
 
     def notes(self) -> list[str]:
-        """Return how the effects within subjects are tested, a sentence each."""
+        """Return sentences on the tests of effects within subjects."""
         out: list[str] = []
         if self.random:
             labels = ", ".join(self.label(effect) for effect in self.random)
@@ -153,13 +153,13 @@ class Within:
         return out
 
     def warnings(self, strata: Sequence[Stratum]) -> list[str]:
-        """Return what makes the tests within subjects less than they look, a sentence each."""
+        """Return sentences on limitations of the tests within subjects."""
         out: list[str] = []
         fixed = [self.label(effect) for effect in self.terms if effect not in self.random]
         if fixed:
             out.append(
-                f"All {self.blocks}s are assumed to respond alike to {', '.join(fixed)}; where they do not, p within "
-                f"{self.blocks}s is too small. Without --random each {self.blocks} has a response of its own."
+                f"All {self.blocks}s are assumed to respond alike to {', '.join(fixed)}; if they do not, p within "
+                f"{self.blocks}s is too small. Without --random the responses may differ between {self.blocks}s."
             )
         for stratum in strata:
             if stratum.scheme == "subjects" and len(stratum.groups) < self.count:
@@ -175,8 +175,8 @@ class Within:
 
         Args:
             contrast: (D,) of the columns of `effects`.
-            variables: names inside of the variables within subjects of which it is.
-            name: of what it is, in messages.
+            variables: internal names of its variables within subjects.
+            name: name of the contrast, for messages.
 
         Raises:
             InputError: too few subjects show it.
@@ -193,7 +193,7 @@ class Within:
         if not s:
             raise InputError(
                 f"In {self.design.formula!r} no {self.blocks} has shapes in all conditions that {label} needs; leave "
-                "it out, or classes that few have."
+                "it out, or leave out classes with few shapes."
             )
         terms, between = self._between(effects)
         first = np.array([np.flatnonzero(self.at == one)[0] for one in responses.subjects])
@@ -231,7 +231,7 @@ class Within:
     def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> Responses:
         """Return contrasts `target` (D, d) of the columns of the effects, each subject's in its model of some effects.
 
-        They are in the metric in which squares are those of the cells of the average subject, or as they are (`in_mm`).
+        They are scaled so that their squares are those of the cells of an average subject, or in mm (`in_mm`).
         """
         columns = columns_of_terms([self.effects.terms[effect] for effect in sorted(model)])
         values = self.effects.matrix[self.rows][:, columns]
@@ -257,10 +257,10 @@ class Within:
 
 
 def _weights(responses: Responses, matrix: FloatArray) -> FloatArray:
-    """Return the (s,) weights of subjects in a model (s, q) of their responses, 1 for all where they are as precise.
+    """Return the (s,) weights of subjects in a model (s, q) of their responses; 1 for all if they are equally precise.
 
-    The variance of a response is that between subjects plus that of its estimate. The share of the latter is the one of
-    `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), the same for all
+    The variance of a response is that between subjects plus that of its estimate. The share of the latter is the value
+    of `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), the same for all
     coordinates.
     """
     v = responses.variances
@@ -299,7 +299,7 @@ def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None
 
 
 def _reduced_effects(effects: Sequence[Term], effect: int, squares: str) -> list[int]:
-    """Return the effects beside which one is estimated, for a type of sums of squares."""
+    """Return the other effects in the model with which one is estimated, for a type of sums of squares."""
     others = range(1, effect) if squares == "I" else [one for one in range(1, len(effects)) if one != effect]
     return [one for one in others if squares != "II" or not effects[effect].factors < effects[one].factors]
 
@@ -311,8 +311,8 @@ class Strata:
     Args:
         every: with the terms that are tested in each.
         within: the effects within subjects; None where there are none.
-        notes: what was done, a sentence each.
-        warnings: what makes the tests less than they look, a sentence each.
+        notes: sentences on the tests.
+        warnings: sentences on limitations of the tests.
     """
 
     every: tuple[Stratum, ...]

@@ -1,7 +1,7 @@
 """Unequal group dispersion: a test for it, and statistics and null distributions that allow it.
 
 A permutation test of means assumes that residuals are exchangeable between groups. If the smaller group is more
-variable, it finds differences that are not there; if the larger group is, it misses differences. Here
+variable, it finds differences that do not exist; if the larger group is, it misses differences. Here
 
 - dispersions are compared by the distances of residuals to their group mean (Anderson, Biometrics 62, 2006), each
   divided by sqrt(1 - leverage) against the bias of small groups (Stier et al., Ecology 94, 2013);
@@ -30,12 +30,12 @@ from shapespace.types import FloatArray
 Codes: TypeAlias = npt.NDArray[np.intp]
 
 FEWEST_OF_GROUP = 5
-"""Subjects of a class below which the test with unequal variances exceeds 7 % false positives (docs/compare.md)."""
+"""Subjects per class below which the test with unequal variances has over 7 % false positives (docs/compare.md)."""
 _TIE = 1e-9
 _FULL_LEVERAGE = 1e-8
-"""Rows with 1 - leverage below this are fitted exactly, and have no residual."""
+"""Rows with 1 - leverage below this limit are fitted exactly, so their residual is zero."""
 _BATCH = 50
-"""Sign flips that are drawn from one seed."""
+"""Number of sign flips drawn from one seed."""
 _FLOOR = 1e-12
 
 
@@ -45,12 +45,12 @@ class DispersionTest:
 
     Args:
         variable: name of the variable.
-        stratum: in which residuals are taken; empty where there is one.
+        stratum: name of the stratum; empty if there is only one.
         groups: classes with two or more members.
         counts: members of each.
         stddev_mm: standard deviation of the shapes of each class about their mean, RMS over the vertices.
         f: F of the distances to the group mean.
-        p: share of permutations of the distances with an F as large.
+        p: share of permutations of the distances with an F at least as large.
         permutations: number of them, the observed one among them.
     """
 
@@ -70,7 +70,7 @@ class DispersionTest:
 
     @property
     def smaller_is_more_variable(self) -> bool | None:
-        """Whether smaller classes have the larger dispersion; None where size and dispersion are not related."""
+        """Whether smaller classes have the larger dispersion; None if size and dispersion are unrelated."""
         counts, spread = np.array(self.counts, dtype=np.float64), np.array(self.stddev_mm)
         together = float(((counts - counts.mean()) * (spread - spread.mean())).sum())
         return None if np.ptp(counts) == 0 or together == 0 else together < 0
@@ -87,7 +87,7 @@ def dispersion_test(
     seed: int,
     stratum: str = "",
 ) -> DispersionTest | None:
-    """Return whether classes differ in how far their members are from the mean of their class.
+    """Test equal dispersion of classes by the distances of their members from the class mean.
 
     Args:
         variable: name of the variable.
@@ -101,7 +101,7 @@ def dispersion_test(
         stratum: name of the stratum.
 
     Returns:
-        the test; None where fewer than two classes have two members each with a residual.
+        the test; None if fewer than two classes have two members with a residual each.
     """
     free = 1.0 - leverage > _FULL_LEVERAGE
     counts = np.bincount(codes[free], minlength=len(groups))
@@ -164,7 +164,7 @@ class UnequalVariances:
     seed: int
 
     def signs(self) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (start, factors (b, n)) by which residuals are multiplied, the same ones in each call; first are 1."""
+        """Yield (start, factors (b, n)) of the residuals, the same in each call; the first row is 1."""
         n = len(self.residual)
         for start in range(0, self.permutations, _BATCH):
             drawn = np.random.default_rng([self.seed, 4, start]).choice((-1.0, 1.0), (_BATCH, n))
@@ -197,7 +197,7 @@ class Estimate:
     """The size of an estimate and its variance, in sign flips of residuals.
 
     Args:
-        flips: of which model.
+        flips: sign flips of the residuals of the reduced model.
         along: (q, m) the estimate in the columns of `full`.
         weights: (n,) with which the squared residual of each row adds to its variance.
     """
@@ -230,8 +230,8 @@ class Estimate:
         """Return the (stop - start, v) statistics of v vertices in a part of the sign flips.
 
         Args:
-            columns: (K, v width) what the vertices take from the coefficients.
-            width: numbers of a vertex.
+            columns: (K, v width) from coefficients to values of the vertices.
+            width: number of values per vertex.
             start: of the sign flips.
             stop: of the sign flips.
         """
@@ -243,7 +243,7 @@ class Estimate:
         return explained / np.maximum(variance, _FLOOR * (self.weights @ squares) + 1e-300)
 
     def _squares(self, squares: FloatArray, start: int, stop: int) -> FloatArray:
-        """Return the (stop - start, v) weighted sums of squares of the flipped residuals, before any model."""
+        """Return the (stop - start, v) weighted sums of squares of the flipped residuals, before a model is fitted."""
         flipped = (self.weights * self.flips.scale**2) @ squares
         out = np.repeat(flipped[None], stop - start, axis=0)
         if start == 0:
@@ -270,7 +270,7 @@ def unequal_variances(
         shapes: (n, K) mm.
         full: (n, m) orthonormal columns of the whole model, the mean among them.
         reduced: (n, r) orthonormal columns of the model without what is tested; r may be 0.
-        groups: (n,) class of each row, whose variances may differ; None takes all rows alike in the reduced model.
+        groups: (n,) class of each row; variances may differ between classes. None for equal weights.
         permutations: number of sign flips, the observed data among them.
         seed: of these.
         where: name of the term, for messages.
@@ -314,14 +314,14 @@ def welch_flips(
     Args:
         maps: (N, V) of the subjects; each group has two or more.
         second: (N,) whether a subject is of the second group.
-        area: (V,) with which vertices count in the squared difference.
-        permutations: at most; all sign flips where they are no more.
-        seed: of random ones.
+        area: (V,) weights of the vertices in the squared difference.
+        permutations: largest number of sign flips; if there are no more, all of them are used.
+        seed: seed of random sign flips.
 
     Returns:
         t: (V,) as observed.
         arrangements: (2, P) the largest |t|, and the squared difference by its variance; the observed ones first.
-        every: whether these are all sign flips.
+        every: whether all sign flips were used.
     """
     n = len(maps)
     every = 2 ** (n - 1) <= permutations

@@ -19,7 +19,7 @@ EFFECT_SIZES: tuple[EffectSize, ...] = ("box-cox", "log")
 _LAMBDA_BOUNDS = (-2.0, 2.0)
 """Of the Box-Cox exponent, as in RRPP 2.1."""
 _LAMBDA_ZERO = 1e-3
-"""Exponents below this are the logarithm, as in RRPP 2.1."""
+"""Absolute exponents below this limit are replaced by the logarithm, as in RRPP 2.1."""
 _LAMBDA_TOLERANCE = 1e-5
 _SMALLEST = 1e-300
 
@@ -37,7 +37,7 @@ def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:
     values = np.maximum(np.asarray(statistic, dtype=np.float64), _SMALLEST)
     logs = np.log(values)
     exponent = box_cox_exponent(values[1:]) if kind == "box-cox" and len(values) > 1 else 0.0
-    # Divided by their geometric mean, values of any size have powers that are finite; Z is the same.
+    # Division by the geometric mean keeps powers finite and leaves Z unchanged.
     logs -= logs.mean()
     transformed = logs if exponent == 0 else np.expm1(exponent * logs) / exponent
     spread = float(transformed.std())
@@ -60,7 +60,7 @@ def box_cox_exponent(values: FloatArray) -> float:
         return 0.0
 
     def log_variance(exponent: float) -> float:
-        # Of values divided by their geometric mean, where the Jacobian of the transformation is 1.
+        # The values are divided by their geometric mean, so the Jacobian of the transformation is 1.
         powers = logs if abs(exponent) < _LAMBDA_ZERO else np.expm1(exponent * logs) / exponent
         return float(np.log(powers.var()))
 

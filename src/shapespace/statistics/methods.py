@@ -1,4 +1,4 @@
-"""Facts for a methods section: sample sizes, the space that is analysed, and tests of equal dispersion."""
+"""Content of a methods section: sample sizes, the analysed space, and tests of equal dispersion."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.schemas import Dispersion, Methods, SampleSize
 from shapespace.statistics.dispersion import DispersionTest
+
+SCAN_OF_SUBJECT = "scan of a subject"
+"""`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
 
 
 def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
@@ -60,7 +63,7 @@ def sample_sizes(
 
 
 def dispersion_record(test: DispersionTest, level: float) -> Dispersion:
-    """Return a test of equal dispersion as analysis.json has it.
+    """Return the record of a test of equal dispersion in analysis.json.
 
     Args:
         test: the test.

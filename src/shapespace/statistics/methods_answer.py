@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from shapespace.schemas import Dispersion, Methods, Part, TableColumn, TablePart, TestScheme, TextPart
 from shapespace.statistics.dispersion import FEWEST_OF_GROUP
+from shapespace.statistics.methods import SCAN_OF_SUBJECT
 
 _SOURCES = {
     "coefficients": "coefficients of the model of the fits",
@@ -136,8 +137,13 @@ def scheme_text(test: TestScheme) -> str:
         if test.reduced_model
         else "residuals of the mean"
     )
-    verb = "permuted between" if test.resampling == "permutation" else "with signs flipped by"
-    return f"{what} {verb} {test.unit}{'s' if test.resampling == 'permutation' else ''}{every}"
+    if test.resampling == "sign flips":
+        return f"{what} with signs flipped by {test.unit}{every}"
+    difference, _, whole = test.unit.partition(" within a ")
+    scope = f"of {difference}s permuted within {whole}s" if whole else f"permuted between {test.unit}s"
+    if test.unit == SCAN_OF_SUBJECT:
+        scope = "permuted within subjects, and between subjects with the same number of scans"
+    return f"{what} {scope}{every}"
 
 
 def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: str) -> str:
@@ -161,7 +167,7 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
             f"({details})."
         )
     if one.equal:
-        return f"Dispersion: unequal dispersion is not shown ({details})."
+        return f"No significant difference of dispersion ({details})."
     if unequal_variances:
         return f"Dispersion is unequal ({details}); the tests of means allow for it."
     effect = {
@@ -189,10 +195,10 @@ def effect_size_sentence(kind: str) -> str:
 
 
 def multiplicity_sentence(methods: Methods) -> str:
-    """Return over what p values are corrected, and over what they are not."""
+    """Return a sentence on the correction of p values for multiple testing."""
     if not methods.corrected_over:
         return "Multiple testing: no p value is corrected for the number of tests, maps or analyses."
     return (
-        f"Multiple testing: p values are corrected only over {'; over '.join(methods.corrected_over)}. Nothing is "
-        "corrected over the number of terms, maps or analyses."
+        f"Multiple testing: p values are corrected only over {'; over '.join(methods.corrected_over)}, not over the "
+        "number of terms, maps or analyses."
     )

@@ -1,7 +1,7 @@
-"""Estimated vertices in results: how much each vertex is worth as evidence, and the account of estimates in an answer.
+"""Estimated vertices in results: weights of vertices by their observations, and the share of estimates in reports.
 
-An estimate follows from the observed vertices of its shape and from the other shapes, so it is no observation of its
-own: maps weight each vertex by the information that its observations carry, and leave it blank below a half.
+An estimate is computed from the observed vertices of its shape and from the other shapes, so it is not an additional
+observation. Maps weight each vertex by the information in its observations, and are blank where that is below a half.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shapespace.statistics.answer import Answer, Rows
 from shapespace.types import BoolArray, FloatArray
 
 LEAST_INFORMATION = 0.5
-"""Share of the information below which a map is blank: as many shapes as a model needs at a vertex (`MIN_SEEN`)."""
+"""Share of the information below which a map is blank; the share of shapes that a model needs (`MIN_SEEN`)."""
 FILE = "observed.csv"
 _ESTIMABLE = 1e-6
 _BLOCK = 4096
@@ -26,7 +26,7 @@ _LISTED = 10
 
 
 def information(cohort: Cohort, matrix: FloatArray, contrasts: FloatArray) -> FloatArray | None:
-    """Return how much of the information on each contrast the shapes that observe a vertex carry.
+    """Return the share of the information on each contrast in the shapes that observe a vertex.
 
     It is the variance of the least-squares estimate of the contrast by all shapes, divided by that by the shapes that
     observe the vertex; 0 where these do not determine it, and at vertices that are not analysed.
@@ -80,7 +80,7 @@ def blank_where(values: FloatArray, blank: BoolArray | None) -> FloatArray:
     return values if blank is None else np.where(blank, np.nan, values)
 
 
-def told_blank(count: int, total: int) -> str:
+def blank_sentence(count: int, total: int) -> str:
     """Return a sentence on how many vertices of a map are blank; empty for none."""
     if not count:
         return ""
@@ -116,7 +116,7 @@ def _percent(share: float) -> str:
 
 
 def shape_settings(cohort: Cohort) -> dict[str, Any]:
-    """Return what analysis.json states about the source of the shapes and about estimated vertices."""
+    """Return the entries of analysis.json on the source of the shapes and on estimated vertices."""
     source, share = cohort.source, cohort.estimated_share
     out: dict[str, Any] = {"shape_source": source.kind}
     if source.modes is not None:
@@ -133,7 +133,7 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
 
 
 def with_shape_data(answer: Answer, cohort: Cohort) -> Answer:
-    """Return an answer that states the source of its shapes, and how much of them is estimated, shape by shape."""
+    """Return an answer with the source of its shapes and the share of estimated vertices of each shape."""
     share = cohort.estimated_share
     stated = replace(
         answer,

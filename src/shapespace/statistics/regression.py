@@ -18,7 +18,7 @@ from shapespace.late import late
 from shapespace.reprs import listed_briefly, told_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
-from shapespace.statistics.methods import methods_of
+from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
 from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.statistics.smoothers import (
     CHOICES,
@@ -50,7 +50,7 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """How well a number can be told from shape, and how.
+    """A regression of a number on shape, with its cross-validated accuracy.
 
     Args:
         cohort: the N shapes.
@@ -116,17 +116,16 @@ class Regression:
     @cached_property
     def methods(self) -> Methods:
         """Sample sizes, tests and assumptions."""
-        tests = (
-            (TestScheme(tested=("R²",), statistic="R²", reduced_model=None, arrangements=1 + self.permutations),)
-            if self.permutations
-            else ()
-        )
+        permutation = TestScheme(
+            tested=("R²",), statistic="R²", reduced_model=None, arrangements=1 + self.permutations,
+            unit="subject" if _is_constant(self.subjects, self.observed) else SCAN_OF_SUBJECT,
+        )  # fmt: skip
         intervals = TestScheme(
             tested=("intervals of R², errors, slope and coverage",), statistic="percentiles", resampling="bootstrap",
             reduced_model=None, arrangements=self.draws,
         )  # fmt: skip
         return methods_of(
-            self.cohort, self.n_subjects, tests=(*tests, intervals),
+            self.cohort, self.n_subjects, tests=(permutation, intervals) if self.permutations else (intervals,),
             assumptions=(
                 f"{self.target} is predicted by {self.choice.words()}, chosen in an inner cross-validation; all "
                 f"figures are of subjects left out in {self.folds} folds. R² is that of these predictions against the "
@@ -158,11 +157,11 @@ class Regression:
         return late("answer_of_regression")(self, new)
 
     def __repr__(self) -> str:
-        told = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
+        figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
         tested = [] if self.p is None else [f"p {self.p:.3g}"]
         return (
             f"<Regression of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} subjects; "
-            f"{listed_briefly([*tested, *told])}>"
+            f"{listed_briefly([*tested, *figures])}>"
         )
 
     def _repr_html_(self) -> str:
@@ -452,7 +451,7 @@ def _p_of(
 
 
 def _permuted(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the targets (N,) permuted between subjects; see `permutation_scheme`."""
+    """Return the targets (N,) permuted between subjects, and within them if they vary; see `permutation_scheme`."""
     counts = np.bincount(codes)
     rows = [np.flatnonzero(codes == subject) for subject in range(len(counts))]
     if not any(np.ptp(y[own]) for own in rows):
@@ -462,26 +461,29 @@ def _permuted(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> Flo
         alike = np.flatnonzero(counts == count)
         for to, source in zip(alike, rng.permutation(alike), strict=True):
             given = rows[int(source)]
-            # Where all subjects have the same targets, exchanges between subjects alone would change nothing.
+            # If all subjects have the same targets, exchanges between subjects alone have no effect.
             order[rows[to]] = rng.permutation(given) if np.ptp(y[given]) else given
     return y[order]
+
+
+def _is_constant(subjects: Sequence[str], y: FloatArray) -> bool:
+    """Return whether all scans of each subject have the same target."""
+    return len(set(zip(subjects, y.tolist(), strict=True))) == len(set(subjects))
 
 
 def permutation_scheme(subjects: Sequence[str], y: FloatArray) -> str:
     """Return in a sentence which targets are exchanged under the null hypothesis of no relation with shape.
 
     Args:
-        subjects: (N,) whose each row is.
+        subjects: (N,) the subject of each row.
         y: (N,) targets.
     """
-    own: dict[str, list[float]] = {}
-    for name, value in zip(subjects, y.tolist(), strict=True):
-        own.setdefault(name, []).append(value)
-    if all(len(set(values)) == 1 for values in own.values()):
-        return f"The permutations exchange the targets of all {len(own)} subjects."
-    partners = Counter(len(values) for values in own.values())
-    alone = sum(partners[len(values)] == 1 for values in own.values())
-    rest = f"; {alone} of {len(own)} subjects have no such partner" if alone else ""
+    scans = Counter(subjects)
+    if _is_constant(subjects, y):
+        return f"The permutations exchange the targets of all {len(scans)} subjects."
+    partners = Counter(scans.values())
+    alone = sum(partners[count] == 1 for count in scans.values())
+    rest = f"; {alone} of {len(scans)} subjects have no such partner" if alone else ""
     return (
         "The target varies within subjects: the permutations exchange the targets of subjects with the same number of "
         f"scans, and the targets within each subject{rest}."
@@ -491,7 +493,7 @@ def permutation_scheme(subjects: Sequence[str], y: FloatArray) -> str:
 def _percentiles(
     y: FloatArray, codes: IndexArray, share: FloatArray, percent: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return percentiles of a target to which each subject contributes once, linear between its distinct values.
+    """Return percentiles of a target in which each subject counts once, linear between its distinct values.
 
     With one value for each subject they are those of `np.percentile`.
     """

@@ -91,7 +91,8 @@ def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple
         f"R² = {m['r2'].value:.2f} ({_span(m['r2'])})" + ("." if found.p is None else f", p = {found.p:.2g}."),
         f"{level} intervals are {m['width'].value:.3g} wide on average, and hold {100 * m['coverage'].value:.0f} % of "
         f"the subjects left out; the observed rises by {m['slope'].value:.2f} ({_span(m['slope'])}) for one predicted.",
-        f"It goes by {found.choice.words()}, {found.effective:.1f} degrees of freedom for {found.n_subjects} subjects.",
+        f"The predictor uses {found.choice.words()}, {found.effective:.1f} degrees of freedom for {found.n_subjects} "
+        "subjects.",
     ]
     if len(found.cohort) > found.n_subjects:
         sentences.append(
@@ -152,7 +153,7 @@ def _measures(found: Regression) -> TablePart:
     return TablePart(
         title="On subjects left out", columns=columns, rows=tuple(rows),
         note=f"Nested cross-validation in {found.folds} folds of subjects, each of whom counts once; {level} "
-        "intervals by drawing subjects anew.",
+        "intervals by bootstrap of subjects.",
     )  # fmt: skip
 
 
@@ -188,7 +189,7 @@ def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
             note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
         ),
         SurfaceMapPart(
-            title=f"What one unit of {found.target} does", arrays=_FILE, values="per_unit_mm",
+            title=f"Change of shape for one unit of {found.target}", arrays=_FILE, values="per_unit_mm",
             unit=Lengths(found.cohort.unit).of_map,
             note="Along the normals of the mean; shapespace compare tests where this is more than chance.",
         ),

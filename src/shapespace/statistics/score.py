@@ -1,7 +1,7 @@
 """Where new subjects lie in a reference population: distances, percentiles, maps, and what lies outside of it.
 
-Each of the reference's people is left out in turn and measured by the others as a new subject is, so that the
-percentiles hold whatever the distances are distributed like (Vovk, Gammerman and Shafer, Algorithmic Learning in a
+Each subject of the reference is left out in turn and measured by the others in the same way as a new subject, so that
+the percentiles are valid for any distribution of the distances (Vovk, Gammerman and Shafer, Algorithmic Learning in a
 Random World, 2005; with refitting, Barber et al., Annals of Statistics 49(1), 2021).
 """
 
@@ -45,7 +45,7 @@ class ScoreOptions:
     Args:
         modes: of the reference, by which distances are measured; None takes those of 95 % of its variance, at most one
             for five people.
-        subject: column of both tables that says who is scanned; None takes each scan for another person.
+        subject: column of the subjects in both tables; None if each scan is of another subject.
         nearest: how many of the reference are named for each subject.
         draws: of the reference as it would look if it were seen as badly as a subject is.
         seed: of the draws.
@@ -150,13 +150,13 @@ class Scores:
             self.subjects, len(self.names), dimensions=self.modes, analysed_variance_ratio=self.variance_share,
             sizes=sizes,
             tests=(
-                TestScheme(tested=("percentiles",), statistic="Mahalanobis distance", unit="person",
+                TestScheme(tested=("percentiles",), statistic="Mahalanobis distance",
                            resampling="leave-one-out"),
                 TestScheme(tested=("p (F)",), statistic="Mahalanobis distance", resampling="none"),
             ),
             corrected_over=("the vertices of a map (limit of |z|)",),
             assumptions=(
-                "Percentiles leave each person of the reference out in turn and assume no distribution; p by the F "
+                "Percentiles leave each subject of the reference out in turn and assume no distribution; p by the F "
                 "distribution assumes normal shapes. z of vertices and sizes are standard deviations of the reference, "
                 "not effect sizes.",
             ),
@@ -167,12 +167,12 @@ class Scores:
         return late("answer_of_scores")(self)
 
     def __repr__(self) -> str:
-        told = listed_briefly(
+        percentiles = listed_briefly(
             [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
         )
         return (
             f"<Scores of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
-            f"{self.modes} modes; {told}>"
+            f"{self.modes} modes; {percentiles}>"
         )
 
     def _repr_html_(self) -> str:
@@ -293,8 +293,8 @@ def _people(reference: Cohort, column: str | None) -> IntArray:
     count = int(codes.max()) + 1
     if count < FEWEST_PEOPLE:
         raise InputError(
-            f"A reference of {count} {'shapes' if column is None else 'subjects'} is too small to tell what is usual; "
-            f"give {FEWEST_PEOPLE} or more, better {SMALL} and more."
+            f"A reference of {count} {'shapes' if column is None else 'subjects'} is too small to estimate the "
+            f"variation; give {FEWEST_PEOPLE} or more, better {SMALL} and more."
         )
     return codes.astype(np.int32)
 
@@ -308,7 +308,7 @@ def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
     most = min(there, count - 3)
     if wanted is not None:
         if not 1 <= wanted <= most:
-            raise InputError(f"A reference of {count} subjects has 1 to {most} modes to measure by, not {wanted}.")
+            raise InputError(f"A reference of {count} subjects has 1 to {most} modes, not {wanted}.")
         return wanted
     enough = int(np.searchsorted(np.cumsum(variance) / variance.sum(), _SHARE)) + 1
     return max(1, min(enough, count // _PEOPLE_PER_MODE, most))
@@ -328,7 +328,7 @@ def _in_basis_of(reference: Cohort, subjects: Cohort) -> tuple[FloatArray, Float
 def _refuse_known(
     reference: Cohort, subjects: Cohort, own: FloatArray, outside: FloatArray, column: str | None
 ) -> None:
-    """Refuse subjects who are in the reference, as scans or as people."""
+    """Refuse subjects whose scans, or other scans of them, are in the reference."""
     apart = cdist(own, reference.coefficients)
     near = np.sqrt(apart.min(axis=1) ** 2 + outside) < _SAME * centroid_size(reference.reference)
     if near.any():
@@ -542,8 +542,8 @@ def _on_size(people: int) -> list[str]:
         return []
     step = 100 / (people + 1)
     return [
-        f"The reference is small: with {people} subjects shares come in steps of {step:.0f} %, and what is usual is "
-        "known roughly."
+        f"The reference is small: with {people} subjects shares come in steps of {step:.0f} %, and the usual variation "
+        "is known only roughly."
     ]
 
 

@@ -35,7 +35,7 @@ def answer_of_scores(scores: Scores) -> Answer:
     many = len(scores.names) != 1
     answer = Answer(
         question="score",
-        title=f"{f'{len(scores.names)} subjects' if many else scores.names[0]} beside a reference of {scores.people}",
+        title=f"{f'{len(scores.names)} subjects' if many else scores.names[0]} against a reference of {scores.people}",
         summary=tuple(_sentence(scores, k) for k in shown[:_MOST_TOLD]),
         parts=tuple(parts),
         tables=tables,
@@ -79,7 +79,7 @@ def _how(scores: Scores) -> tuple[str, ...]:
     limit = (
         f"Of 95 % of the reference's subjects no vertex lies beyond {scores.z_limit:.1f} standard deviations."
         if math.isfinite(scores.z_limit)
-        else "With fewer than 19 subjects in the reference, how far out single vertices lie by chance is not known."
+        else "With fewer than 19 subjects in the reference, the limit of |z| for single vertices cannot be estimated."
     )
     unsure = "" if scores.subjects.fitted is None else " and each fit's own uncertainty"
     return (

@@ -1,4 +1,4 @@
-"""`shapespace change`: what changed between the visits of each subject."""
+"""`shapespace change`: the change between the visits of each subject."""
 
 from __future__ import annotations
 
@@ -16,30 +16,37 @@ if TYPE_CHECKING:
 def add(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_cohort(sub)
-    sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whose scan it is (default: subject)")
+    sub.add_argument("--subject", default="subject", metavar="COLUMN",
+                     help="column of the subjects (default: subject)")  # fmt: skip
     sub.add_argument("--time", metavar="COLUMN",
-                     help="when: numbers, dates (2026-05-31) or words (default: time, visit or date)")  # fmt: skip
-    sub.add_argument("--order", type=_words, metavar="LIST", help="of times that are words, such as before,after")
+                     help="column of the times: numbers, dates (2026-05-31) or words (default: time, visit or "
+                     "date)")  # fmt: skip
+    sub.add_argument("--order", type=_words, metavar="LIST",
+                     help="order of times that are words, such as before,after")  # fmt: skip
     sub.add_argument("--stable", default="auto", metavar="WHAT",
-                     help="what did not change: auto finds it, all, a region of the model, a file of vertices, or "
-                     "landmarks:NAME,NAME and a radius in mm (default: auto)")  # fmt: skip
+                     help="the part that did not change, by which visits are aligned: auto (detected), all, a region "
+                     "of the model, a file of vertices, or landmarks:NAME,NAME and a radius in mm (default: "
+                     "auto)")  # fmt: skip
     sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
-                     help="a part whose volume is told too: a CSV file of vertices; can be repeated (default: the "
-                     "regions of the model)")  # fmt: skip
+                     help="a region whose volume is also reported: a CSV file of vertices; can be repeated (default: "
+                     "the regions of the model)")  # fmt: skip
     sub.add_argument("--landmarks", type=Path, metavar="FILE",
                      help="CSV of name,vertex, or landmarks.csv of shapespace correspond (default: those of the "
                      "model)")  # fmt: skip
-    sub.add_argument("--group", metavar="COLUMN", help="two groups whose changes are compared")
+    sub.add_argument("--group", metavar="COLUMN",
+                     help="column of two groups whose changes are compared")  # fmt: skip
     sub.add_argument("--unequal-variances", action="store_true",
-                     help="of --group: allow one to vary more than the other (Welch's t, sign flips)")  # fmt: skip
-    sub.add_argument("--rate", action="store_true", help="mm per unit of time in the group, not last minus first")
-    sub.add_argument("--permutations", type=int, default=1000, metavar="N", help="of the tests (default 1000)")
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the tests (default 0)")
+                     help="with --group: allow groups of unequal dispersion (Welch's t, sign flips)")  # fmt: skip
+    sub.add_argument("--rate", action="store_true",
+                     help="analyse mm per unit of time instead of last minus first visit")  # fmt: skip
+    sub.add_argument("--permutations", type=int, default=1000, metavar="N",
+                     help="number of permutations (default 1000)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the permutations (default 0)")
     sub.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Answer, and write the report."""
+    """Measure the changes, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.io.regions import read_region
     from shapespace.statistics.change import change

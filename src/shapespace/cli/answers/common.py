@@ -1,4 +1,4 @@
-"""What the commands about cohorts share: their arguments, the cohort that these name, and how an answer is told."""
+"""What the commands about cohorts share: arguments, reading the cohort, and printing of the results."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
 def add_cohort(sub: argparse.ArgumentParser, surfaces: str = "auto") -> None:
     """Add the arguments that name a cohort, and where the answer is written; `surfaces` is a default."""
     sub.add_argument("data", type=Path, metavar="DATA",
-                     help="a table (CSV or .xlsx) whose column file, scan, specimen, name or id names a shape in each "
-                     "row; or a folder of fits, whose metadata are the table")  # fmt: skip
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="where to write")
+                     help="a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, "
+                     "name or id; or a folder of fits, whose metadata are the table")  # fmt: skip
+    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
     sub.add_argument("--shapes", type=Path, metavar="DIR",
                      help="results of fits, or meshes in correspondence (default: the folder of DATA)")  # fmt: skip
-    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="of the fits, where it was moved")
+    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="model of the fits, if its file was moved")
     sub.add_argument("--surfaces", choices=("auto", "coefficients", "fitted", "dense"), default=surfaces,
-                     help="shapes of fits: auto takes dense surfaces where all fits have one, else coefficients "
+                     help="shapes of fits: auto uses dense surfaces if all fits have one, otherwise coefficients "
                      f"(default: {surfaces})")  # fmt: skip
-    sub.add_argument("--doubtful", action="store_true", help="take doubtful fits too (default: left out and counted)")
+    sub.add_argument("--doubtful", action="store_true", help="include doubtful fits (default: excluded)")
     sub.add_argument("--drop-missing", action="store_true",
-                     help="leave out shapes of which something is missing in the table (default: refused)")  # fmt: skip
+                     help="exclude shapes with missing values in the table (default: an error)")  # fmt: skip
 
 
 def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
     """Add the choice between shapes and forms."""
     sub.add_argument("--gauge", choices=("form", "shape"), default=default,
-                     help=f"form keeps size, shape divides it out (default {default})")  # fmt: skip
+                     help=f"form keeps size, shape divides size out (default {default})")  # fmt: skip
     sub.add_argument("--no-unit", action="store_true",
                      help="the coordinates have no unit: lengths are not written in mm")  # fmt: skip
 
@@ -43,13 +43,13 @@ def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
 def cohort_of(
     arguments: argparse.Namespace, gauge: Gauge | None = None, onto: Cohort | None = None, *, least: int = 2
 ) -> Cohort:
-    """Return the cohort that `add_cohort` asked for.
+    """Return the cohort that the arguments of `add_cohort` name.
 
     Args:
-        arguments: with what `add_cohort` added.
-        gauge: stands for `add_gauge` where a command has no choice.
-        onto: a cohort that it is to be compared with.
-        least: how many shapes there must be, where `onto` is None.
+        arguments: parsed arguments, with those of `add_cohort`.
+        gauge: of a command without the argument of `add_gauge`.
+        onto: a cohort that this one is compared with.
+        least: the smallest number of shapes, if `onto` is None.
     """
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortOptions, read_cohort
@@ -63,7 +63,7 @@ def cohort_of(
 
 
 def finish(answer: Answer, arguments: argparse.Namespace) -> int:
-    """Write the answer and its report, and tell of it."""
+    """Write the answer and its report, and print the summary."""
     from shapespace.commands.answers import keep_answer
     from shapespace.schemas import to_json
 
@@ -71,8 +71,8 @@ def finish(answer: Answer, arguments: argparse.Namespace) -> int:
     for note in notes:
         say(note)
     if arguments.json:
-        told = to_json(answer.analysis())
-        show_json({"folder": str(arguments.output), "report": None if report is None else str(report), **told})
+        analysis = to_json(answer.analysis())
+        show_json({"folder": str(arguments.output), "report": None if report is None else str(report), **analysis})
         return 0
     for sentence in answer.summary:
         show(sentence)

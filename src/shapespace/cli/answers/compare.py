@@ -1,4 +1,4 @@
-"""`shapespace compare`: do groups differ, and with what."""
+"""`shapespace compare`: linear models of shape on groups and covariates."""
 
 from __future__ import annotations
 
@@ -11,24 +11,29 @@ def add(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_cohort(sub)
     sub.add_argument("--formula", required=True, metavar="FORMULA",
-                     help="what explains shape, such as '~ sex + age'; size and log_size are known too")  # fmt: skip
-    sub.add_argument("--blocks", metavar="COLUMN", help="says whose scans are repeated ones, such as subject")
+                     help="linear model of shape, such as '~ sex + age'; size and log_size are available "
+                     "too")  # fmt: skip
+    sub.add_argument("--blocks", metavar="COLUMN",
+                     help="column of the subjects, if subjects have several scans")  # fmt: skip
     sub.add_argument("--random", metavar="TERMS",
-                     help="which effects within subjects differ between subjects, such as '1 + time | subject'; with "
-                     "--blocks all of them do")  # fmt: skip
+                     help="random effects: those within subjects that differ between subjects, such as '1 + time | "
+                     "subject' (default with --blocks: all)")  # fmt: skip
     sub.add_argument("--type", choices=("I", "II", "III"), default="II", dest="squares",
-                     help="of sums of squares (default II: after all terms that do not contain it)")  # fmt: skip
+                     help="type of the sums of squares (default II: each term after all terms that do not contain "
+                     "it)")  # fmt: skip
     sub.add_argument("--permutations", type=int, default=1000, metavar="N",
-                     help="arrangements, the observed one among them (default 1000)")  # fmt: skip
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the arrangements")
-    sub.add_argument("--level", type=float, default=0.05, metavar="P", help="of significance (default 0.05)")
+                     help="number of permutations, including the observed data (default 1000)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the permutations (default 0)")
+    sub.add_argument("--level", type=float, default=0.05, metavar="P", help="level of significance (default 0.05)")
     sub.add_argument("--unequal-variances", action="store_true",
-                     help="allow classes of unequal dispersion (by a variance for each subject)")  # fmt: skip
+                     help="allow classes of unequal dispersion: a variance for each subject, and sign "
+                     "flips")  # fmt: skip
     sub.add_argument("--effect-size", choices=("box-cox", "log"), default="box-cox",
-                     help="transformation of F before Z is standardised (default box-cox, as in RRPP)")  # fmt: skip
-    sub.add_argument("--no-maps", action="store_true", help="do not test each vertex")
+                     help="transformation of F in the effect size Z (default box-cox, as in RRPP)")  # fmt: skip
+    sub.add_argument("--no-maps", action="store_true", help="skip the tests of each vertex")
     sub.add_argument("--bumps", type=float, metavar="MM",
-                     help="of fits: also seek bumps of this width beside how shapes vary anyway")  # fmt: skip
+                     help="of fits: also search for bumps of this width beyond the variation between "
+                     "shapes")  # fmt: skip
     add_gauge(sub)
     sub.set_defaults(run=run)
 

@@ -1,4 +1,4 @@
-"""`shapespace recognise verify` and `shapespace recognise identify`: who is it."""
+"""`shapespace recognise verify` and `shapespace recognise identify`: identity of the subject of a scan."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def add_verify(sub: argparse.ArgumentParser) -> None:
     """Add the arguments of verification."""
     _add_who(sub)
     sub.add_argument("--curve", type=_counts, default=(), metavar="K,K,...",
-                     help="find the equal error rate for these numbers of modes too")  # fmt: skip
-    sub.add_argument("--by", metavar="COLUMN", help="figures for each value of this column of the probes")
+                     help="also compute the equal error rate for these numbers of modes")  # fmt: skip
+    sub.add_argument("--by", metavar="COLUMN", help="also report results for each value of this column of the probes")
     sub.set_defaults(run=run_verify)
 
 
@@ -29,7 +29,7 @@ def add_identify(sub: argparse.ArgumentParser) -> None:
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
-    """Are two scans of one person."""
+    """Verify whether two scans are of one subject."""
     from shapespace.batch.progress import steps
     from shapespace.statistics.identity.verify import verify
 
@@ -40,7 +40,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def run_identify(arguments: argparse.Namespace) -> int:
-    """Which of the people enrolled does a scan show."""
+    """Identify the subject of a scan among the enrolled ones."""
     from shapespace.batch.progress import steps
     from shapespace.statistics.identity.identify import identify
 
@@ -52,24 +52,27 @@ def run_identify(arguments: argparse.Namespace) -> int:
 
 def _add_who(sub: argparse.ArgumentParser) -> None:
     add_cohort(sub, "coefficients")
-    sub.add_argument("--subject", default="subject", metavar="COLUMN", help="whom a scan shows (default: subject)")
+    sub.add_argument("--subject", default="subject", metavar="COLUMN",
+                     help="column of the subjects (default: subject)")  # fmt: skip
     sub.add_argument("--gallery", metavar="EXPR",
-                     help="who is enrolled, such as expression=neutral or session!=2,3 (default: all against all; of "
-                     "identify the first scan of each subject)")  # fmt: skip
-    sub.add_argument("--probe", metavar="EXPR", help="who is searched for (default: all others)")
-    sub.add_argument("--train", metavar="EXPR", help="who is learned from (default: the subjects of other folds)")
+                     help="scans to enrol, such as expression=neutral or session!=2,3 (default: verify compares all "
+                     "scans with all, identify enrols the first scan of each subject)")  # fmt: skip
+    sub.add_argument("--probe", metavar="EXPR", help="scans to compare with the gallery (default: all others)")
+    sub.add_argument("--train", metavar="EXPR", help="training scans (default: the subjects of the other folds)")
     sub.add_argument("--role", metavar="COLUMN",
-                     help="that says gallery, probe or train instead (default: role, if there is one)")  # fmt: skip
+                     help="column with gallery, probe or train for each scan, instead of expressions (default: role, "
+                     "if the table has it)")  # fmt: skip
     sub.add_argument(
-        "--folds", type=int, metavar="N", help="parts of the subjects, each tested by the others (default 4)"
+        "--folds", type=int, metavar="N", help="folds of subjects; the others train the scores (default 4)"
     )
     sub.add_argument("--scores", type=_names, metavar="LIST",
-                     help="plda, cosine, mahalanobis or distance, first the one that is told of first "
+                     help="scores among plda, cosine, mahalanobis and distance; the summary reports the first "
                      "(default: all)")  # fmt: skip
-    sub.add_argument("--modes", type=int, metavar="K", help="leading coefficients of identity (default: all)")
-    sub.add_argument("--no-uncertainty", action="store_true", help="take all fits for exact")
-    sub.add_argument("--draws", type=int, default=1000, metavar="N", help="of subjects, for intervals (default 1000)")
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="of folds and draws (default 0)")
+    sub.add_argument("--modes", type=int, metavar="K", help="number of leading coefficients to use (default: all)")
+    sub.add_argument("--no-uncertainty", action="store_true", help="ignore the uncertainty of the fits")
+    sub.add_argument("--draws", type=int, default=1000, metavar="N",
+                     help="bootstrap draws of subjects, for intervals (default 1000)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of folds and draws (default 0)")
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:

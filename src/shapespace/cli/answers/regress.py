@@ -1,4 +1,4 @@
-"""`shapespace regress`: what number goes with a shape?"""
+"""`shapespace regress`: regression of a number, such as age, on shape."""
 
 from __future__ import annotations
 
@@ -13,22 +13,26 @@ def add(sub: argparse.ArgumentParser) -> None:
     add_cohort(sub)
     add_gauge(sub)
     what = sub.add_mutually_exclusive_group(required=True)
-    what.add_argument("--target", metavar="COLUMN", help="the number to learn")
+    what.add_argument("--target", metavar="COLUMN", help="column of the number to predict")
     what.add_argument("--predictor", type=Path, metavar="FILE.npz",
-                      help="predict DATA by what an earlier run learned (its predictor.npz)")  # fmt: skip
+                      help="predict DATA with the predictor.npz of an earlier run")  # fmt: skip
     sub.add_argument("--predict", type=Path, metavar="NEW",
-                     help="table or folder of new shapes, of other subjects, to predict")  # fmt: skip
-    sub.add_argument("--new-shapes", type=Path, metavar="DIR", help="results or meshes of NEW (default: its folder)")
-    sub.add_argument("--subject", metavar="COLUMN", help="who a shape is of (default: subject)")
-    sub.add_argument("--folds", type=int, default=10, metavar="K", help="of the outer cross-validation (default 10)")
-    sub.add_argument("--permutations", type=int, default=199, metavar="P", help="for p (default 199)")
-    sub.add_argument("--level", type=float, default=0.9, metavar="L", help="of intervals (default 0.9)")
-    sub.add_argument("--seed", type=int, default=0, metavar="S")
+                     help="also predict new shapes, of other subjects: a table or a folder")  # fmt: skip
+    sub.add_argument("--new-shapes", type=Path, metavar="DIR",
+                     help="results of fits, or meshes, of NEW (default: its folder)")  # fmt: skip
+    sub.add_argument("--subject", metavar="COLUMN", help="column of the subjects (default: subject)")
+    sub.add_argument("--folds", type=int, default=10, metavar="K",
+                     help="folds of the outer cross-validation (default 10)")  # fmt: skip
+    sub.add_argument("--permutations", type=int, default=199, metavar="P",
+                     help="number of permutations for p (default 199)")  # fmt: skip
+    sub.add_argument("--level", type=float, default=0.9, metavar="L",
+                     help="coverage of prediction intervals (default 0.9)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of folds and draws (default 0)")
     sub.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn a number from shape and predict it, and keep the answer."""
+    """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.read import CohortOptions, read_cohort

@@ -17,7 +17,8 @@ def add(sub: argparse.ArgumentParser) -> None:
                      help="its results of fits, or meshes (default: the folder of the reference)")  # fmt: skip
     sub.add_argument("--modes", type=int, metavar="N",
                      help="of the reference (default: of 95 %% of its variance, one for five subjects)")  # fmt: skip
-    sub.add_argument("--subject", metavar="COLUMN", help="says who is scanned, where subjects have several scans")
+    sub.add_argument("--subject", metavar="COLUMN",
+                     help="column of the subjects, if subjects have several scans")  # fmt: skip
     sub.add_argument("--nearest", type=int, default=3, metavar="N", help="of the reference to name (default 3)")
     sub.add_argument("--seed", type=int, default=0, metavar="S", help="of the draws of uncertain fits")
     add_gauge(sub)

@@ -388,7 +388,7 @@
         bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey is what the fit does not follow on the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: parts of the scan without a match." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
         said.hidden = !said.textContent;
       }
 
@@ -457,7 +457,7 @@
         }));
       }
       controls.append(
-        make("div", { class: "ss-sliders", role: "group", "aria-label": "What is seen, and how opaque" }, ...[scan && scan.row, model.row].filter(Boolean)),
+        make("div", { class: "ss-sliders", role: "group", "aria-label": "Visibility and opacity" }, ...[scan && scan.row, model.row].filter(Boolean)),
         select("Colour", maps, state.map, (key) => {
           state.map = key;
           // The coloured surface is seen alone; the sliders bring the other one back.

@@ -183,7 +183,7 @@ def histogram_figure(
     observed_label: str = "",
     title: str = "",
 ) -> Figure:
-    """Draw how values are spread, with a line at one of them.
+    """Draw a histogram, with a line at one value.
 
     Args:
         edges: (n + 1,) rising.
@@ -201,7 +201,7 @@ def histogram_figure(
         raise InputError(f"A histogram needs 2 to {_MOST_BINS} edges that rise.")
     if not 1 <= len(series) <= _MOST_SERIES:
         raise InputError(f"A histogram has 1 to {_MOST_SERIES} series, not {len(series)}.")
-    figure, axes = chart(title or f"How {plain(x)} is spread", height=3.0)
+    figure, axes = chart(title or f"Distribution of {plain(x)}", height=3.0)
     for k, (name, counts) in enumerate(series):
         many = np.asarray(counts, dtype=np.float64)
         if many.shape != (len(ends) - 1,) or not np.isfinite(many).all() or (many < 0).any():

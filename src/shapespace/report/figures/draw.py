@@ -64,7 +64,7 @@ _Item = TypeVar("_Item")
 
 
 class ShownFigure(Figure):
-    """A figure that shows itself once as the value of a notebook's cell, also where pyplot was never imported."""
+    """A figure that is displayed once as the value of a notebook's cell, also without pyplot."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()

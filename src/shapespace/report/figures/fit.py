@@ -340,7 +340,7 @@ def z_stddev(fit: StagedFit) -> FloatArray:
 
 
 def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
-    """Draw the scan beside the parts of the model that followed it, were rejected, lay at its border or unseen.
+    """Draw the scan next to the model, whose regions are coloured: matched, rejected, at the border, unobserved.
 
     Raises:
         InputError: the regions were not saved.

@@ -130,8 +130,8 @@ class Identification:
         return late("answer_of_identification")(self)
 
     def __repr__(self) -> str:
-        told = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
-        return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {told}>"
+        ranks = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
+        return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
     def _repr_html_(self) -> str:
         return late("html_of_analysis")(self)
@@ -150,7 +150,7 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
     """
     people, whose = np.unique(gallery, return_inverse=True)
     if len(people) < 2:
-        raise InputError(f"{len(people)} subjects are enrolled, and two are the least to tell apart; use fewer folds.")
+        raise InputError(f"{len(people)} subjects are enrolled, but at least two are needed; use fewer folds.")
     best = np.full((len(people), len(probes)), -np.inf)
     np.maximum.at(best, whose, scores)
     own = people[:, None] == probes

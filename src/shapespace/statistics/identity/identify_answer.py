@@ -55,7 +55,7 @@ def answer_of_identification(found: Identification) -> Answer:
             else "",
             ""
             if strangers
-            else "Nobody is a stranger, so each probe is searched for once more without its own subject.",
+            else "All probes are of enrolled subjects, so each is also searched for in a gallery without its subject.",
         ]
     )
     told = ("score", "figure", "value", "low", "high")
@@ -104,7 +104,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
     ranks = tuple(float(k) for k in range(1, found.enrolled + 1))
     return (
         TablePart(
-            title="How well subjects are found",
+            title="Identification rates",
             note="FPIR: searches for somebody who is not enrolled that find somebody. FNIR: searches for somebody "
             "enrolled that do not find them first and above the threshold.",
             columns=tuple(columns),
@@ -112,7 +112,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
         ),
         CurvePart(
             title="CMC curve",
-            note="How often the right subject is within the first so many.",
+            note="Share of probes whose subject is within the first ranks.",
             series=tuple(
                 Series(x=ranks, y=tuple(one.cmc.tolist()), label=called(one.name),
                        low=tuple(one.band[0].tolist()), high=tuple(one.band[1].tolist()))
@@ -127,7 +127,7 @@ def _parts(found: Identification) -> tuple[Part, ...]:
                 who_was_tested(found.trial, found.trained_on),
                 f"{found.enrolled} subjects are enrolled"
                 + (" in each part at least." if len(found.trial.rounds) > 1 else ".")
-                + " A subject's score is that of the scan of them that is most like the probe; ties count against the"
+                + " A subject's score is that of its most similar scan; ties count against the"
                 f" right one. {INTERVALS}",
             ),
         ),

@@ -61,7 +61,7 @@ class TwoCovariance:
         counts = np.bincount(whose, minlength=len(names)).astype(np.float64)
         if len(names) < 3 or counts.max(initial=0.0) < 2:
             raise InputError(
-                f"The PLDA score learns from subjects who are not tested, and there are {len(names)}, of whom "
+                f"The PLDA score is trained on subjects who are not tested, and there are {len(names)}, of whom "
                 f"{int((counts > 1).sum())} have two scans; give three subjects or more and several scans of each, or "
                 "leave it out of --scores."
             )
@@ -84,10 +84,10 @@ class TwoCovariance:
         return TwoCovariance(*map(read_only, arrays), people=len(names), scans=n)
 
     def score(self, gallery: Samples, probes: Samples) -> FloatArray:
-        """Return (G, P) scores: the model's log likelihood, natural, of one person less that of two.
+        """Return (G, P) scores: natural log likelihood, by the model, of one person minus that of two.
 
-        They are likelihood ratios only as far as the normal model and its covariances are right, which few people to
-        learn from do not ensure; `calibrated` makes likelihood ratios of them.
+        They are likelihood ratios only if the normal model and its covariances are right, which a small training set
+        does not ensure; `calibrated` makes likelihood ratios of them.
 
         The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
         the coordinates of `basis` is used.

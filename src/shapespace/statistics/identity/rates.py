@@ -101,7 +101,8 @@ class Sweep:
             raise InputError("Rates need a finite score for each pair.")
         if same.all() or not same.any():
             raise InputError(
-                f"There are {int(same.sum())} pairs of one subject and {int((~same).sum())} of two; rates need both."
+                f"There are {int(same.sum())} pairs of one subject and {int((~same).sum())} of two; error rates need "
+                "both."
             )
         self._order = np.argsort(-score, kind="stable")
         ranked = score[self._order]
@@ -120,7 +121,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure with the ends of its 95 % interval over people; None where the data are too few.
+    """A figure with its 95 % interval over people; None if the data are too few.
 
     The interval of a share is never narrower than the exact one without an error, see `widen_share`.
     """
@@ -130,7 +131,7 @@ class Figure:
     high: float | None = None
 
     def briefly(self) -> str:
-        """Return the figure as percent with its interval, for a line at a prompt."""
+        """Return the figure in percent with its interval, for a one-line repr."""
         if self.value is None:
             return "unknown"
         interval = "" if self.low is None or self.high is None else f" ({100 * self.low:.3g} to {100 * self.high:.3g})"
@@ -147,12 +148,12 @@ def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
 
 
 def figure(value: float | None, drawn: Sequence[float] | FloatArray, people: int | None = None) -> Figure:
-    """Return a figure with the interval that figures of resampled people span.
+    """Return a figure with its bootstrap interval over people.
 
     Args:
         value: of all people.
         drawn: the figure of each draw of people; NaN where a draw has none.
-        people: number of people whose errors a share counts, for its ends near 0 and 1; None for other figures.
+        people: number of people in a share of errors, for its ends near 0 and 1; None for other figures.
     """
     known = np.asarray([one for one in drawn if np.isfinite(one)])
     if value is None or not (len(known) or (people and value in (0.0, 1.0))):

@@ -39,7 +39,7 @@ class IdentityOptions:
         modes: leading coefficients of identity that are used; None for all.
         curve: numbers of modes for which the equal error rate is found as well.
         by: a column of which each value has its own figures.
-        uncertainty: whether the PLDA score uses the error that each fit states.
+        uncertainty: whether the PLDA score uses the estimated error of each fit.
         draws: of people, for intervals.
         seed: of folds and draws.
         drop_missing: leave out scans of which a column that is used says nothing.
@@ -233,7 +233,7 @@ def _rounds(
 ) -> tuple[IntArray, tuple[Round, ...]]:
     """Return the group of each person, and the rounds."""
     if not gallery:
-        raise InputError("Nobody is left to be tested; learn from fewer subjects.")
+        raise InputError("No subject is left to test; train on fewer subjects.")
     tested = np.unique(person[[*gallery, *probes]])
     if training:
         parts = max(min(_GROUPS, len(tested) // 2), 1)
@@ -241,12 +241,12 @@ def _rounds(
         parts = options.folds or max(min(_FOLDS, len(tested) // 2), 1)
         if options.folds and not 2 <= options.folds <= len(tested) // 2:
             raise InputError(
-                f"{len(tested)} subjects cannot be parted into {options.folds} folds; each needs two of them, and two "
+                f"{len(tested)} subjects cannot be split into {options.folds} folds; each needs two of them, and two "
                 "folds are the least."
             )
         if parts < 2:
             raise InputError(
-                f"There are {len(tested)} subjects, and four are the least: two to learn from, and two to tell apart."
+                f"There are {len(tested)} subjects, but at least four are needed: two for training and two for testing."
             )
     order = np.random.default_rng((options.seed, 3)).permutation(len(tested))
     group = np.zeros(people, dtype=np.int32)
@@ -264,8 +264,8 @@ def _rounds(
 def _refuse_too_few(trial: Trial, table: Table) -> None:
     tested = int(trial.tested.sum())
     if tested < 2:
-        raise InputError(f"{table.where}: {tested} subject is compared, and two are the least.")
+        raise InputError(f"{table.where}: {tested} subject is compared, but at least two are needed.")
     if not any(trial.pairs(one)[0].same.any() for one in trial.rounds):
         raise InputError(
-            f"{table.where}: no two scans that are compared show one subject; nobody can be recognised by one scan."
+            f"{table.where}: no two of the compared scans are of one subject; add repeated scans of subjects."
         )

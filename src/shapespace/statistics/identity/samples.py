@@ -97,7 +97,7 @@ def samples_of(
     if len(training) < 3:
         raise InputError(
             "Surfaces without fits are whitened by those of subjects who are not tested, of whom there are "
-            f"{len(training)} and three are the least; ask for folds, or name subjects to train on."
+            f"{len(training)}, but at least three are needed; use folds, or name training subjects."
         )
     known = mm[np.asarray(training, dtype=np.intp)]
     mean = known.mean(axis=0)

@@ -48,7 +48,7 @@ SCORES: Mapping[str, Callable[[Samples], Scorer]] = MappingProxyType(
         "distance": _distance,
     }
 )
-"""Scores of how alike two scans are: by the two-covariance model (PLDA), by the angle and by the distance of whitened
+"""Similarity scores of two scans: by the two-covariance model (PLDA), by the angle and by the distance of whitened
 coefficients of identity, and by the plain distance of the shapes, RMS over vertices in mm. No score is a likelihood
 ratio."""
 
@@ -57,7 +57,7 @@ _FORMER = {"likelihood-ratio": "plda"}
 
 
 def score_name(name: str) -> str:
-    """Return the present name of a score; a former one warns."""
+    """Return the current name of a score, with a warning for a former name."""
     if name not in _FORMER:
         return name
     warn(

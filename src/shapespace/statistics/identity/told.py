@@ -25,9 +25,9 @@ CALLED = {
 """What scores are called in words."""
 INTERVALS = (
     "95 % intervals are percentiles over draws of subjects with replacement; near 0 and 1 they are at least as wide as "
-    "the exact interval of Clopper and Pearson for no error among as many subjects."
+    "the exact interval of Clopper and Pearson for no error among the same number of subjects."
 )
-"""What the intervals of error rates are, for reports."""
+"""Description of the intervals of error rates, for reports."""
 
 
 def called(name: str) -> str:
@@ -44,7 +44,7 @@ def in_percent(one: Figure) -> str:
 
 
 def interval(one: Figure) -> tuple[float, float] | None:
-    """Return the ends of an interval; None where there is none."""
+    """Return the ends of an interval, or None if there is none."""
     return None if one.low is None or one.high is None else (one.low, one.high)
 
 
@@ -66,12 +66,12 @@ def thinned(x: FloatArray, y: FloatArray, label: str) -> Series:
 def who_was_tested(trial: Trial, trained_on: int) -> str:
     """Return in words who was compared, and who was learned from."""
     tested = int(trial.tested.sum())
-    learned = f"{trained_on} other subjects" if trained_on else "nobody"
+    training = f"on {trained_on} other subjects" if trained_on else "on no subjects"
     if len(trial.rounds) == 1:
-        return f"{tested} subjects were tested; what is learned was learned from {learned}."
+        return f"{tested} subjects were tested; scores and calibration were trained {training}."
     return (
-        f"{tested} subjects were tested in {len(trial.rounds)} parts, each compared within itself; what is learned was "
-        f"learned from the other parts, of {trained_on} subjects at least."
+        f"{tested} subjects were tested in {len(trial.rounds)} folds, each compared within itself; scores and "
+        f"calibration were trained on the other folds, of at least {trained_on} subjects."
     )
 
 
@@ -102,8 +102,8 @@ def none_missed(errors: bool, people: int) -> str:
     return (
         ""
         if errors
-        else f"No error among {people} subjects does not mean that there are none: up to "
-        f"{100 * zero_bound(people):.1f} % of them may be ones with whom errors happen (95 %, Clopper-Pearson, "
+        else f"No error among {people} subjects does not mean an error rate of zero: up to "
+        f"{100 * zero_bound(people):.1f} % of subjects may be affected by errors (95 %, Clopper-Pearson, "
         "with subjects as the units)."
     )
 

@@ -108,8 +108,8 @@ class Verification:
         return late("answer_of_verification")(self)
 
     def __repr__(self) -> str:
-        told = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
-        return f"<Verification of {len(self.people)} subjects; {told}>"
+        rates = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
+        return f"<Verification of {len(self.people)} subjects; {rates}>"
 
     def _repr_html_(self) -> str:
         return late("html_of_analysis")(self)

@@ -60,7 +60,7 @@ def answer_of_verification(found: Verification) -> Answer:
             "nothing is stated."
             if thin
             else "",
-            "There are too few subjects to calibrate scores on others than those tested, so there are no likelihood "
+            "There are too few subjects to calibrate scores on subjects who are not tested, so there are no likelihood "
             "ratios."
             if first.llr is None
             else "",
@@ -154,8 +154,8 @@ def _table(found: Verification) -> TablePart:
         told = [cell for figure in (one.eer, *one.tar.values()) for cell in (figure.value, interval(figure))]
         rows.append((called(one.name), *told, one.cllr.value, one.cllr_min))
     return TablePart(
-        title="How well one subject is told from two",
-        note="EER: where as many pairs of one subject are refused as pairs of two accepted. TAR: pairs of one subject "
+        title="Verification rates",
+        note="EER: error rate where false rejection and false acceptance are equal. TAR: pairs of one subject "
         "accepted, at a rate FAR of pairs of two accepted. Cllr: what the likelihood ratios miss, 0 to 1 and more.",
         columns=tuple(columns),
         rows=tuple(rows),

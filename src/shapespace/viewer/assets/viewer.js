@@ -194,7 +194,7 @@
     drawMarks(stage.a, $("marks").checked);
   }
 
-  // Where a landmark lies on a surface: `at` has the vertices of its triangle and their barycentric weights.
+  // Position of a landmark on a surface: `at` has the vertices of its triangle and their barycentric weights.
   function onSurface(positions, at) {
     return [0, 1, 2].map((axis) => at.vertices.reduce((sum, v, k) => sum + at.weights[k] * positions[3 * v + axis], 0));
   }
