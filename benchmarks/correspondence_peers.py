@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import peers
 
-from shapespace.batch.where import Where
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
 from shapespace.correspondence.rounds import CorrespondSettings
@@ -90,7 +90,11 @@ def by_shapespace(
     for name, scan in scans.items():
         write_mesh(turned / f"{name}.ply", scan.with_vertices(turns[name].apply(scan.vertices)))
     _, records = correspond_files(
-        CorrespondFiles([turned], where=Where(jobs=jobs)), folder / "same", settings, quiet=False, say=print
+        CorrespondFiles([turned], execution=ExecutionConfig(jobs=jobs)),
+        folder / "same",
+        settings,
+        quiet=False,
+        say=print,
     )
     surfaces: dict[str, Mesh] = {}
     for record in records:

@@ -8,7 +8,7 @@ normal n, by a small rotation, translation and log scale of the model and by the
 import numpy as np
 
 from shapespace.fit.equations import Estimate
-from shapespace.fit.robust import Look, Problem
+from shapespace.fit.robust import Problem, WeightedMatches
 from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray
 
@@ -20,7 +20,9 @@ def vertex_rows(vertices: FloatArray, normals: FloatArray, modes: FloatArray) ->
     return np.concatenate([turn, normals, size, np.einsum("vd,vdk->vk", normals, modes)], axis=1)
 
 
-def gauss_newton_step(problem: Problem, look: Look, at: Estimate, modes: int) -> tuple[FloatArray, FloatArray]:
+def gauss_newton_step(
+    problem: Problem, look: WeightedMatches, at: Estimate, modes: int
+) -> tuple[FloatArray, FloatArray]:
     """Return the step (7 + K,) from `at` given what the fit sees there, and the Hessian of the cost."""
     surface, prior, scan, vertices = problem.surface, problem.prior, look.matches.points, look.matches.vertices
     w, v = look.weights.points, look.weights.vertices

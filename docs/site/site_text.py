@@ -37,7 +37,7 @@ NAVIGATION = {
         "docs/landmarks",
         "docs/howto-partial",
         "docs/howto-own-model",
-        "docs/beside",
+        "docs/interop",
         "docs/howto-*",
     ],
     "Understand": [

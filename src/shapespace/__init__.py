@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from shapespace.geometry.distance import surface_distances
     from shapespace.geometry.landmarks import place_landmarks
     from shapespace.geometry.volume_surface import VolumeSurface, surface_of_volume
-    from shapespace.io.beside import as_mesh
+    from shapespace.io.interop import as_mesh
     from shapespace.io.landmarks import read_landmarks
     from shapespace.io.meshes import read_mesh, write_mesh
     from shapespace.io.volumes import read_volume
@@ -128,7 +128,7 @@ _HOMES = {
     "ShapespaceError": "errors",
     "Similarity": "types",
     "SurfaceLandmarks": "types",
-    "as_mesh": "io.beside",
+    "as_mesh": "io.interop",
     "change": "statistics.change",
     "compare": "statistics.compare",
     "correspond": "correspondence.rounds",

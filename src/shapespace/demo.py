@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.results import read_record
 from shapespace.batch.run import fit_files, make_jobs
-from shapespace.batch.where import Where
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
@@ -343,7 +343,7 @@ def _fit_all(
         home / model_name,
         make_folder(home / "fits"),
         config,
-        executor=Where().executor(len(scans)),
+        executor=ExecutionConfig().executor(len(scans)),
         stages=True,
         on_done=lambda job, _: clock.step(f"fitted {job.name}"),
         on_state=show,

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, MeshError
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
@@ -153,7 +153,7 @@ class Mesh:
         Raises:
             ShapespaceError: trimesh is not installed.
         """
-        return late("to_trimesh")(self)
+        return lazy_import("to_trimesh")(self)
 
     def to_pyvista(self) -> Any:
         """Return a `pyvista.PolyData`.
@@ -161,7 +161,7 @@ class Mesh:
         Raises:
             ShapespaceError: PyVista is not installed.
         """
-        return late("to_pyvista")(self)
+        return lazy_import("to_pyvista")(self)
 
     def to_open3d(self) -> Any:
         """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` where there are no triangles.
@@ -169,7 +169,7 @@ class Mesh:
         Raises:
             ShapespaceError: Open3D is not installed.
         """
-        return late("to_open3d")(self)
+        return lazy_import("to_open3d")(self)
 
     def to_meshio(self) -> Any:
         """Return a `meshio.Mesh` of triangles, or of vertices where there are none.
@@ -177,7 +177,7 @@ class Mesh:
         Raises:
             ShapespaceError: meshio is not installed.
         """
-        return late("to_meshio")(self)
+        return lazy_import("to_meshio")(self)
 
     def to_menpo(self) -> Any:
         """Return a `menpo.shape.TriMesh`, or a `PointCloud` where there are no triangles.
@@ -185,7 +185,7 @@ class Mesh:
         Raises:
             ShapespaceError: menpo is not installed.
         """
-        return late("to_menpo")(self)
+        return lazy_import("to_menpo")(self)
 
 
 def _no_corners() -> IntArray:

@@ -12,7 +12,7 @@ import pytest
 import shapespace as ss
 from shapespace import cli
 from shapespace.batch.results import read_record
-from shapespace.late import LATE, late
+from shapespace.lazy import LAZY_FUNCTIONS, lazy_import
 from shapespace.report.saved import Folder, find_fits, model_of
 from shapespace.report.saved import raw_scan as saved_scan
 from synthetic_shapes import blob_model, raw_scan, training_meshes
@@ -114,6 +114,6 @@ def test_no_name_leads_out_of_the_folder(result: ss.FitResult, tmp_path: Path, n
         result.save(tmp_path / "out", name)
 
 
-def test_every_late_name_is_there() -> None:
-    for name in LATE:
-        assert callable(late(name))
+def test_every_lazy_name_is_there() -> None:
+    for name in LAZY_FUNCTIONS:
+        assert callable(lazy_import(name))

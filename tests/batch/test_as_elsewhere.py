@@ -22,7 +22,7 @@ SRC = Path(__file__).resolve().parents[2] / "src" / "shapespace"
 POSIX_ONLY = {
     ("batch/workers.py", "sched_getaffinity"): "on Linux alone; elsewhere cpu_count",
     ("datasets/download.py", "fcntl"): "elsewhere msvcrt",
-    ("io/apart_child.py", "resource"): "elsewhere its parent ends it when it is late",
+    ("io/sandbox_child.py", "resource"): "elsewhere its parent ends it when it is late",
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
     ("model/streamed.py", "fcntl"): "Windows refuses to remove open files",
     ("viewer/fitting.py", "nice"): "elsewhere the process keeps its place",

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from shapespace.batch.execution import EXECUTORS, ExecutionConfig
 from shapespace.batch.executors import Executor, Local, Serial
-from shapespace.batch.where import EXECUTORS, Where
 from shapespace.errors import FileError, FitError, InputError
 
 SEVERAL = [kind for kind in EXECUTORS if kind != "serial"]
@@ -161,7 +161,7 @@ def test_workers_that_cannot_start_are_one_sentence() -> None:
 )
 def test_where_tasks_cannot_run_is_said(told: dict[str, Any], match: str) -> None:
     with pytest.raises(InputError, match=match):
-        Where(**told)
+        ExecutionConfig(**told)
 
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path) -> None:

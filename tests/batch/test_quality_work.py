@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from shapespace.batch import quality_work
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.batch.quality_work import QualityElsewhere, QualityWork
-from shapespace.batch.where import Where
 from shapespace.errors import FitError
 from shapespace.model.quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
 from shapespace.types import Mesh
@@ -37,7 +37,9 @@ def test_every_executor_measures_the_same_to_the_bit(
     kind: str, meshes: list[Mesh], tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     dask = request.getfixturevalue("cluster").scheduler.address if kind == "dask" else ""
-    run = QualityElsewhere(Where(kind, jobs=2 if kind == "local" else 0, dask=dask), tmp_path / "out", quiet=True)
+    run = QualityElsewhere(
+        ExecutionConfig(kind, jobs=2 if kind == "local" else 0, dask=dask), tmp_path / "out", quiet=True
+    )
     assert numbers(measure_quality(meshes, SETTINGS, run=run)) == numbers(measure_quality(meshes, SETTINGS))
     assert not list(tmp_path.rglob("*.npz"))
 
@@ -67,6 +69,6 @@ def test_a_part_that_no_worker_survives_ends_in_a_sentence(
             return ((task, work.give_up(task, "its worker ended by signal 9")) for task in tasks)
 
     monkeypatch.setattr("shapespace.batch.quality_work.Serial", Lost)
-    run = QualityElsewhere(Where("serial"), tmp_path, quiet=True)
+    run = QualityElsewhere(ExecutionConfig("serial"), tmp_path, quiet=True)
     with pytest.raises(FitError, match="signal 9; run it with fewer"):
         measure_quality(meshes, SETTINGS, run=run)

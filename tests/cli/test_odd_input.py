@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import Run, World, leftovers
-from shapespace.batch.where import EXECUTORS
+from shapespace.batch.execution import EXECUTORS
 from shapespace.errors import FitError
 from shapespace.io.meshes import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh

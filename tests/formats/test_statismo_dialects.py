@@ -17,7 +17,7 @@ from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes
 from shapespace.formats.registry import read_linear
 from shapespace.formats.statismo import Statismo
-from shapespace.io import apart_child
+from shapespace.io import sandbox_child
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 
@@ -29,14 +29,14 @@ DIALECTS: list[Write] = [
 
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read files that are known to be harmless without a process for each; test_read_apart reads in one."""
+    """Read files that are known to be harmless without a process for each; test_sandbox reads in one."""
 
     def read(path: Path, leave: tuple[str, ...] = ()) -> Any:
-        from shapespace.io.apart import Tree
+        from shapespace.io.sandbox import Tree
 
-        found = apart_child._Found(2**26)
+        found = sandbox_child._Found(2**26)
         with h5py.File(path) as file:
-            apart_child._walk(file, "", found, leave)
+            sandbox_child._walk(file, "", found, leave)
         return Tree(found.arrays, found.texts, found.attributes, tuple(found.groups))
 
     monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_apart", read)

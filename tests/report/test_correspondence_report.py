@@ -15,10 +15,10 @@ from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.report import correspondence_page
 from shapespace.report.checker import checker_layer, checker_places
-from shapespace.report.concerns import concerns_of
 from shapespace.report.corresponded import Corresponded, upright
 from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
 from shapespace.report.render import Camera, Layer, render, squares
+from shapespace.report.triage import concerns_of
 from shapespace.types import Mesh
 from synthetic_shapes import similarity
 

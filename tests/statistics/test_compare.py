@@ -107,7 +107,7 @@ FORMULAS = {
 def test_sums_of_squares_r2_and_f_are_those_of_plain_least_squares(formula: str, squares: SquaresType) -> None:
     table, terms = people(), FORMULAS[formula]
     shapes = cohort(table)
-    found = compare(shapes, formula, CompareOptions(squares=squares, permutations=20, maps=False))
+    found = compare(shapes, formula, CompareOptions(anova_type=squares, permutations=20, maps=False))
     columns = pieces(table, terms)
     flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
     total = left(flat, [])[0]
@@ -137,7 +137,7 @@ def test_one_number_a_shape_gives_the_tables_of_statsmodels(squares: SquaresType
     shapes = points + y[:, None, None] * np.eye(3)[2] * (np.arange(len(points)) == 7)[:, None]
     found = compare(
         Cohort.of_shapes(shapes, table, align=False), "~ sex * age + site",
-        CompareOptions(squares=squares, permutations=20, maps=False),
+        CompareOptions(anova_type=squares, permutations=20, maps=False),
     )  # fmt: skip
     fitted = smf.ols("y ~ C(sex, Sum) * age + C(site, Sum)", pandas.DataFrame({**table, "y": y})).fit()
     expected = anova.anova_lm(fitted, typ=("I", "II", "III").index(squares) + 1)
@@ -287,7 +287,7 @@ def test_that_few_arrangements_differ_is_said() -> None:
 
 
 def test_type_iii_with_an_interaction_says_where_it_tests() -> None:
-    options = CompareOptions(squares="III", permutations=20, maps=False)
+    options = CompareOptions(anova_type="III", permutations=20, maps=False)
     assert any("center(age)" in one for one in compare(cohort(people()), "~ sex * age", options).warnings)
     assert not compare(cohort(people()), "~ sex * center(age)", options).warnings
 
@@ -533,7 +533,7 @@ def test_blocks_that_cannot_be_are_refused() -> None:
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    for wrong in ({"permutations": 5}, {"seed": -1}, {"level": 0.0}, {"squares": "IV"}):
+    for wrong in ({"permutations": 5}, {"seed": -1}, {"level": 0.0}, {"anova_type": "IV"}):
         with pytest.raises(InputError):
             CompareOptions(**wrong)  # pyright: ignore[reportArgumentType]
 

@@ -67,7 +67,7 @@ def test_published_z_of_plethodon_are_reproduced(squares: SquaresType, reference
     table = {name: data["plethodon_table"][name] for name in ("species", "site")}
     cohort = Cohort.of_shapes(shapes, table, align=False)
     expected = data["plethodon_lm_raw_landmark_gpa"][f"pleth_{squares}"]
-    options = CompareOptions(squares=squares, permutations=10_000, maps=False)
+    options = CompareOptions(anova_type=squares, permutations=10_000, maps=False)
     found = compare(cohort, "~ species * site", options)
     for term, z, log in zip(expected["terms"], expected["Z"], expected["zlog"], strict=True):
         test = found.test(term)

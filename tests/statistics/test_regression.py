@@ -15,11 +15,11 @@ from shapespace.cohort.table import Table, numbers_as_text
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
+from shapespace.statistics.linear_regressors import Choice, Decomposed, folds_of
 from shapespace.statistics.methods_answer import scheme_text
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known
 from shapespace.statistics.regression import Regression, compare_with, permutation_scheme, regress, share_of
 from shapespace.statistics.regression_answer import predicted_answer
-from shapespace.statistics.smoothers import Choice, Decomposed, folds_of
 from shapespace.types import Mesh, read_only
 from symmetric_object import cohort_of, posed, symmetric_object
 

@@ -11,8 +11,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
-from shapespace.batch.where import Where
 from shapespace.errors import FitError
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
@@ -35,7 +35,7 @@ class QualityElsewhere:
         quiet: whether workers say that code is compiled.
     """
 
-    where: Where
+    execution: ExecutionConfig
     folder: Path
     quiet: bool
 
@@ -47,8 +47,8 @@ class QualityElsewhere:
             FitError: there are no workers, or a part was given up.
         """
         few = sum(len(mesh.vertices) for mesh in shapes.meshes) < _FEW_VERTICES
-        here = few and self.where.kind == "local" and not self.where.jobs
-        executor = None if here else self.where.executor(len(parts), quiet=self.quiet)
+        here = few and self.execution.kind == "local" and not self.execution.jobs
+        executor = None if here else self.execution.executor(len(parts), quiet=self.quiet)
         with contextlib.ExitStack() as stack:
             if executor is None:
                 work = QualityWork(Path())

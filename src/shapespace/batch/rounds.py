@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
-from shapespace.batch.where import Where
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks
 from shapespace.correspondence.place import Placed, PlaceTask, Workbench
@@ -42,7 +42,7 @@ class KeptRounds:
     """
 
     folder: Path
-    where: Where
+    execution: ExecutionConfig
     quiet: bool
     on_done: Callable[[], None]
 
@@ -66,7 +66,7 @@ class KeptRounds:
                 yield placed
         if not left:
             return
-        executor = self.where.executor(len(left), quiet=self.quiet)
+        executor = self.execution.executor(len(left), quiet=self.quiet)
         work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.bench.npz", bench.seed)
         work.remember(bench)
         if executor is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shapespace.cli.printing import now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
-    from shapespace.batch.where import Where
+    from shapespace.batch.execution import ExecutionConfig
     from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
 
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
@@ -231,7 +231,7 @@ def correspond(arguments: argparse.Namespace) -> int:
         arguments.template,
         arguments.model,
         arguments.landmarks,
-        _where(arguments),
+        _execution_config(arguments),
         arguments.recursive,
         arguments.strict,
     )
@@ -304,7 +304,9 @@ def quality(arguments: argparse.Namespace) -> int:
         control_points=arguments.control_points,
     )
     options = QualityOptions(settings, arguments.representation, arguments.scans, arguments.unseen)
-    found, notes = quality(arguments.targets, arguments.output, options, _where(arguments), quiet=arguments.quiet)
+    found, notes = quality(
+        arguments.targets, arguments.output, options, _execution_config(arguments), quiet=arguments.quiet
+    )
     for note in notes:
         say(note)
     if arguments.json:
@@ -383,7 +385,7 @@ def fit(arguments: argparse.Namespace) -> int:
     settings = BatchSettings(
         config,
         arguments.landmarks,
-        _where(arguments),
+        _execution_config(arguments),
         arguments.again,
         arguments.stages,
         arguments.recursive,
@@ -411,10 +413,10 @@ def _region(region: str | None) -> str | tuple[int, ...] | None:
     return read_region(region)
 
 
-def _where(arguments: argparse.Namespace) -> Where:
-    from shapespace.batch.where import Where
+def _execution_config(arguments: argparse.Namespace) -> ExecutionConfig:
+    from shapespace.batch.execution import ExecutionConfig
 
-    return Where(arguments.executor, arguments.jobs, arguments.timeout, arguments.dask or "")
+    return ExecutionConfig(arguments.executor, arguments.jobs, arguments.timeout, arguments.dask or "")
 
 
 def recognise_train(arguments: argparse.Namespace) -> int:
@@ -503,7 +505,7 @@ def recognise_study(arguments: argparse.Namespace) -> int:
         arguments.model,
         folds=arguments.folds,
         seed=arguments.seed,
-        where=_where(arguments),
+        execution=_execution_config(arguments),
         quiet=arguments.quiet,
     )
     if arguments.json:

@@ -20,7 +20,7 @@ from shapespace.cohort.table import Table, named, numbers_as_text
 from shapespace.errors import CorrespondenceError, InputError
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import listed_briefly, short_repr
@@ -186,7 +186,7 @@ class Cohort:
         )
 
     def _repr_html_(self) -> str:
-        return late("html_of_cohort")(self)
+        return lazy_import("html_of_cohort")(self)
 
     @property
     def n_vertices(self) -> int:

@@ -13,13 +13,13 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
-from shapespace.batch.where import Where
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
@@ -81,7 +81,7 @@ class CorrespondFiles:
     template: Path | None = None
     model: Path | None = None
     landmarks: Path | None = None
-    where: Where = field(default_factory=Where)
+    execution: ExecutionConfig = field(default_factory=ExecutionConfig)
     recursive: bool = False
     strict: bool = False
 
@@ -138,7 +138,7 @@ def _corresponding(
     if template is not None:
         for sentence in _told_astray(template):
             say(f"{template.name}: {sentence}")
-    rounds = _Rounds(folder / _KEPT, files.where, quiet=quiet)
+    rounds = _Rounds(folder / _KEPT, files.execution, quiet=quiet)
     with telling_of_compiling(quiet=quiet), waiting("choosing the template", quiet=quiet):
         first = first_template(list(scans.values()), template, settings, model)
     made = correspond(list(scans.values()), settings, first=first, run=rounds)
@@ -236,8 +236,8 @@ def _finished(
 class _Rounds:
     """Runs rounds with a bar for each."""
 
-    def __init__(self, folder: Path, where: Where, *, quiet: bool) -> None:
-        self._folder, self._where, self._quiet, self._number = folder, where, quiet, 0
+    def __init__(self, folder: Path, execution: ExecutionConfig, *, quiet: bool) -> None:
+        self._folder, self._execution_config, self._quiet, self._number = folder, execution, quiet, 0
 
     def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
         self._number += 1
@@ -246,7 +246,7 @@ class _Rounds:
             def one_more() -> None:
                 bar.update()
 
-            return list(KeptRounds(self._folder, self._where, self._quiet, one_more)(bench, tasks))
+            return list(KeptRounds(self._folder, self._execution_config, self._quiet, one_more)(bench, tasks))
 
 
 @dataclass(frozen=True)

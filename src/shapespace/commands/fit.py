@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
 from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.run import Plan, fit_files, make_jobs
-from shapespace.batch.where import Where
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.errors import InputError, ShapespaceError
@@ -53,7 +53,7 @@ class BatchSettings:
 
     config: FitConfig = field(default_factory=FitConfig)
     landmarks: Path | None = None
-    where: Where = field(default_factory=Where)
+    execution: ExecutionConfig = field(default_factory=ExecutionConfig)
     again: bool = False
     stages: bool = False
     recursive: bool = False
@@ -100,7 +100,7 @@ def fit_scans(
     if stored and not settings.store:
         say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
     first = find_suspects(work, quiet=quiet)
-    executor = settings.where.executor(len(work), quiet=quiet)
+    executor = settings.execution.executor(len(work), quiet=quiet)
     with (
         progress(len(work), "fitting", "scan", quiet=quiet) as bar,
         telling_of_compiling(quiet=quiet or executor is not None),

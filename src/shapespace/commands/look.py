@@ -119,8 +119,8 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
     Raises:
         FileError: it is none, or it cannot be read.
     """
-    from shapespace.report.concerns import concerns_of, distance_share, known, median
     from shapespace.report.corresponded import Corresponded
+    from shapespace.report.triage import concerns_of, distance_share, known, median
 
     if not (folder / CorrespondenceRecord.FILE).is_file():
         raise FileError(

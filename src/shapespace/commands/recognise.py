@@ -9,10 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.folder import RECORD
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.results import read_record
-from shapespace.batch.where import Where
 from shapespace.cohort.classes import notes_on_classes
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error
@@ -185,7 +185,14 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
 
 
 def recognise_study(
-    output: Path, data: Path | None, model: Path | None, *, folds: int, seed: int, where: Where, quiet: bool
+    output: Path,
+    data: Path | None,
+    model: Path | None,
+    *,
+    folds: int,
+    seed: int,
+    execution: ExecutionConfig,
+    quiet: bool,
 ) -> tuple[Path, list[dict[str, Any]], str]:
     """Run the recognition study on labelled scans; return its report, its targets and what the scans are, in words.
 
@@ -202,6 +209,6 @@ def recognise_study(
     from shapespace.study.own_scans import run_own_study  # needs the extras
 
     with telling_of_compiling(quiet=quiet):
-        report, holds = run_own_study(output, data, model, folds=folds, where=where, seed=seed, quiet=quiet)
+        report, holds = run_own_study(output, data, model, folds=folds, execution=execution, seed=seed, quiet=quiet)
     content = json.loads(read_bytes(output / "recognition.json"))
     return report, content["targets"], holds

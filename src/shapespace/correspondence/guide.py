@@ -77,7 +77,7 @@ class Others:
         return float(np.sqrt(((shape - self.told(shape, seen))[there] ** 2).sum(axis=1).mean()))
 
 
-def told_by_others(
+def predict_leave_one_out(
     shapes: FloatArray, seen: FloatArray, noise_share: float, images: FloatArray | None = None
 ) -> FloatArray:
     """Return each of the aligned `shapes` (N, V, 3) as far as the others tell it, (N, V, 3).

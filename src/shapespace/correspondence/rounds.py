@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from shapespace.correspondence.guide import Others, aligned, told_by_others
+from shapespace.correspondence.guide import Others, aligned, predict_leave_one_out
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import Marks, agreed, unlike_most, without_astray
 from shapespace.correspondence.mirror import Mirror
@@ -27,8 +27,8 @@ from shapespace.geometry.doctor import repair
 from shapespace.geometry.landmarks import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import rms_size
-from shapespace.io.beside import as_meshes
-from shapespace.late import late
+from shapespace.io.interop import as_meshes
+from shapespace.lazy import lazy_import
 from shapespace.model.missing import with_estimates
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
@@ -140,7 +140,7 @@ class Correspondence:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        return late("html_of_correspondence")(self)
+        return lazy_import("html_of_correspondence")(self)
 
     def meshes(self) -> list[Mesh]:
         """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.
@@ -429,7 +429,7 @@ class _State:
             return
         shapes, seen = self._stacked(order)
         shapes, _ = aligned(shapes, seen, self.template.vertices)
-        told = told_by_others(shapes, seen, self.settings.noise_share)
+        told = predict_leave_one_out(shapes, seen, self.settings.noise_share)
         apart = ((shapes - told) ** 2).sum(axis=2)
         rms = np.sqrt((seen * apart).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
         usual = float(np.median(rms))
@@ -466,7 +466,7 @@ class _State:
             self.moves[i].append(float(np.sqrt(square)) / SIZE)
             self.placed[i] = replace(now, vertices=shape, T_scan_template=T)
         if self.settings.guided and len(order) >= _ENOUGH_TO_SETTLE:
-            told = told_by_others(shapes, seen, self.settings.noise_share, images)
+            told = predict_leave_one_out(shapes, seen, self.settings.noise_share, images)
             self.expected = dict(zip(order, told, strict=True))
         self.template = Mesh(mean, self.template.faces, name=self.template.name)
         self.places = agreed(self.template, [(self.placed[i].vertices, self._landmarks(i)) for i in order])

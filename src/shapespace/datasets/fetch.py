@@ -29,8 +29,8 @@ from tqdm import tqdm
 from shapespace.datasets import ict_files
 from shapespace.datasets.download import NotThereError, download, locked
 from shapespace.errors import DataError
+from shapespace.io.disk_cache import cache_folder
 from shapespace.io.files import atomic_path, make_folder, sha256_of_file, write_text
-from shapespace.io.kept import cache_folder
 
 _TYPICAL_OBJ_BYTES = 2_558_000
 _LICENCE_NAME = "LICENSE.txt"

@@ -89,7 +89,7 @@ def dense_surface(
     matcher = _matcher(target, surface, T, settings)
     size_mm = rms_size(model.mean_vertices)
 
-    def look() -> Look:
+    def look() -> WeightedMatches:
         return _look(matcher, surface, T, target, settings)
 
     now = look()
@@ -124,7 +124,7 @@ def dense_surface(
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class WeightedMatches:
     """What the stage sees where the surface is.
 
     Args:
@@ -171,7 +171,9 @@ def _matcher(target: ScanTarget, surface: MovingSurface, T: Similarity, settings
     )
 
 
-def _look(matcher: Matcher, surface: MovingSurface, T: Similarity, target: ScanTarget, settings: DenseSettings) -> Look:
+def _look(
+    matcher: Matcher, surface: MovingSurface, T: Similarity, target: ScanTarget, settings: DenseSettings
+) -> WeightedMatches:
     matches = matcher.match(surface, T)
     points = np.flatnonzero(matches.points.allowed)
     if len(points) < _FEWEST_MATCHES:
@@ -184,7 +186,7 @@ def _look(matcher: Matcher, surface: MovingSurface, T: Similarity, target: ScanT
     pairs = nearest[points[1:]] == nearest[points[:-1]]
     apart = np.diff(residual[points])[pairs]
     noise_mm = spread(apart) / np.sqrt(2.0) if len(apart) >= _FEWEST_PAIRS else spread_mm
-    return Look(
+    return WeightedMatches(
         matches, surface.topology.faces, len(surface.vertices), settings, spread_mm,
         max(noise_mm, settings.least_noise_mm),
     )  # fmt: skip

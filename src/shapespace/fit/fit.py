@@ -16,10 +16,10 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.crop import Crop
-from shapespace.fit.held_to import HeldTo
 from shapespace.fit.marks import SHARE, Marks
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.methods import method_named
+from shapespace.fit.region_fit import RegionFit
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings
@@ -30,7 +30,7 @@ from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.surface import rms_size
-from shapespace.io.beside import MeshLike, as_mesh
+from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks import read_landmarks
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
@@ -187,7 +187,7 @@ def fit_scan(
     # Products this small go slower by several threads, and many fits at a time share the cores anyway.
     with threadpool_limits(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
-        held = None if config.region is None else HeldTo.of(model, config.region)
+        held = None if config.region is None else RegionFit.of(model, config.region)
         own = model if held is None else held.part.model
         placed = _place(model, own, scan, config, landmarks, T_scan_model)
         clock.append(time.perf_counter())
@@ -377,7 +377,7 @@ def _measure(
 
 
 def _landmark_stddev_mm(
-    model: ShapeModel, fitted: Fitted, held: HeldTo | None, *, dense: bool
+    model: ShapeModel, fitted: Fitted, held: RegionFit | None, *, dense: bool
 ) -> dict[str, FloatArray] | None:
     """Return name -> (3,) of where each of the model's landmarks lies, mm of the scan."""
     if fitted.landmark_covariance is None:

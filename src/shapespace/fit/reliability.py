@@ -85,7 +85,7 @@ def reliability(evidence: Mapping[str, float]) -> Reliability:
     """Return how far off the fit with this evidence is.
 
     Args:
-        evidence: of `posterior`, with `layered_share` of `another`; lengths in mm of the model's frame.
+        evidence: of `posterior`, with `layered_share` of `second_instance`; lengths in mm of the model's frame.
     """
     error = log_error(evidence)
     margin = FAILURE_OFFSET + FAILURE_SLOPE * (error - math.log(FAILED_SHARE))

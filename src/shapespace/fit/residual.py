@@ -23,7 +23,7 @@ from shapespace.fit.settings import ResidualSettings
 from shapespace.geometry import mirror as mirror_search
 from shapespace.geometry.mirror import find_mirror
 from shapespace.geometry.surface import rms_size
-from shapespace.io.kept import keep, recall
+from shapespace.io.disk_cache import keep, recall
 from shapespace.model import local_modes
 from shapespace.model.local_modes import smooth_fields, strongest_products
 from shapespace.model.shape_model import ShapeModel

@@ -18,7 +18,7 @@ from shapespace.fit.state import IcpState
 from shapespace.fit.trust import Chirality, chirality_of
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
-from shapespace.late import OpenViewer, late
+from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr, told_briefly
 from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
@@ -270,7 +270,7 @@ class FitResult:
             FileError: the folder cannot be written, or another run writes into it.
             InputError: a name that no file can have.
         """
-        return late("save_fit")(self, Path(folder), name, stages=stages)
+        return lazy_import("save_fit")(self, Path(folder), name, stages=stages)
 
     def plot(self, what: str = "distances", **options: Any) -> Figure:
         """Return a matplotlib figure of the fit.
@@ -284,7 +284,7 @@ class FitResult:
             InputError: there is no such plot.
             ShapespaceError: the extra `report` is not installed.
         """
-        return late("plot_fit")(self, what, **options)
+        return lazy_import("plot_fit")(self, what, **options)
 
     def view(self, *, height_px: int = 720) -> OpenViewer:
         """Open the viewer on this fit, in a notebook in the cell's own frame.
@@ -297,10 +297,10 @@ class FitResult:
         Raises:
             ShapespaceError: the extra `view` is not installed.
         """
-        return late("view_fit")(self, height_px=height_px)
+        return lazy_import("view_fit")(self, height_px=height_px)
 
     def _repr_html_(self) -> str:
-        return late("html_of_fit")(self)
+        return lazy_import("html_of_fit")(self)
 
     def _vertices(self, stage: str) -> FloatArray:
         at = self.stages[stage]

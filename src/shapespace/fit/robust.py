@@ -54,7 +54,7 @@ _LACK_LEFT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class WeightedMatches:
     """What the fit sees where it is.
 
     Args:
@@ -83,7 +83,7 @@ class Step:
         motion_mm: largest movement of a vertex, mm of the model's frame.
     """
 
-    look: Look
+    look: WeightedMatches
     at: Estimate
     motion_mm: float
 
@@ -136,7 +136,7 @@ class Problem:
             target, self.surface, at.T_scan_model, points, vertex, engine, s.normal_cosine, tree=tree, winding=winding
         )
 
-    def look(self, matcher: Matcher, at: Estimate) -> Look:
+    def look(self, matcher: Matcher, at: Estimate) -> WeightedMatches:
         """Return the matches and how much each counts.
 
         Raises:
@@ -156,9 +156,9 @@ class Problem:
         weights = matches.weights(
             s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share * fineness**2
         )  # eqs 8, 9
-        return Look(matches, weights, sigma_mm)
+        return WeightedMatches(matches, weights, sigma_mm)
 
-    def equations(self, look: Look, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
+    def equations(self, look: WeightedMatches, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
         """Return what each vertex carries of the matches, and the equations of a step from there."""
         gathered = look.matches.gathered(look.weights, self.prepared.topology.faces, len(self.surface.vertices))
         equations = normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
@@ -204,7 +204,7 @@ class Problem:
             if step.motion_mm < level.stop_motion_mm:
                 return
 
-    def unexplained_variance(self, look: Look) -> float:
+    def unexplained_variance(self, look: WeightedMatches) -> float:
         """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17)."""
         return look.matches.unexplained_variance(
             look.weights, self.prepared.topology.faces, len(self.surface.vertices), self.settings.seed
@@ -363,7 +363,9 @@ def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T
     return T.scale**2 * T.rotation @ covariance @ T.rotation.T
 
 
-def _matched(look: Look, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray) -> dict[str, float]:
+def _matched(
+    look: WeightedMatches, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray
+) -> dict[str, float]:
     """Return how much of model and scan found a match, and how plausible pose and shape are.
 
     Args:

@@ -39,9 +39,9 @@ class Robust(RobustSettings):
         self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
     ) -> Generator[IcpState, None, Fitted]:
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
-        from shapespace.fit.another import displaced, find_second_instance, layers  # compiled
         from shapespace.fit.chirality import mirrored_log_odds
         from shapespace.fit.robust import robust_icp
+        from shapespace.fit.second_instance import displaced, find_second_instance, layers  # compiled
 
         fitted = yield from robust_icp(
             model,

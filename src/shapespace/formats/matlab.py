@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
 from shapespace.formats.parts import LinearModel, Modes, are_measurable, scaled
-from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
 from shapespace.io.files import open_file
 from shapespace.io.json_files import check_file
+from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart, read_matlab_apart
 from shapespace.types import FloatArray
 
 _AGAIN = "give the file as it was downloaded"

@@ -19,10 +19,10 @@ from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.parts import ORTHOGONAL, LinearModel, Modes, are_measurable, are_triangles, scaled
 from shapespace.formats.statismo_tree import PARAMETERS, hdf5_of, tree_of
 from shapespace.geometry.landmarks import place_landmarks
-from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
 from shapespace.io.files import write_bytes
 from shapespace.io.json_files import check_file
 from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_hdf5_apart
 from shapespace.io.vtk import read_vtk
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.formats.parts import LinearModel, orthonormal
-from shapespace.io.apart import Tree
 from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.sandbox import Tree
 from shapespace.types import FloatArray
 
 PARAMETERS: Final = "modelinfo/modelBuilder-0/parameters"

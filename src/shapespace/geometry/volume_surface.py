@@ -21,7 +21,7 @@ from scipy import ndimage
 from shapespace.errors import InputError, MeshError, ShapespaceError
 from shapespace.geometry.remesh import is_sheet
 from shapespace.geometry.surface import boundary_edges
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr
 from shapespace.types import MAX_MEMORY_BYTES, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
 
@@ -86,7 +86,7 @@ class VolumeSurface:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        return late("html_of_volume_surface")(self)
+        return lazy_import("html_of_volume_surface")(self)
 
 
 def surface_of_volume(

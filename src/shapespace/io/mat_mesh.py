@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io.apart import HDF5_SIGNATURE, ApartError, Tree, read_matlab_apart
 from shapespace.io.parsing import CUT_SHORT, damaged, mesh_of
+from shapespace.io.sandbox import HDF5_SIGNATURE, ApartError, Tree, read_matlab_apart
 from shapespace.types import Mesh
 
 _HDF5_AT = 512

@@ -21,9 +21,9 @@ from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import without_estimates
-from shapespace.io.beside import as_meshes
 from shapespace.io.hdf5 import read_hdf5
-from shapespace.late import late
+from shapespace.io.interop import as_meshes
+from shapespace.lazy import lazy_import
 from shapespace.model import model_file
 from shapespace.model.foreign import Foreign, is_foreign, load_foreign, parted
 from shapespace.model.held_out import held_out_shapes
@@ -76,7 +76,7 @@ class AdditiveModel:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        return late("html_of_additive_model")(self)
+        return lazy_import("html_of_additive_model")(self)
 
     def __post_init__(self) -> None:
         rotation, k = read_only(self.rotation), self.shape.n_modes

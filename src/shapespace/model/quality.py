@@ -23,8 +23,8 @@ from shapespace.geometry.closest import ClosestPointEngine, build_engine, on_bou
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
-from shapespace.io.beside import MeshLike, as_meshes
-from shapespace.late import late
+from shapespace.io.interop import MeshLike, as_meshes
+from shapespace.lazy import lazy_import
 from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
@@ -141,10 +141,10 @@ class ModelQuality:
         Raises:
             ShapespaceError: the extra `report` is not installed.
         """
-        return late("plot_quality")(self, **options)
+        return lazy_import("plot_quality")(self, **options)
 
     def _repr_html_(self) -> str:
-        return late("html_of_quality")(self)
+        return lazy_import("html_of_quality")(self)
 
     def sentences(self) -> tuple[str, ...]:
         """Return how many modes the shapes support, and whether more shapes would help."""

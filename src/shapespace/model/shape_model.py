@@ -20,8 +20,8 @@ from shapespace.formats.parts import LinearModel
 from shapespace.geometry.procrustes import Gauge, align_in_place, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import without_estimates
-from shapespace.io.beside import MeshLike, as_meshes
-from shapespace.late import OpenViewer, late
+from shapespace.io.interop import MeshLike, as_meshes
+from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
@@ -614,7 +614,7 @@ class ShapeModel:
             InputError: there is no such plot.
             ShapespaceError: the extra `report` is not installed.
         """
-        return late("plot_model")(self, what, **options)
+        return lazy_import("plot_model")(self, what, **options)
 
     def view(self, *, height_px: int = 720) -> OpenViewer:
         """Open the viewer on the model, in a notebook in the cell's own frame; see `FitResult.view`.
@@ -625,10 +625,10 @@ class ShapeModel:
         Raises:
             ShapespaceError: the extra `view` is not installed.
         """
-        return late("view_model")(self, height_px=height_px)
+        return lazy_import("view_model")(self, height_px=height_px)
 
     def _repr_html_(self) -> str:
-        return late("html_of_model")(self)
+        return lazy_import("html_of_model")(self)
 
     def as_linear(self) -> LinearModel:
         """Return what formats of other tools can hold of the model."""

@@ -32,11 +32,11 @@ from shapespace.report.blocks import (
     text_table,
 )
 from shapespace.report.colours import DIVERGING, SEQUENTIAL
-from shapespace.report.concerns import concerns_of, distance_share, known, median, percent_of, scan_status, sentence
 from shapespace.report.corresponded import Corresponded, Placed, drawable, upright
 from shapespace.report.page import Chapter, Page, Step
 from shapespace.report.saved import Folder
 from shapespace.report.staged import nice_ceiling
+from shapespace.report.triage import concerns_of, distance_share, known, median, percent_of, scan_status, sentence
 from shapespace.report.wording import DASH, counted, listed, percent, plain, setting, words
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
 from shapespace.types import FloatArray, Mesh
@@ -311,7 +311,7 @@ class CorrespondencePage:
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first scans."""
-        from shapespace.report import stills
+        from shapespace.report import thumbnails
 
         limit = 100 * (median([self.share(record, "p99") for record in self.records]) or nan)
         limit = nice_ceiling(limit)
@@ -320,7 +320,7 @@ class CorrespondencePage:
             "Each strip, from the left: the scan; the checkerboard of the front view; how far each vertex lies from "
             "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) beside the mean shape, "
             "with the change of size divided out and folded triangles in black.",
-            [(self.page.image(stills.colour_bar(c), f"from {low} to {high}"), low, high) for c, low, high in bars],
+            [(self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high) for c, low, high in bars],
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
         carded = self._carded()
@@ -349,13 +349,13 @@ class CorrespondencePage:
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and what it lacks."""
-        from shapespace.report import stills
+        from shapespace.report import thumbnails
 
         if record in self.out:
             scan = drawable(self._bounded(record))[0]
             if scan.faces is not None:
                 scan = scan.with_vertices(scan.vertices @ upright(scan).T)
-            return self.page.image(stills.mesh_still(scan), f"The scan {record.name}, set aside"), ""
+            return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, set aside"), ""
         placed = self.at.placed(record.name)
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
@@ -364,7 +364,7 @@ class CorrespondencePage:
             scan, far = self._beside(own, placed)
         except FileFormatError as error:
             note = f"Without the scan beside it: {error}"
-        still = stills.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
+        still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
         seen = "the scan, the checkerboard, distances and areas" if scan else "the checkerboard and areas"
         return self.page.image(still, f"{record.name}: {seen}"), note
 

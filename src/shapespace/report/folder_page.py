@@ -331,7 +331,7 @@ class FolderPage:
 
     def gallery(self) -> list[Block]:
         """Return a card for each of the first fits: failed and doubtful first, then by their error."""
-        from shapespace.report import stills
+        from shapespace.report import thumbnails
 
         sample, _ = sections.usable([fit for fit in self.carded if fit.pictured], self.staged)
         good = [fit for fit in sample if fit.status == "converged"]
@@ -342,7 +342,7 @@ class FolderPage:
             more = f"{others} have no picture here, so that this file stays below 8 MB; the table has them all."
             out.append(Text(more))
         if sample:
-            out.append(ScaleKey(limit, self.page.image(stills.colour_bar(), "from blue over pale to red")))
+            out.append(ScaleKey(limit, self.page.image(thumbnails.colour_bar(), "from blue over pale to red")))
         cards = [self.card(fit, limit) for fit in self.carded]
         out.append(Gallery(cards[:MOST_OPEN_CARDS]))
         if len(cards) > MOST_OPEN_CARDS:
@@ -374,18 +374,21 @@ class FolderPage:
 
     def still(self, fit: SavedFit, limit_mm: float) -> Image:
         """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
-        from shapespace.report import stills
+        from shapespace.report import thumbnails
 
         if fit.pictured:
             try:
                 staged = self.staged(fit)
             except ScanNotFoundError:
                 surfaces = saved_surfaces(self.folder, fit)
-                still, alt = stills.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
+                still, alt = thumbnails.mesh_still(surfaces["final"]), f"The fitted surface of {fit.name}"
             else:
-                still, alt = stills.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
+                still, alt = thumbnails.fit_strip(staged, limit_mm), sections.strip_alt(staged, limit_mm)
         else:
-            still, alt = stills.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
+            still, alt = (
+                thumbnails.mesh_still(raw_scan(self.folder, fit)),
+                f"The raw scan {fit.name}, as its axes stand",
+            )
         return self.page.image(still, alt)
 
     def numbers(self) -> list[Block]:

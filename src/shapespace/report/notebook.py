@@ -19,7 +19,7 @@ from shapespace.report.wording import counted, listed, mm, percent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from shapespace.report.stills import Still
+    from shapespace.report.thumbnails import Still
 
 Drawn: TypeAlias = "tuple[Still, str]"
 """A picture, and what stands below it."""
@@ -124,7 +124,7 @@ def html_of_fit(result: FitResult) -> str:
     rows += [("Note", note) for note in result.notes]
 
     def draw() -> Drawn:
-        from shapespace.report.stills import fit_strip
+        from shapespace.report.thumbnails import fit_strip
 
         fit = StagedFit.of(result.model, result)
         colours = "blue inside, red outside" if fit.scan.faces is not None else "dark is far"

@@ -180,7 +180,7 @@ def _shortened(table: Table) -> list[Block]:
 
 def _surface(mesh: Mesh, caption: str) -> Callable[[], Drawn]:
     def draw() -> Drawn:
-        from shapespace.report.stills import mesh_still
+        from shapespace.report.thumbnails import mesh_still
 
         return mesh_still(mesh), caption
 

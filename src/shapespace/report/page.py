@@ -17,7 +17,7 @@ from shapespace.report.wording import anchor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
-    from shapespace.report.stills import Still
+    from shapespace.report.thumbnails import Still
 
 LARGEST_REPORT_BYTES = 8_000_000
 """A report stays below this size, so that it can be mailed."""

@@ -152,11 +152,11 @@ def quality_part(page: Page, quality: Quality) -> Figure:
 
 def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
     """Return the model's modes with sliders, as stills of the mean where nothing turns."""
-    from shapespace.report import stills
+    from shapespace.report import thumbnails
     from shapespace.report.scene import pack_model
 
     count = min(most, model.n_modes)
-    still = stills.mesh_still(model.mesh(), (420, 420))
+    still = thumbnails.mesh_still(model.mesh(), (420, 420))
     which = f"The first {counted(count, 'mode')} of {model.n_modes}"
     if count == model.n_modes:
         which = f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}"
@@ -204,7 +204,7 @@ def fit_in_full(
 
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     """Return scan and model of one fit, as a strip of stills where nothing turns."""
-    from shapespace.report import stills
+    from shapespace.report import thumbnails
     from shapespace.report.scene import pack_fit
 
     limit_mm = fit.scale_mm
@@ -213,7 +213,7 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
         if fit.scan.faces is not None
         else f"the distance to the points of the scan, 0 to {limit_mm:g} mm."
     )
-    still = stills.fit_strip(fit, limit_mm, (300, 372))
+    still = thumbnails.fit_strip(fit, limit_mm, (300, 372))
     return page.turning(
         "fit",
         pack_fit(fit, largest_scan=SCAN_TRIANGLES),
@@ -233,10 +233,10 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
         surfaces: `final`, and `dense` where there is one, in the model's frame.
         why: the scan is not shown, as the end of a sentence.
     """
-    from shapespace.report import stills
+    from shapespace.report import thumbnails
     from shapespace.report.scene import pack_surfaces
 
-    still = stills.mesh_still(surfaces["final"], (420, 420))
+    still = thumbnails.mesh_still(surfaces["final"], (420, 420))
     return page.turning(
         "fit",
         pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=why, largest=SCAN_TRIANGLES),

@@ -23,7 +23,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
@@ -190,14 +190,14 @@ class Asymmetry:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        return late("answer_of_asymmetry")(self)
+        return lazy_import("answer_of_asymmetry")(self)
 
     def __repr__(self) -> str:
         rows = listed_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
         return f"<Asymmetry of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def measure_asymmetry(

@@ -15,7 +15,7 @@ from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_edges, vertex_areas
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.model.shape_model import region_vertices
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.change_align import stable_vertices
@@ -56,7 +56,7 @@ class Change(Found):
         return answer_of(self)
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def change(

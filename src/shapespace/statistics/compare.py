@@ -18,7 +18,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
@@ -56,7 +56,7 @@ class CompareOptions:
     """How groups are compared.
 
     Args:
-        squares: one of `TYPES`.
+        anova_type: type of the sums of squares, one of `TYPES`.
         blocks: column with the subject of each scan; subjects may respond differently to all conditions within
             subjects. None if all shapes are independent.
         permutations: arrangements, the observed one among them.
@@ -73,7 +73,7 @@ class CompareOptions:
         effect_size: transformation of F before Z is standardised, one of `EFFECT_SIZES`.
     """
 
-    squares: SquaresType = "II"
+    anova_type: SquaresType = "II"
     blocks: str | None = None
     permutations: int = 1000
     seed: int = 0
@@ -86,8 +86,10 @@ class CompareOptions:
     effect_size: EffectSize = "box-cox"
 
     def __post_init__(self) -> None:
-        if self.squares not in TYPES:
-            raise InputError(f"There is no type {self.squares!r} of sums of squares; choose one of {', '.join(TYPES)}.")
+        if self.anova_type not in TYPES:
+            raise InputError(
+                f"There is no type {self.anova_type!r} of sums of squares; choose one of {', '.join(TYPES)}."
+            )
         if not 20 <= self.permutations <= 1_000_000:
             raise InputError(f"The number of permutations must lie from 20 to 1000000, not at {self.permutations}.")
         if self.seed < 0 or not 0 < self.level < 1:
@@ -244,14 +246,14 @@ class Comparison:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        return late("answer_of_comparison")(self)
+        return lazy_import("answer_of_comparison")(self)
 
     def __repr__(self) -> str:
         terms = listed_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
         return f"<Comparison of {len(self.cohort)} shapes of {self.subjects} subjects; {terms}>"
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def compare(
@@ -296,7 +298,7 @@ def compare(
     subjects = None if options.blocks is None else cohort.table.texts(options.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
     made = strata_of(
-        cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.squares, random
+        cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.anova_type, random
     )
     strata = made.every
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
@@ -385,7 +387,7 @@ def _methods(
     schemes: list[TestScheme] = []
     for stratum in strata:
         for term in stratum.terms:
-            reduced = stratum.reduced(term, options.squares)
+            reduced = stratum.reduced(term, options.anova_type)
             flips = options.unequal_variances or stratum.flips(reduced)
             schemes.append(
                 TestScheme(
@@ -445,7 +447,7 @@ def term_tests(
     """
     total = float((stratum.shapes**2).sum())
     for term in stratum.terms:
-        reduced = stratum.reduced(term, options.squares)
+        reduced = stratum.reduced(term, options.anova_type)
         residual = stratum.residual(reduced)
         own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
@@ -813,7 +815,7 @@ def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
             one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
             for term in design.terms
         )
-        if options.squares == "III" and apart and not one.levels and one.low * one.high > 0:
+        if options.anova_type == "III" and apart and not one.levels and one.low * one.high > 0:
             yield (
                 f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
                 f"center({one.name}) in the formula, or take type II."

@@ -59,7 +59,7 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         notes=(*comparison.cohort.notes, *comparison.notes),
         settings={
             "formula": comparison.design.formula,
-            "squares": comparison.options.squares,
+            "squares": comparison.options.anova_type,
             "blocks": comparison.options.blocks,
             "random": comparison.options.random,
             "permutations": comparison.options.permutations,
@@ -179,7 +179,7 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
     note = (
-        f"Type {comparison.options.squares} sums of squares of Procrustes distances. {_of_f(comparison)} "
+        f"Type {comparison.options.anova_type} sums of squares of Procrustes distances. {_of_f(comparison)} "
         f"{effect_size_sentence(comparison.options.effect_size)} R² is the share of the total of its stratum."
     )
     yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))

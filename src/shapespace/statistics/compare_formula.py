@@ -18,7 +18,7 @@ import numpy as np
 
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only
 

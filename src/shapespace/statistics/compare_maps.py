@@ -17,7 +17,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.geometry.surface import vertex_normals
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum

@@ -24,9 +24,9 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
 from shapespace.io.json_files import plain_json
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import short_repr, told_briefly
-from shapespace.statistics.smoothers import IndexArray
+from shapespace.statistics.linear_regressors import IndexArray
 from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
@@ -56,7 +56,7 @@ class Predictions:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        return late("html_of_predictions")(self)
+        return lazy_import("html_of_predictions")(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Predictor:
         )
 
     def _repr_html_(self) -> str:
-        return late("html_of_predictor")(self)
+        return lazy_import("html_of_predictor")(self)
 
     def predict(self, cohort: Cohort) -> Predictions:
         """Return what is predicted of the shapes of a cohort, of subjects that were not learned from.

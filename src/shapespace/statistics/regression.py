@@ -14,13 +14,11 @@ from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, told_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.answer import Answer
-from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
-from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
-from shapespace.statistics.smoothers import (
+from shapespace.statistics.linear_regressors import (
     CHOICES,
     Choice,
     Decomposed,
@@ -30,6 +28,8 @@ from shapespace.statistics.smoothers import (
     nested,
     weighted_mean,
 )
+from shapespace.statistics.methods import SCAN_OF_SUBJECT, methods_of
+from shapespace.statistics.predictor import Predictions, Predictor, cv_plus, model_hash_of
 from shapespace.types import FloatArray, Mesh, read_only, require
 
 FEWEST, SMALL = 10, 100
@@ -154,7 +154,7 @@ class Regression:
         Args:
             new: shapes of other subjects, and what the predictor says of them; None for none.
         """
-        return late("answer_of_regression")(self, new)
+        return lazy_import("answer_of_regression")(self, new)
 
     def __repr__(self) -> str:
         figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
@@ -165,7 +165,7 @@ class Regression:
         )
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def regress(

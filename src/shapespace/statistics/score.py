@@ -20,7 +20,7 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly
 from shapespace.schemas import Methods, SampleSize, TestScheme
 from shapespace.statistics.answer import Answer
@@ -164,7 +164,7 @@ class Scores:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        return late("answer_of_scores")(self)
+        return lazy_import("answer_of_scores")(self)
 
     def __repr__(self) -> str:
         percentiles = listed_briefly(
@@ -176,7 +176,7 @@ class Scores:
         )
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def score(

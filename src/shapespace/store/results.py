@@ -21,7 +21,7 @@ from shapespace.io.files import read_bytes, read_error
 from shapespace.io.json_files import LARGEST_BYTES, json_of, read_json
 from shapespace.io.meshes import read_mesh
 from shapespace.io.tables import CHECKSUM
-from shapespace.late import late, other_package
+from shapespace.lazy import lazy_import, other_package
 from shapespace.reprs import told_briefly
 from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
@@ -205,7 +205,7 @@ class Results:
         return f"<Results in {told_briefly(str(self.folder))}: {len(self):,} fits>"
 
     def _repr_html_(self) -> str:
-        return late("html_of_results")(self)
+        return lazy_import("html_of_results")(self)
 
     def __len__(self) -> int:
         return len(self.singles) + sum(name not in self.singles for name in self._stored)

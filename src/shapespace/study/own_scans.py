@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
 from shapespace.batch.run import fit_files, make_jobs
-from shapespace.batch.where import Where
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig
@@ -38,7 +38,14 @@ _CURVE = (2, 5, 10, 20, 40, 80)
 
 
 def run_own_study(
-    folder: Path, data: Path, model_file: Path, *, folds: int, where: Where, seed: int = 0, quiet: bool = False
+    folder: Path,
+    data: Path,
+    model_file: Path,
+    *,
+    folds: int,
+    execution: ExecutionConfig,
+    seed: int = 0,
+    quiet: bool = False,
 ) -> tuple[Path, str]:
     """Fit the labelled scans in `data`, classify them, and write recognition.json and its report.
 
@@ -74,7 +81,7 @@ def run_own_study(
         jobs = make_jobs([entry.path for entry in found.scans])
         records = fit_files(
             jobs, model, model_file, make_folder(folder / "fits"), FitConfig(),
-            executor=where.executor(len(jobs), quiet=quiet), resume=True, on_done=fitted,
+            executor=execution.executor(len(jobs), quiet=quiet), resume=True, on_done=fitted,
         )  # fmt: skip
     fits = OwnFits.of(found.scans, records, model, additive)
     settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}

@@ -15,9 +15,9 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.tables import table_text
 from shapespace.report import colours
 from shapespace.report.checker import SQUARES, checker_places
-from shapespace.report.concerns import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.corresponded import Corresponded
 from shapespace.report.scene import pack, quantised
+from shapespace.report.triage import Concern, concerns_of, distance_share, scan_status, sentence
 from shapespace.report.wording import without_folders
 from shapespace.version import __version__
 

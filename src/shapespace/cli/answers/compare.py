@@ -18,7 +18,7 @@ def add(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--random", metavar="TERMS",
                      help="random effects: those within subjects that differ between subjects, such as '1 + time | "
                      "subject' (default with --blocks: all)")  # fmt: skip
-    sub.add_argument("--type", choices=("I", "II", "III"), default="II", dest="squares",
+    sub.add_argument("--type", choices=("I", "II", "III"), default="II", dest="anova_type",
                      help="type of the sums of squares (default II: each term after all terms that do not contain "
                      "it)")  # fmt: skip
     sub.add_argument("--permutations", type=int, default=1000, metavar="N",
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.compare import CompareOptions, compare
 
     options = CompareOptions(
-        squares=arguments.squares,
+        anova_type=arguments.squares,
         blocks=arguments.blocks,
         random=arguments.random,
         permutations=arguments.permutations,

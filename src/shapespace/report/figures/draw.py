@@ -27,7 +27,7 @@ from shapespace.errors import InputError
 from shapespace.report.colours import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render import Camera, Image, Layer, point_spacing
 from shapespace.report.staged import StagedFit, measured_mm
-from shapespace.report.stills import Still, encoded
+from shapespace.report.thumbnails import Still, encoded
 from shapespace.report.wording import counted as counted
 from shapespace.report.wording import mm as mm
 from shapespace.report.wording import percent as percent

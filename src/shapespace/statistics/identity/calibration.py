@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from shapespace.statistics.identity.rates import Pairs
 from shapespace.types import BoolArray, FloatArray, IntArray
 

@@ -10,7 +10,7 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.rates import Figure, figure, people_drawn
@@ -127,14 +127,14 @@ class Identification:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        return late("answer_of_identification")(self)
+        return lazy_import("answer_of_identification")(self)
 
     def __repr__(self) -> str:
         ranks = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
         return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from shapespace.errors import InputError
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from shapespace.statistics.identity.samples import Samples
 from shapespace.types import FloatArray, read_only
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
-from shapespace.late import late
+from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.statistics.answer import Answer
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
@@ -105,14 +105,14 @@ class Verification:
 
     def answer(self) -> Answer:
         """Return it as it is kept and reported."""
-        return late("answer_of_verification")(self)
+        return lazy_import("answer_of_verification")(self)
 
     def __repr__(self) -> str:
         rates = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
         return f"<Verification of {len(self.people)} subjects; {rates}>"
 
     def _repr_html_(self) -> str:
-        return late("html_of_analysis")(self)
+        return lazy_import("html_of_analysis")(self)
 
 
 def verify(

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.report import stills
+from shapespace.report import thumbnails
 from shapespace.report.staged import StagedFit
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan
@@ -24,7 +24,7 @@ def fit() -> StagedFit:
 def map_of(fit: StagedFit, distance_mm: float) -> np.ndarray:
     """Return the panel of the distances, where all of them are the same."""
     far = {stage: np.full(len(fit.regions), distance_mm) for stage in fit.surfaces}
-    data, size = stills.fit_strip(replace(fit, model_to_scan_mm=far), 2.5)
+    data, size = thumbnails.fit_strip(replace(fit, model_to_scan_mm=far), 2.5)
     picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
     assert picture.shape == (size[1], size[0], 3)
     return picture[:, 2 * size[0] // 3 :]

@@ -15,7 +15,7 @@ from shapespace.types import IntArray, SurfaceLandmarks
 
 
 @dataclass(frozen=True, eq=False)
-class HeldTo:
+class RegionFit:
     """What turns a fit of a part into one of the whole.
 
     Args:
@@ -27,13 +27,13 @@ class HeldTo:
     part: Part
 
     @staticmethod
-    def of(whole: ShapeModel, region: str | tuple[int, ...]) -> HeldTo:
+    def of(whole: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
         """Return what holds fits to a region.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        return HeldTo(whole, Part.of(whole, region))
+        return RegionFit(whole, Part.of(whole, region))
 
     def note(self, region: str | tuple[int, ...] | None) -> str:
         """Return a sentence on what the fit is held to."""

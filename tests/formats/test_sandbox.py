@@ -15,8 +15,8 @@ import statismo_by_hand as by_hand
 
 from own_file_fuzz import damaged_bytes, fuzzed
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.io import apart, apart_child
-from shapespace.io.apart import ApartError, read_hdf5_apart, read_matlab_apart
+from shapespace.io import sandbox, sandbox_child
+from shapespace.io.sandbox import ApartError, read_hdf5_apart, read_matlab_apart
 from shapespace.model.shape_model import ShapeModel
 
 Harm = Callable[[Any, Path], None]
@@ -57,7 +57,7 @@ def in_circles(file: Any, secret: Path) -> None:
 
 
 def many_groups(file: Any, secret: Path) -> None:
-    for number in range(apart_child._MOST_NODES + 1):
+    for number in range(sandbox_child._MOST_NODES + 1):
         file.create_group(f"many/{number}")
 
 
@@ -103,12 +103,12 @@ def test_a_file_is_read_apart_as_it_is_in_this_process(harmless: Path) -> None:
 
 
 def test_a_file_that_takes_too_long_or_too_much_is_given_up(harmless: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "MOST_SECONDS", 0)
+    monkeypatch.setattr(sandbox, "MOST_SECONDS", 0)
     with pytest.raises(ApartError, match="longer than 0 s"):
         read_hdf5_apart(harmless)
     monkeypatch.undo()
     if sys.platform == "linux":
-        monkeypatch.setattr(apart, "PROGRAM_BYTES", -3 * 2**26)
+        monkeypatch.setattr(sandbox, "PROGRAM_BYTES", -3 * 2**26)
         with pytest.raises(ApartError, match=r"survive|cannot be read|memory"):
             read_hdf5_apart(harmless)
 
@@ -116,7 +116,7 @@ def test_a_file_that_takes_too_long_or_too_much_is_given_up(harmless: Path, monk
 def test_a_library_that_dies_or_lies_half_way_is_no_model() -> None:
     for answer in (b"", b"half a line", b'{"arrays":[["/a","<f4",[4]]],"texts":{},"attributes":{},"groups":[]}\n1234'):
         with pytest.raises(ApartError, match="does not survive"):
-            apart._tree(answer)
+            sandbox._tree(answer)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such pipes")
@@ -141,7 +141,7 @@ def test_matlab_variables_that_unfold_to_far_more_than_the_file_are_refused(
 ) -> None:
     scipy.io.savemat(tmp_path / "m.mat", {"mean": np.zeros(10**6)}, do_compression=True)
     assert (tmp_path / "m.mat").stat().st_size < 20_000
-    monkeypatch.setattr(apart, "SPARE_BYTES", 2**20)
+    monkeypatch.setattr(sandbox, "SPARE_BYTES", 2**20)
     with pytest.raises(ApartError, match="out of proportion"):
         read_matlab_apart(tmp_path / "m.mat", ["mean"])
 

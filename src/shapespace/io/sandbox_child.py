@@ -1,4 +1,4 @@
-"""What the process of `apart` runs: a program of its own, which imports nothing of shapespace.
+"""Program of the sandbox process: a program of its own, which imports nothing of shapespace.
 
 Its standard input is the file. It writes one line of JSON on what it found and, after it, the bytes of the arrays.
 """

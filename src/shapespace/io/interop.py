@@ -11,7 +11,7 @@ import numpy as np
 
 from shapespace.errors import InputError, MeshError
 from shapespace.io.meshes import read_mesh
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any

@@ -11,7 +11,7 @@ from shapespace.errors import InputError
 
 
 @dataclass(frozen=True)
-class Where:
+class ExecutionConfig:
     """Where tasks run.
 
     Args:
@@ -47,22 +47,22 @@ class Where:
         return EXECUTORS[self.kind](self, tasks, quiet)
 
 
-def _local(where: Where, tasks: int, quiet: bool) -> Executor | None:
-    workers = min(where.jobs or cores(), tasks)
-    return None if workers <= 1 and where.timeout_s is None else Local(max(workers, 1), where.timeout_s, quiet)
+def _local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor | None:
+    workers = min(execution.jobs or cores(), tasks)
+    return None if workers <= 1 and execution.timeout_s is None else Local(max(workers, 1), execution.timeout_s, quiet)
 
 
-def _serial(_where: Where, _tasks: int, _quiet: bool) -> None:
+def _serial(_execution_config: ExecutionConfig, _tasks: int, _quiet: bool) -> None:
     return None
 
 
-def _dask(where: Where, _tasks: int, _quiet: bool) -> Executor:
+def _dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
     from shapespace.batch.on_dask import OnDask  # needs the extra
 
-    return OnDask(where.dask, where.timeout_s)
+    return OnDask(execution.dask, execution.timeout_s)
 
 
-EXECUTORS: dict[str, Callable[[Where, int, bool], Executor | None]] = {
+EXECUTORS: dict[str, Callable[[ExecutionConfig, int, bool], Executor | None]] = {
     "local": _local,
     "serial": _serial,
     "dask": _dask,

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io import apart_child
+from shapespace.io import sandbox_child
 from shapespace.io.files import open_file
 
 MOST_BYTES: Final = 2**32
@@ -90,7 +90,7 @@ def _read(path: Path, asked: dict[str, Any]) -> Tree:
         }
         # A program of its own and not a copy: a copy of a process with threads may hang, and a script without a guard
         # would be run again. -P, since modules beside the program are none of its own.
-        command = [sys.executable, "-P", str(Path(apart_child.__file__)), json.dumps(asked)]
+        command = [sys.executable, "-P", str(Path(sandbox_child.__file__)), json.dumps(asked)]
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),  # not the folder that one stands in
             "OPENBLAS_NUM_THREADS": "1",

@@ -33,7 +33,7 @@ def beside(second: Mesh) -> FitResult:
 
 
 def said(result: FitResult) -> list[str]:
-    return [note for note in result.notes if "another one" in note]
+    return [note for note in result.notes if "second instance" in note]
 
 
 def test_a_second_one_beside_the_first_is_noted_with_its_distance() -> None:

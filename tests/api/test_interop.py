@@ -19,7 +19,7 @@ from sklearn.pipeline import Pipeline
 
 import shapespace as ss
 from shapespace import cli
-from shapespace.late import other_package
+from shapespace.lazy import other_package
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -221,7 +221,7 @@ def test_matlab_reads_the_table_by_the_rules_of_its_names(folder: Path, result: 
 def test_r_reads_coefficients_by_the_snippet_of_the_document(
     folder: Path, result: ss.FitResult, tmp_path: Path
 ) -> None:
-    [snippet] = re.findall(r"^```r\n(.*?)^```", (ROOT / "docs" / "beside.md").read_text("utf-8"), re.DOTALL | re.M)
+    [snippet] = re.findall(r"^```r\n(.*?)^```", (ROOT / "docs" / "interop.md").read_text("utf-8"), re.DOTALL | re.M)
     (tmp_path / "out").symlink_to(folder)
     script = tmp_path / "read.R"
     script.write_text(snippet + '\nwrite.csv(z, "z.csv")\nstopifnot(is.na(fits[fits$scan == "bad", "z1"]))\n', "utf-8")

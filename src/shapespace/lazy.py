@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from shapespace.errors import ShapespaceError
 
-LATE: Mapping[str, str] = MappingProxyType(
+LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
         "answer_of_asymmetry": "statistics.asymmetry_answer",
         "answer_of_comparison": "statistics.compare_answer",
@@ -36,11 +36,11 @@ LATE: Mapping[str, str] = MappingProxyType(
         "plot_model": "report.notebook",
         "plot_quality": "report.notebook",
         "save_fit": "batch.save",
-        "to_menpo": "io.beside",
-        "to_meshio": "io.beside",
-        "to_open3d": "io.beside",
-        "to_pyvista": "io.beside",
-        "to_trimesh": "io.beside",
+        "to_menpo": "io.interop",
+        "to_meshio": "io.interop",
+        "to_open3d": "io.interop",
+        "to_pyvista": "io.interop",
+        "to_trimesh": "io.interop",
         "view_fit": "viewer.notebook",
         "view_model": "viewer.notebook",
     }
@@ -61,9 +61,9 @@ class OpenViewer(Protocol):
         ...
 
 
-def late(name: str) -> Callable[..., Any]:
-    """Return the function `name` of `LATE`."""
-    return getattr(import_module(f"shapespace.{LATE[name]}"), name)
+def lazy_import(name: str) -> Callable[..., Any]:
+    """Return the function `name` of `LAZY_FUNCTIONS`."""
+    return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)
 
 
 def other_package(module: str, what: str, install: str = "") -> Any:
