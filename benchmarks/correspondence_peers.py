@@ -61,7 +61,7 @@ class Way:
     Args:
         surfaces: by the name of the scan, in the pose of the scan as it was given.
         seconds: CPU time of each.
-        aside: why others were set aside, by name.
+        aside: why others were excluded, by name.
     """
 
     surfaces: dict[str, Mesh]
@@ -205,7 +205,7 @@ def table(
 ) -> str:
     """Return the table of a case; differences are beside the first method."""
     titles = (
-        "method", "set aside", "failed", "CPU s a scan", "to the scan: mean, % of diagonal", "99 %", "largest",
+        "method", "excluded", "failed", "CPU s a scan", "to the scan: mean, % of diagonal", "99 %", "largest",
         "folded, %", "generalisation, mm", "less the first one's", "specificity, mm", "to its own surfaces, mm",
         "10 modes hold, %",
     )  # fmt: skip

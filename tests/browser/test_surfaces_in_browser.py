@@ -104,7 +104,7 @@ def test_pages_filters_and_numbers_that_are_no_vertex(open_tab, address: str) ->
     tab.page.get_by_test_id("filter").fill("not a name")
     assert tab.page.get_by_test_id("which").inner_text() == "No scan"
     tab.page.get_by_test_id("filter").fill("stranger")
-    assert "set aside" in tab.page.get_by_test_id("list").inner_text()
+    assert "excluded" in tab.page.get_by_test_id("list").inner_text()
     tab.page.get_by_test_id("filter").fill("able")
     tab.until("document.getElementById('which').textContent === '1 to 1 of 1'")
     tab.page.get_by_test_id("number").fill("600")

@@ -202,7 +202,7 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
         tab.page.get_by_test_id("next-doubtful").click()
         seen.append(tab.page.get_by_test_id("fit-detail").inner_text())
     assert any("broken" in detail for detail in seen)
-    assert not any("Pose and shape stood still" in detail for detail in seen)
+    assert not any("Converged; robust residual SD" in detail for detail in seen)
     tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
     tab.until("document.getElementById('caption-a').textContent.startsWith('holes')")
     told = tab.page.get_by_test_id("fit-detail").get_by_test_id("shown").inner_text()

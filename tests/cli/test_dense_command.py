@@ -75,7 +75,7 @@ def test_resume_knows_whether_it_was_asked_for(run: Run, world: World, tmp_path:
     surface = tmp_path / "scan_0.dense.ply"
     assert run(*command).code == 0 and not surface.exists()
     asked = run(*command, "--dense")
-    assert asked.code == 0 and surface.is_file() and "dense surface to scan" in asked.out
+    assert asked.code == 0 and surface.is_file() and "dense surface: median distance model" in asked.out
     written = surface.stat().st_mtime_ns
     assert run(*command, "--dense").code == 0 and surface.stat().st_mtime_ns == written
     surface.unlink()

@@ -113,7 +113,7 @@ def test_further_scans_join_the_table_and_the_report_counts_the_same(run: Run, w
     assert sorted(after) == sorted(rows) and after["scan_1"]["status"] != before["status"]
 
 
-def test_the_terminal_tells_what_scan_and_model_both_show_and_how_many_more_there_are(
+def test_the_terminal_prints_overlap_distances_and_how_many_more_scans_there_are(
     run: Run, world: World, tmp_path: Path
 ) -> None:
     half = raw_scan(np.zeros(5), similarity(3, 8.0, 1.0), vertices=2000, keep=-0.1, noise_mm=0.1).scan
@@ -126,25 +126,23 @@ def test_the_terminal_tells_what_scan_and_model_both_show_and_how_many_more_ther
     assert f"and 2 more scans; all are in {tmp_path / 'o' / 'coefficients.csv'}" in lines
     shown = record_of(tmp_path / "o", "half_00")["shown"]
     assert shown["model_seen_share"] < 0.8
-    assert listed[0].startswith(
-        f"half_00.ply: converged; model to scan {shown['model_to_scan']['mean']:.2f} mm mean over the "
-        f"{100 * shown['model_seen_share']:.0f} % of it that the scan shows, scan to model "
-        f"{shown['scan_to_model']['mean']:.2f} mm mean over the {100 * shown['scan_covered_share']:.0f} % of it that "
-        "the model covers"
+    in_scan = record_of(tmp_path / "o", "half_00")["shown_scan_mm"]
+    assert listed[0].replace("->", "→") == (
+        f"half_00.ply: converged: mean distance model→scan {in_scan['model_to_scan']['mean']:.2f} mm "
+        f"({100 * shown['model_seen_share']:.0f} % overlap), scan→model {in_scan['scan_to_model']['mean']:.2f} mm "
+        f"({100 * shown['scan_covered_share']:.0f} % overlap)"
     )
 
 
-def test_a_scan_of_another_size_is_told_in_its_own_millimetres_too(run: Run, world: World, tmp_path: Path) -> None:
+def test_distances_of_a_scan_of_another_size_are_in_its_own_millimetres(run: Run, world: World, tmp_path: Path) -> None:
     mesh = read_mesh(world.scan)
     write_mesh(tmp_path / "large.ply", mesh.with_vertices(1.3 * mesh.vertices))
     outcome = run("fit", world.model, tmp_path / "large.ply", "-o", tmp_path, "--unit", "mm", "--quiet")
-    in_scan = record_of(tmp_path, "large")["shown_scan_mm"]
-    assert (
-        f"({in_scan['model_to_scan']['mean']:.2f} and {in_scan['scan_to_model']['mean']:.2f} mm of the scan)"
-        in outcome.out
-    )
-    usual = run("fit", world.model, world.scan, "-o", tmp_path, "--quiet")
-    assert "mm of the scan" not in usual.out
+    record = record_of(tmp_path, "large")
+    in_scan, in_model = record["shown_scan_mm"], record["shown"]
+    assert in_scan["model_to_scan"]["mean"] > 1.2 * in_model["model_to_scan"]["mean"]
+    for direction in ("model_to_scan", "scan_to_model"):
+        assert f" {in_scan[direction]['mean']:.2f} mm (" in outcome.out
 
 
 @pytest.fixture

@@ -262,7 +262,7 @@ def _add_quality(commands: Any) -> None:
     sub.add_argument("--unseen", type=Path, metavar="FOLDER",
                      help="also the error on these shapes in correspondence, which no model saw")  # fmt: skip
     sub.add_argument("--folds", type=_folds, default=10, metavar="N|loo",
-                     help="in how many parts shapes are left out (default 10); loo: each by itself")  # fmt: skip
+                     help="in how many parts shapes are left out (default 10); loo: one shape at a time")  # fmt: skip
     sub.add_argument("--modes", type=_positive, metavar="K", help="the largest number of modes (default: all)")
     sub.add_argument("--samples", type=_positive, default=100, metavar="N", help="random shapes (default 100)")
     sub.add_argument("--gauge", choices=("form", "shape"), default="shape", help="as of build (default shape)")
@@ -385,8 +385,8 @@ def _add_convert(commands: Any) -> None:
                "shapespace convert femur.h5.json femur.h5\n"
                "         shapespace convert model.h5 model.bin --to eos")  # fmt: skip
     sub.add_argument("source", type=Path, metavar="IN", help="a model in any format that is read")
-    sub.add_argument("output", type=Path, metavar="OUT", help="its ending tells the format; .h5 is shapespace's own")
-    sub.add_argument("--to", metavar="FORMAT", help="the format by its name, where the ending does not tell it")
+    sub.add_argument("output", type=Path, metavar="OUT", help="its extension sets the format; .h5 is shapespace's own")
+    sub.add_argument("--to", metavar="FORMAT", help="the format by its name, if the extension does not determine it")
     sub.add_argument("--unit", choices=("um", "mm", "cm", "inch", "m"), help="of IN, where its format does not say")
     sub.add_argument("--expressions", type=Path, metavar="FILE.bin",
                      help="blendshapes that eos keeps in a file of their own")  # fmt: skip

@@ -24,6 +24,15 @@ def show(line: str) -> None:
     print(_visible(line))
 
 
+def arrow() -> str:
+    """Return an arrow as the encoding of standard output allows it."""
+    try:
+        "\N{RIGHTWARDS ARROW}".encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return "->"
+    return "\N{RIGHTWARDS ARROW}"
+
+
 def now(line: str) -> None:
     """Print a line at once, for a command that goes on."""
     show(line)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shapespace.cli.printing import now, say, short, show, show_json, warn
+from shapespace.cli.printing import arrow, now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
     from shapespace.batch.execution import ExecutionConfig
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
 _LISTED = 10
 """Scans that the terminal lists."""
-_OTHER_SIZE = 0.02
-"""Share by which a millimetre of the scan differs from one of the model where both are told."""
 
 
 def demo(arguments: argparse.Namespace) -> int:
@@ -605,7 +603,7 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
         show(f"round {number}: vertices moved by {100 * moved:.2f} % of the size (RMS)")
     for record in records:
         if record.reason:
-            warn(f"{record.name} is set aside: {record.reason}")
+            warn(f"{record.name} is excluded: {record.reason}")
     there = [record for record in records if not record.reason]
     seen = sum(record.seen_share or 0.0 for record in there) / len(there)
     show(
@@ -621,31 +619,28 @@ def _print_fit(name: str, record: Mapping[str, Any]) -> None:
     file = str(record["scan"]["name"])
     # A scan that shares its file's name with others goes by the name of its results.
     called = file if stem_of(file) == name else f"{name} ({file})"
-    told = _distances(record, "shown")
-    show(f"{called}: {record['status']}" + (f"; {told}" if told else ""))
-    if told := _distances(record, "shown_dense", measure="median"):
-        show(f"  dense surface to scan: {told.removeprefix('model to scan ')}")
+    distances = _distances(record, "shown")
+    show(f"{called}: {record['status']}" + (f": {distances}" if distances else ""))
+    if distances := _distances(record, "shown_dense", measure="median"):
+        show(f"  dense surface: {distances}")
     for note in record["notes"]:
         show(f"  {note}")
 
 
 def _distances(record: Mapping[str, Any], key: str, measure: str = "mean") -> str:
-    """Return the distances over what scan and model both show, in words; empty where the record does not tell."""
-    shown, in_scan = record.get(key), record.get(f"{key}_scan_mm")
-    if not shown or not in_scan:
+    """Return the overlap distances in millimetres of the scan as text; empty if the record has none."""
+    overlap, in_scan = record.get(key), record.get(f"{key}_scan_mm")
+    if not overlap or not in_scan:
         return ""
-    told = [shown[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
-    if any(value is None or not math.isfinite(value) for value in told):
-        return "scan and model show nothing in common"
-    sizes = [in_scan[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
-    seen, covered = (f"{100 * shown[key]:.0f} %" for key in ("model_seen_share", "scan_covered_share"))
-    words = (
-        f"model to scan {told[0]:.2f} mm {measure} over the {seen} of it that the scan shows, "
-        f"scan to model {told[1]:.2f} mm {measure} over the {covered} of it that the model covers"
+    distances = [in_scan[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    if any(value is None or not math.isfinite(value) for value in distances):
+        return "scan and model do not overlap"
+    shares = [f"{100 * overlap[name]:.0f} % overlap" for name in ("model_seen_share", "scan_covered_share")]
+    to = arrow()
+    return (
+        f"{measure} distance model{to}scan {distances[0]:.2f} mm ({shares[0]}), "
+        f"scan{to}model {distances[1]:.2f} mm ({shares[1]})"
     )
-    if abs(sizes[0] - told[0]) > _OTHER_SIZE * told[0]:
-        words += f" ({sizes[0]:.2f} and {sizes[1]:.2f} mm of the scan)"
-    return words
 
 
 def _without_history(record: Mapping[str, Any]) -> dict[str, Any]:

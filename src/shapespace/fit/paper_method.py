@@ -92,8 +92,8 @@ class Paper:
     def reason(self, ended: Ended) -> str:
         """Return why it stopped."""
         return (
-            f"The RMS closest distance stood still at {ended.phases[2].rms_mm:.2f} mm: it changed by less than "
-            f"{self.stop_rate:g} of itself and no vertex moved more than {self.stop_motion_mm:g} mm."
+            f"Converged; RMS closest distance {ended.phases[2].rms_mm:.2f} mm: its relative change is below "
+            f"{self.stop_rate:g} and no vertex moved more than {self.stop_motion_mm:g} mm."
         )
 
     def doubts(self, ended: Ended) -> list[str]:

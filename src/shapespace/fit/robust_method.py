@@ -81,9 +81,9 @@ class Robust(RobustSettings):
         ]
 
     def reason(self, ended: Ended) -> str:
-        """Return that it stood still, and how near."""
+        """Return that the fit converged, with its robust residual standard deviation."""
         e = ended.fitted.evidence
         return (
-            f"Pose and shape stood still: what matches lies {e['spread_mm']:.2f} mm apart (robust standard deviation), "
-            f"at {100 * e['model_matched_share']:.0f} % of the model's vertices."
+            f"Converged; robust residual SD {e['spread_mm']:.2f} mm over {100 * e['model_matched_share']:.0f} % of the "
+            "model's vertices."
         )

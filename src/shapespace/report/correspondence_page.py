@@ -47,7 +47,7 @@ _MOST_NAMED = 12
 _HARDLY_SEEN, _WHOLE_SHARE = 0.5, 0.9
 _STATUS = {
     "unreadable": ("unreadable", "failed"),
-    "set aside": ("set aside", "failed"),
+    "set aside": ("excluded", "failed"),
     "look": ("to be looked at", "doubtful"),
     "corresponding": ("in correspondence", "converged"),
 }
@@ -165,7 +165,7 @@ class CorrespondencePage:
         told += f"; {counted(len(some), 'of them stands', 'of them stand')} out and should be looked at" if some else (
             " and none of them stands out"
         )  # fmt: skip
-        told += f"; {aside} {'is' if aside == 1 else 'are'} set aside." if aside else "."
+        told += f"; {aside} {'is' if aside == 1 else 'are'} excluded." if aside else "."
         folded = [record.folded_share for record in self.records if record.folded_share]
         told += " No triangle is folded over." if not folded else (
             f" {counted(len(folded), 'scan has', 'scans have')} folded triangles, {percent_of(max(folded))} at most."
@@ -187,7 +187,7 @@ class CorrespondencePage:
         items = [Item(sentence(r.reason), Cell(r.name, place=self._cards.get(r.name))) for r in self.at.set_aside]
         if len(items) > _MOST_NAMED:
             items = [*items[:_MOST_NAMED], Item(f"{counted(len(items) - _MOST_NAMED, 'other')}, in the table of all.")]
-        return Notice("Set aside, and not in a model built from this folder", items, "broken")
+        return Notice("Excluded scans: they are not in a model built from this folder", items, "broken")
 
     def _to_look_at(self) -> Notice:
         some = self.looked_at
@@ -324,7 +324,7 @@ class CorrespondencePage:
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
         carded = self._carded()
-        out: list[Block] = [Text("Those set aside come first, then those that stand out most.")]
+        out: list[Block] = [Text("Sorted: excluded scans first, then by how much they stand out.")]
         if len(carded) < len(self.records) + len(self.out):
             others = counted(len(self.records) + len(self.out) - len(carded), "other scan")
             out.append(
@@ -355,7 +355,7 @@ class CorrespondencePage:
             scan = drawable(self._bounded(record))[0]
             if scan.faces is not None:
                 scan = scan.with_vertices(scan.vertices @ upright(scan).T)
-            return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, set aside"), ""
+            return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, excluded"), ""
         placed = self.at.placed(record.name)
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)

@@ -76,7 +76,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         else:
             files += _surfaces(path, summary)
             if summary.set_aside:
-                notes.append(f"{path}: without {len(summary.set_aside)} scans that were set aside ({_names(summary)}).")
+                notes.append(f"{path}: without {len(summary.set_aside)} excluded scans ({_names(summary)}).")
     ratios: dict[Path, float] = {}
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:

@@ -4,7 +4,7 @@
 
   const Viewer = window.ShapespaceViewer;
   const { $, h, save, alertUser, ask, guarded, json, binary } = Viewer;
-  const WORDS = { unreadable: "unreadable", "set aside": "set aside", look: "to be looked at", corresponding: "in correspondence" };
+  const WORDS = { unreadable: "unreadable", "set aside": "excluded", look: "to be looked at", corresponding: "in correspondence" };
   const DOTS = { unreadable: "unreadable", "set aside": "failed", look: "doubtful", corresponding: "converged" };
 
   window.shapespaceReady = false;

@@ -8,7 +8,7 @@
   const FILTERED_FROM = 12;
   const OTHER_SIZE = 0.02; // share by which the scan's millimetres differ where both are told
   const STATUS = {
-    converged: "Nothing speaks against this fit", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
+    converged: "No problems detected", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
     failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
   };
   const LEFT_RED = [0.83, 0.25, 0.15];
