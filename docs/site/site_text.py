@@ -66,6 +66,7 @@ NAVIGATION = {
     ],
     "Look up": [
         "docs/cli",
+        "docs/glossary",
         "docs/api",
         "docs/api-stability",
         "docs/model-formats",
