@@ -369,7 +369,7 @@ def test_fit_prints_facts_as_json_or_a_line_a_scan(run: Run, world: World, tmp_p
     assert record == {key: value for key, value in written.items() if key != "history"}
     text = run("fit", world.model, world.scan, "-o", tmp_path / "o", "--resume")
     lines = text.out.splitlines()
-    assert lines[0].startswith("scan_0.ply: converged; model to scan ")
+    assert lines[0].replace("->", "→").startswith("scan_0.ply: converged: mean distance model→scan ")
     assert lines[1] == f"1 scan: 1 converged; results in {tmp_path / 'o'}"
 
 

@@ -244,7 +244,7 @@ def test_mixed_units_are_said_and_build_brings_them_together(
 ) -> None:
     metres = SCANS[2].with_vertices(1e-3 * SCANS[2].vertices)
     said = say(a=SCANS[0], b=SCANS[1], c=metres, d=SCANS[3])
-    assert "1 of 4 scans is in another unit than most, as sizes tell (c)" in said
+    assert "1 of 4 scans is in another unit than the majority, judging by size (c)" in said
     assert '"other_units": {\n  "c": 0.001\n }' in (tmp_path / "same" / "correspondence.json").read_text("utf-8")
     model = tmp_path / "model.h5"
     build = ["build", str(tmp_path / "same"), "-o", str(model), "--quiet"]

@@ -172,7 +172,7 @@ def test_kinds_that_are_none_are_refused(bosphorus: Path):
 
 def test_a_folder_without_the_kind_asked_for_is_refused(tmp_path: Path):
     put(tmp_path, "bs000_YR_R10_0.bnt")
-    assert "no scans of the kind neutral or expression" in refusal(tmp_path)
+    assert "no scans of kind neutral or expression" in refusal(tmp_path)
 
 
 def test_the_databases_are_not_mixed(tmp_path: Path):

@@ -27,6 +27,8 @@ NAMES_KEPT = {
     "ShapeModel.with_more": {"tell"},
 }
 """Public names, each with the words in its signature that stay, and the reason."""
+STATUSES_KEPT = {"set aside"}
+"""Values in result files, which programs read; they are printed as other words."""
 NOT_YET_CLEAN: tuple[str, ...] = ()
 """File names of pages in docs that still have such words; every other page, also a new one, is checked."""
 GLOSSARY = ROOT / "docs" / "glossary.md"
@@ -90,6 +92,23 @@ def test_the_help_of_a_command_has_none_of_the_words(command: str, parser: argpa
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_document_has_none_of_the_words(page: Path) -> None:
     assert ruled_out_in(prose_of(page)) == []
+
+
+def sentences() -> Iterator[tuple[str, str]]:
+    """Yield (place, text) of the strings in src that are no docstrings and have several words."""
+    for file in sorted((ROOT / "src").rglob("*.py")):
+        tree = ast.parse(file.read_text("utf-8"))
+        docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Constant) or not isinstance(node.value, str) or id(node) in docs:
+                continue
+            if " " in node.value.strip() and node.value not in STATUSES_KEPT:
+                yield f"{file.relative_to(ROOT)}:{node.lineno}", node.value
+
+
+def test_messages_have_none_of_the_words() -> None:
+    found = {place: words for place, text in sentences() if (words := ruled_out_in(text))}
+    assert not found
 
 
 def test_pages_not_yet_clean_exist_and_have_such_words() -> None:

@@ -210,5 +210,5 @@ def test_a_crop_that_leaves_nothing_says_where_the_scan_lies() -> None:
     raw = scanned(0)
     with pytest.raises(FitError, match="leaves 0 of its 4000 vertices, which lie between"):
         fit_scan(MODEL, raw.scan, replace(MM, crop="sphere:9999,0,0,5"))
-    with pytest.raises(FitError, match="goes by landmarks, and none are given"):
+    with pytest.raises(FitError, match="needs landmarks, and none are given"):
         fit_scan(MODEL, raw.scan, replace(MM, crop="landmarks:50"))

@@ -76,7 +76,7 @@ def test_the_page_tells_of_all_and_shows_some(folder: Path, few: None, sketched:
         "Of 160 fits these",
     ):
         assert told in text
-    assert "site Oslo" not in text and "Not told of: person." in text
+    assert "site Oslo" not in text and "Not shown: person." in text
     # Of the other fits, none is named.
     named = {name for name in Results(folder).names() if name in text}
     assert len(named) <= 3 + 4 + 5 + 3

@@ -364,8 +364,8 @@ def _note_other_objects(made: Correspondence, notes: dict[str, list[str]]) -> No
     for scan in there:
         if scan.moved and scan.moved[0] > _ANOTHER_SHAPE:
             notes[scan.name].append(
-                f"It differs from the others by {100 * scan.moved[0]:.0f} % of its size, and so few scans do not tell "
-                "whether it is another object; look at it."
+                f"It differs from the others by {100 * scan.moved[0]:.0f} % of its size, and there are too "
+                "few scans to decide whether it is another object; inspect it."
             )
 
 
@@ -385,8 +385,8 @@ def _tell(records: Sequence[CorrespondRecord], made: Correspondence, given: str,
         named = ", ".join(record.name for record in others[:_LISTED]) + (", ..." if len(others) > _LISTED else "")
         what = "scans is" if len(others) == 1 else "scans are"
         say(
-            f"{len(others)} of {len(records)} {what} in another unit than most, as sizes tell ({named}); so are the "
-            "surfaces, and build brings them to that of most."
+            f"{len(others)} of {len(records)} {what} in another unit than the majority, judging by size ({named}); "
+            "so are the surfaces, and build converts them to the unit of the majority."
         )
 
 

@@ -105,8 +105,8 @@ def quality(
     for target in found:
         if isinstance(target.what, ShapeModel):
             notes.append(
-                f"{target.name} is a model file, which does not keep its training shapes: compactness is told, "
-                "generalisation and specificity only of a folder"
+                f"{target.name} is a model file, which does not keep its training shapes: only compactness is "
+                "computed; generalisation and specificity need a folder"
                 + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
             )
     write_text(output / "quality.json", json_text(result))

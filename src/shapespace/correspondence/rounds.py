@@ -408,7 +408,7 @@ class _State:
 
     def _doubt(self, placed: Placed) -> str:
         """Return what else may be wrong with a scan whose pose its landmarks tell."""
-        return "; or its landmarks, which tell its pose, have wrong names" if placed.by_landmarks else ""
+        return "; or its landmarks, which determine its pose, have wrong names" if placed.by_landmarks else ""
 
     def _settle_rivals(self) -> None:
         """Where several poses were about as likely, take the one whose shape the scans of sure pose tell best."""

@@ -195,7 +195,7 @@ def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expressio
         else:
             left_out.append(LeftOut(_inside(scan.path, folder), f"not asked for ({scan.kind})"))
     if not scans:
-        raise InputError(f"{folder} holds no scans of the kind {' or '.join(kinds)}; choose other kinds or folders.")
+        raise InputError(f"{folder} holds no scans of kind {' or '.join(kinds)}; choose other kinds or folders.")
     return ScanSet(folder, layout, tuple(scans), tuple(left_out))
 
 

@@ -94,7 +94,7 @@ class Crop:
         if self.kind == "sphere":
             return np.asarray(np.linalg.norm(x - np.array(self.numbers[:3]), axis=1) <= self.numbers[3])
         if not landmarks:
-            raise FitError(f"{scan.name}: the crop {self.text} goes by landmarks, and none are given for it.")
+            raise FitError(f"{scan.name}: the crop {self.text} needs landmarks, and none are given for it.")
         points = np.stack(list(landmarks.values()))
         mm = MM_PER_UNIT[unit if unit != "auto" else _unit(model, landmarks, scan.name)]
         inside = np.zeros(len(x), dtype=np.bool_)
@@ -112,6 +112,6 @@ def _unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str
     shared = [name for name in model.landmarks if name in landmarks]
     there = rms_size(np.stack([landmarks[name] for name in shared])) if len(shared) > 1 else 0.0
     if there == 0.0:
-        raise FitError(f"{scan_name}: its landmarks do not tell its unit, by which it is cropped; give --unit.")
+        raise FitError(f"{scan_name}: its landmarks do not determine its unit, which the crop needs; give --unit.")
     ratio = there / rms_size(model.landmarks.select(shared).interpolate(model.mean_vertices))
     return min(MM_PER_UNIT, key=lambda unit: abs(float(np.log(ratio * MM_PER_UNIT[unit]))))

@@ -43,14 +43,14 @@ def doubts_of_returned(ended: Ended) -> list[str]:
     scale = fitted.T_scan_model.scale / fitted.T_scan_fitted.scale
     if abs(np.log(scale)) > _OTHER_SCALE:
         found.append(
-            f"told in the model's own modes, the surface that was fitted would be {scale:.3g} times as large as it is"
+            f"projected onto the model's own modes, the fitted surface would be {scale:.3g} times as large as it is"
         )
     own = fitted.T_scan_fitted.inverse()
     told = (own @ fitted.T_scan_model).apply(model.reconstruct(fitted.b))
     away_mm = float(np.sqrt(((own.apply(fitted.vertices_scan_mm) - told) ** 2).sum(axis=1).mean()))
     if away_mm > _MOVED_AWAY * fitted.outside_mm + _LEAST_MOVED_SHARE * ended.size_mm:
         found.append(
-            f"told in the model's own modes, the surface moves {away_mm:.2g} mm away from the one that was fitted"
+            f"projected onto the model's own modes, the surface moves {away_mm:.2g} mm away from the fitted one"
         )
     dense = ended.stages.get("dense")
     if dense is not None and dense.moved_mm > _DENSE_MOVED_SHARE * ended.size_mm:

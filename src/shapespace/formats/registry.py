@@ -72,7 +72,7 @@ def format_to_write(path: Path, name: str | None) -> ModelFormat:
     if (only := next(filter(is_meant, READ_ONLY_MODELS.values()), None)) is not None:
         what = f"Cannot write {path}: {only.title} is only read"
     else:
-        what = f"There is no format {name!r}" if name else f"The name {path.name!r} tells no format"
+        what = f"There is no format {name!r}" if name else f"The name {path.name!r} names no format"
     names = ", ".join(f"{one.name} ({one.suffixes[0]})" if one.suffixes else one.name for one in MODEL_FORMATS.values())
     raise InputError(f"{what}; choose one of {names}, or .h5 for shapespace's own.")
 

@@ -133,7 +133,9 @@ def _of_cells(cells: Mapping[str, Any], called: str) -> IntArray | None:
         found += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
     others = sorted(set(cells) - {"triangle", "quad", "vertex", "line"})
     if others:
-        raise InputError(f"{called}: it has cells of the kind {others[0]}, which are no surface; extract that first.")
+        raise InputError(
+            f"{called}: it has cells of type {others[0]}, which are no surface; extract the surface first."
+        )
     return np.concatenate(found).astype(np.int32) if found else None
 
 

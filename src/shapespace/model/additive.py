@@ -250,7 +250,7 @@ class AdditiveModel:
             InputError: no scans, or another number of words on neutral.
         """
         if not told or (neutral is not None and len(neutral) != len(told)):
-            raise InputError("Give what at least one fit told, and one word on neutral for each or none.")
+            raise InputError("Pass at least one estimate of a fit, and one value of neutral for each or none.")
         k, share = self.n_identity, 1.0 / len(told)
         left: FloatArray = np.eye(k)
         right: FloatArray = np.zeros(k)
@@ -457,5 +457,5 @@ def _as_shape_model(A: FloatArray, B: FloatArray) -> tuple[tuple[FloatArray, Flo
     orthonormal, upper = np.linalg.qr(W)
     left, stddev, right = np.linalg.svd(upper)
     if stddev[-1] <= np.sqrt(_NO_VARIANCE) * stddev[0]:
-        raise InputError("Identity and expression share modes, so they cannot be told apart; ask for fewer modes.")
+        raise InputError("Identity and expression share modes, so they cannot be separated; ask for fewer modes.")
     return (orthonormal @ left, stddev), right.T

@@ -83,7 +83,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
     if linear.expression is not None and len(stddev) == moved.shape[1]:
         rotation = right
     elif linear.expression is not None:
-        notes.append("Identity and expression share modes, so that they cannot be told apart and are one.")
+        notes.append("Identity and expression share modes, so they cannot be separated and are treated as one.")
     if linear.n_training is None and not linear.held_out:
         notes.append(f"It does not say of how many shapes it was made; {len(stddev) + 1} are taken.")
     kept = float((stddev**2).sum())

@@ -73,8 +73,8 @@ def large_components(
         found = _leading(covariance, d, cast(int | float, modes), total, Stop(), seed, kept, on_pass)
         if found is None:
             raise InputError(
-                f"The modes asked for cannot be told from the next ones in {_columns(d)} directions, which is what "
-                "memory is taken for; ask for fewer modes."
+                f"The modes asked for cannot be separated from the next ones in {_columns(d)} directions, the number "
+                "that memory is reserved for; ask for fewer modes."
             )
         variance = varying(found.values)
         rows = np.ascontiguousarray(found.vectors.T[: len(variance)])

@@ -726,5 +726,5 @@ def _more_shapes(by_shapes: Curve, seed: int) -> str:
     if low > 0 and now >= 5:
         return said + "so more shapes would help."
     return said + (
-        "so more shapes would help little." if high < 10 else "so these shapes do not tell whether more would help."
+        "so more shapes would help little." if high < 10 else "so these shapes do not show whether more would help."
     )

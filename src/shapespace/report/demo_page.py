@@ -351,13 +351,13 @@ class DemoPage:
     # Experiment 2
 
     def experiment_2(self) -> list[Block]:
-        """Return models of many people, fitted to scans of somebody else."""
+        """Return models of many people, fitted to scans of another person."""
         if not self.cases:
             raise FileFormatError("demo.json holds no case of experiment 2; run the demo again.")
         scans = "a scan" if len(self.cases) == 1 else "scans"
         models = [case.model for case in self.cases]
         return [
-            Text(f"Models of many people's neutral faces, fitted to {scans} of somebody else."),
+            Text(f"Models of many people's neutral faces, fitted to {scans} of another person."),
             *(
                 self.page.section(
                     case.title or "Case",

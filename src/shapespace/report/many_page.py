@@ -257,7 +257,7 @@ class ManyPage(FolderPage):
         ]
         left = [*self.population.left_out, *(column.name for column in self.population.listed[_MOST_COLUMNS:])]
         if left:
-            parts.append(Text(f"Not told of: {listed(left)}.", "soft"))
+            parts.append(Text(f"Not shown: {listed(left)}.", "soft"))
         return parts
 
     def by(self, column: Listed) -> list[Block]:

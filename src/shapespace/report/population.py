@@ -253,7 +253,7 @@ class Population:
             if status == "converged":
                 continue
             # Reasons differ by names and numbers, which say nothing about how often they occur.
-            plain = _NUMBERS.sub("…", _NAMES.sub("…", reason or "no reason told"))[:200]
+            plain = _NUMBERS.sub("…", _NAMES.sub("…", reason or "no reason given"))[:200]
             if (status, plain) not in self.n_reasons and len(self.n_reasons) >= _MOST_REASONS:
                 plain = "another reason"
             self.n_reasons[status, plain] += 1

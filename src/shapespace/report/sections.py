@@ -338,7 +338,7 @@ def fit_facts(fit: SavedFit) -> list[Block]:
     if fit.record.notes:
         out.append(Notes(fit.record.notes))
     if fit.record.evidence:
-        out.append(Folded("What the verdict goes by", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
+        out.append(Folded("Evidence for the verdict", [evidence_facts(fit.record.evidence, f"Evidence of {fit.name}")]))
     return out
 
 

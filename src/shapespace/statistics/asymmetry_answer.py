@@ -102,7 +102,7 @@ def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
         sentences.append(
             f"Directional asymmetry is shown at {shown} of {len(found.mean)} vertices (family-wise p at most {_ALPHA})."
             if shown
-            else f"No place shows directional asymmetry by itself (family-wise p above {_ALPHA} everywhere)."
+            else f"No vertex shows directional asymmetry (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
     sentences.append(f"The most asymmetric is {found.subjects[first]} with {_told(found, first)}.")

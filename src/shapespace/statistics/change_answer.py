@@ -296,7 +296,7 @@ def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) 
 def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     found = change.repeatability
     if found is None:
-        text = f"There are no rescans: nobody was scanned twice at a time. {_SOURCES[change.uncertainty]}"
+        text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
         return [TextPart(title="What is noise", level=2, text=text)]
     arrays |= {"smallest_mm": found.smallest_mm, "icc": found.icc}
     rows: list[tuple[Any, ...]] = [

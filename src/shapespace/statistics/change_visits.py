@@ -102,8 +102,8 @@ def time_column(table: Table, time: str | None) -> str:
     there = next((name for name in TIMES if name in table.columns), None)
     if there is None:
         raise InputError(
-            f"{table.where} has no column {', '.join(TIMES[:-1])} or {TIMES[-1]}; name the one that tells when each "
-            "scan was taken with --time."
+            f"{table.where} has no column {', '.join(TIMES[:-1])} or {TIMES[-1]}; name the column with "
+            "the time of each scan with --time."
         )
     return there
 

@@ -86,7 +86,7 @@ def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> A
 def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
     m, level = found.measures, f"{100 * found.level:.0f} %"
     sentences = [
-        f"Shape tells {found.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
+        f"Shape predicts {found.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
         f"({level} interval {_span(m['rmse'])}), beside {found.baseline_rmse:.3g} by the mean alone: "
         f"R² = {m['r2'].value:.2f} ({_span(m['r2'])})" + ("." if found.p is None else f", p = {found.p:.2g}."),
         f"{level} intervals are {m['width'].value:.3g} wide on average, and hold {100 * m['coverage'].value:.0f} % of "
@@ -103,7 +103,7 @@ def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple
         sentences.append(permutation_scheme(found.subjects, found.observed))
     if found.small:
         sentences.insert(1, f"{found.n_subjects} subjects are a small sample (fewer than {SMALL}): another would "
-                            "give other figures, and the intervals tell how far.")  # fmt: skip
+                            "give other figures, within the intervals stated.")  # fmt: skip
     if new is not None:
         cohort, told = new
         sentences.append(f"{len(told.names)} new shapes are predicted. {_outside(found.predictor, told)}")

@@ -232,8 +232,8 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
     if counts:
         made.append(parts.learning_curve("How many people it takes", folds, counts, ceiling=None))
     summary = [
-        f"{len(classes)} expressions of unseen people are told apart at {parts.words(accuracy)} (95 % interval "
-        f"over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
+        f"{len(classes)} expressions of unseen people are classified with an accuracy of {parts.words(accuracy)} "
+        f"(95 % interval over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
         f"{parts.words(1 / len(classes))}).",
         f"{doubtful + failed} of {len(fits.status)} fits are not to be trusted.",
     ]

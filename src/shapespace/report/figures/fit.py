@@ -312,7 +312,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
         axes.bar(at, high - low, bottom=low, width=0.9, color="#e3e5e8", label="95 % of the training set")
     deviation = z_stddev(fit)[:shown]
     told = fit.shrinkage[:shown] >= 0.5
-    for mask, colour, name in ((told, FORWARD, "told by the scan"), (~told, "#9cc3df", "mostly the model's guess")):
+    for mask, colour, name in ((told, FORWARD, "determined by the scan"), (~told, "#9cc3df", "mostly the prior")):
         if mask.any():
             axes.bar(at[mask], z[mask], width=0.55, color=colour, label=name, zorder=2)
     known = np.isfinite(deviation)

@@ -32,7 +32,7 @@ def answer_of_identification(found: Identification) -> Answer:
             f"By {called(first.name)} the right subject is the first of {found.enrolled} in "
             f"{in_percent(first.rank_1)} of {found.probes - strangers} searches.",
             *(
-                f"Where {100 * rate:g} % of searches for strangers may find somebody, "
+                f"Where {100 * rate:g} % of searches for strangers may return a person, "
                 f"{in_percent(one)} of those enrolled are missed."
                 for rate, one in first.fnir.items()
                 if one.value is not None
@@ -105,8 +105,8 @@ def _parts(found: Identification) -> tuple[Part, ...]:
     return (
         TablePart(
             title="Identification rates",
-            note="FPIR: searches for somebody who is not enrolled that find somebody. FNIR: searches for somebody "
-            "enrolled that do not find them first and above the threshold.",
+            note="FPIR: searches for people who are not enrolled that return a person. FNIR: searches for "
+            "enrolled people that do not return them first and above the threshold.",
             columns=tuple(columns),
             rows=rows,
         ),
