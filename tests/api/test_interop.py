@@ -165,7 +165,7 @@ def test_quads_of_meshio_are_two_triangles_each(mesh: ss.Mesh) -> None:
         (np.zeros((4, 2)), r"shape \(V, 3\)"),
         (np.array([["a", "b", "c"]]), "no numbers"),
         (SimpleNamespace(points=np.zeros((4, 3)), n_points=4, extract_surface=None), "extract_surface"),
-        (SimpleNamespace(points=np.zeros((4, 3)), cells=[], cells_dict={"tetra": [[0, 1, 2, 3]]}), "kind tetra"),
+        (SimpleNamespace(points=np.zeros((4, 3)), cells=[], cells_dict={"tetra": [[0, 1, 2, 3]]}), "type tetra"),
         ((np.zeros((4, 3)), np.array([[0, 1, 9]])), "points at vertex 9"),
     ],
 )

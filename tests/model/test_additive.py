@@ -222,7 +222,7 @@ def test_coefficients_of_another_number_are_refused(model: AdditiveModel) -> Non
         model.told(np.zeros(7), np.ones(7))
     with pytest.raises(InputError, match="positive definite"):
         model.told(np.zeros(7), np.zeros((7, 7)))
-    with pytest.raises(InputError, match="at least one fit"):
+    with pytest.raises(InputError, match="at least one estimate"):
         model.tie([])
 
 
