@@ -151,7 +151,7 @@ class Shard:
             or any(str(field.type) != kinds["count" if field.name == ROW else kind_of(field.name)] for field in schema)
             or not {"scan", "status", RECORD, ROW} <= set(schema.names)
         ):
-            raise FileFormatError(f"{path} is not the table of a store that its manifest describes; {AGAIN}.")
+            raise FileFormatError(f"{path} is not a table of a store as its manifest describes it; {AGAIN}.")
         self._row_groups = tuple(group.num_rows for group in groups)
         self._names_of_columns = frozenset(schema.names)
         self._verified = True
