@@ -182,6 +182,14 @@ def test_numbers_other_words_numbered_words_and_names_are_no_misspellings(cells:
     assert all(note.startswith("Shapes in each class") for note in notes_on_classes("x", cells))
 
 
+def test_groups_coded_as_two_numbers_are_counted() -> None:
+    assert notes_on_classes("sex", ("0", *"11111", "")) == [
+        "Shapes in each class of sex: 1 5, 0 1.",
+        "sex has 1 class with one shape ('0'); check the spelling, or leave these shapes out.",
+    ]
+    assert not notes_on_classes("age", ("20", "21", "21", "22"))
+
+
 def test_names_that_differ_in_case_are_named_and_not_counted() -> None:
     (note,) = notes_on_classes("subject", ("anna", "Anna", "bert", "carl"))
     assert "'anna' (1) and 'Anna' (1), which differ only in case" in note

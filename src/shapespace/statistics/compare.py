@@ -398,9 +398,7 @@ def _methods(
                     unequal_variances=options.unequal_variances,
                 )
             )
-    classes = [
-        (one.name, [str(value) for value in design.values[one.column]]) for one in design.variables if one.levels
-    ]
+    classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
     return methods_of(
         cohort,
         len(set(owners)),
@@ -792,9 +790,10 @@ def _warnings(
                 "once, by its mean, and p is approximate where means of few scans are noisier."
             )
     for stratum in strata:
-        if stratum.fewest_log_arrangements < math.log(_FEWEST):
+        fewest = stratum.fewest_log_arrangements(flips=options.unequal_variances)
+        if fewest < math.log(_FEWEST):
             yield (
-                f"There are only {round(math.exp(stratum.fewest_log_arrangements))} arrangements"
+                f"There are only {round(math.exp(fewest))} arrangements"
                 f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
             )
 

@@ -81,10 +81,13 @@ class Stratum:
         """(n, p) orthonormal columns of the whole model."""
         return np.linalg.qr(self.matrix)[0]
 
-    @cached_property
-    def fewest_log_arrangements(self) -> float:
-        """Logarithm of how many arrangements of a term differ, of the term that has fewest."""
-        return min(self.log_arrangements(flips=self.flips(self.reduced(term, "III"))) for term in self.terms)
+    def fewest_log_arrangements(self, *, flips: bool = False) -> float:
+        """Return the logarithm of how many arrangements of a term differ, of the term that has fewest.
+
+        Args:
+            flips: whether the arrangements of all terms are flips of signs.
+        """
+        return min(self.log_arrangements(flips=flips or self.flips(self.reduced(term, "III"))) for term in self.terms)
 
     def log_arrangements(self, *, flips: bool = False) -> float:
         """Return the logarithm of how many arrangements differ; of equal covariates, or of all signs, there is one."""
