@@ -677,6 +677,13 @@ def test_the_number_of_arrangements_is_that_of_sign_flips_with_unequal_variances
     assert any("only 8 arrangements" in one for one in flipped)
 
 
+def test_a_formula_and_options_of_another_type_are_refused() -> None:
+    shapes = cohort({"sex": ["f", "m"] * 4})
+    for formula, options in ((None, QUICK), ("~ sex", "quick")):
+        with pytest.raises(InputError, match="compare takes a"):
+            compare(shapes, formula, options)  # type: ignore[arg-type]
+
+
 def test_random_terms_may_stand_in_brackets() -> None:
     table = Table({"subject": ("a", "b"), "time": ("0", "1")}, ("x", "y"))
     assert random_effects_of("(1 + time | subject)", table) == random_effects_of("1 + time | subject", table)

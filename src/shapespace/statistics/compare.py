@@ -279,7 +279,9 @@ def compare(
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
+    require(formula, str, "compare", "write a formula such as '~ sex + age'")
     options = options or CompareOptions()
+    require(options, CompareOptions, "compare", "give options as CompareOptions(...)")
     own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)
     random, options = _random(options, cohort)
