@@ -7,8 +7,7 @@ normal n, by a small rotation, translation and log scale of the model and by the
 
 import numpy as np
 
-from shapespace.fit.equations import Estimate
-from shapespace.fit.robust import Problem, WeightedMatches
+from shapespace.fit.robust import Iterate, Problem, WeightedMatches
 from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray
 
@@ -21,11 +20,11 @@ def vertex_rows(vertices: FloatArray, normals: FloatArray, modes: FloatArray) ->
 
 
 def gauss_newton_step(
-    problem: Problem, look: WeightedMatches, at: Estimate, modes: int
+    problem: Problem, weighted: WeightedMatches, iterate: Iterate, modes: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the step (7 + K,) from `at` given what the fit sees there, and the Hessian of the cost."""
-    surface, prior, scan, vertices = problem.surface, problem.prior, look.matches.points, look.matches.vertices
-    w, v = look.weights.points, look.weights.vertices
+    """Return the step (7 + K,) from an iterate with its weighted matches, and the Hessian of the cost."""
+    surface, prior, scan, vertices = iterate.surface, problem.prior, weighted.matches.points, weighted.matches.vertices
+    w, v = weighted.weights.points, weighted.weights.vertices
     rows = vertex_rows(surface.vertices, surface.normals, surface.modes[:, :, :modes].astype(float))
     hessian, gradient = np.zeros((POSE + modes, POSE + modes)), np.zeros(POSE + modes)
     corners = surface.topology.faces[scan.triangle]
@@ -36,9 +35,9 @@ def gauss_newton_step(
     for j, weight, residual in zip(vertices.vertex, v, vertices.residual, strict=True):
         hessian += weight * np.outer(rows[j], rows[j])
         gradient += weight * residual * rows[j]
-    rho = prior.weight * look.sigma_mm**2
+    rho = prior.weight * weighted.sigma_mm**2
     hessian[POSE:, POSE:] += np.diag(rho / prior.stddev[:modes] ** 2)
-    gradient[POSE:] += rho * at.b[:modes] / prior.stddev[:modes] ** 2
+    gradient[POSE:] += rho * iterate.b[:modes] / prior.stddev[:modes] ** 2
     hessian[6, 6] += rho / prior.scale_stddev**2
-    gradient[6] += rho / prior.scale_stddev**2 * np.log(at.T_scan_model.scale / prior.start_scale)
+    gradient[6] += rho / prior.scale_stddev**2 * np.log(iterate.T_scan_model.scale / prior.start_scale)
     return -np.linalg.solve(hessian, gradient), hessian

@@ -10,6 +10,8 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral
+from os import PathLike
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
@@ -51,6 +53,26 @@ def require(value: object, wanted: type, function: str, how: str) -> None:
     """
     if not isinstance(value, wanted):
         raise InputError(f"{function} takes a {wanted.__name__}, not {type(value).__name__}; {how}.")
+
+
+def require_path(value: object, function: str) -> None:
+    """Refuse an argument that is no path in a sentence.
+
+    Raises:
+        InputError: it is neither text nor a path.
+    """
+    if not isinstance(value, str | PathLike):
+        raise InputError(f"{function} takes a path, not {type(value).__name__}; give a str or a Path.")
+
+
+def require_whole(value: object, name: str) -> None:
+    """Refuse a setting that is neither a whole number nor None in a sentence.
+
+    Raises:
+        InputError: it is neither.
+    """
+    if value is not None and not isinstance(value, Integral):
+        raise InputError(f"{name} is a whole number or None, not {type(value).__name__}; give a number such as 10.")
 
 
 def read_only(array: npt.ArrayLike) -> FloatArray:

@@ -487,9 +487,9 @@ def test_a_disk_that_fills_up_in_a_batch_keeps_what_was_written(
         with (tmp_path / "coefficients.csv").open(newline="") as stream:
             assert [row["scan"] for row in csv.DictReader(stream)] == ["scan_0"]
         assert not (tmp_path / "scan_1.fit.json").exists()
-    # With space again, --resume does the rest.
+    # With space again, the same command does the rest.
     monkeypatch.undo()
-    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3, "--resume", "--json")
+    outcome = run("fit", world.model, *world.scans, "-o", tmp_path, "--max-iterations", 3, "--json")
     assert outcome.code == 0 and outcome.facts["max_iterations"] == 3
 
 

@@ -367,7 +367,7 @@ def test_fit_prints_facts_as_json_or_a_line_a_scan(run: Run, world: World, tmp_p
     written = record_of(tmp_path / "o")
     assert record.pop("name") == "scan_0"
     assert record == {key: value for key, value in written.items() if key != "history"}
-    text = run("fit", world.model, world.scan, "-o", tmp_path / "o", "--resume")
+    text = run("fit", world.model, world.scan, "-o", tmp_path / "o")
     lines = text.out.splitlines()
     assert lines[0].replace("->", "→").startswith("scan_0.ply: converged: mean distance model→scan ")
     assert lines[1] == f"1 scan: 1 converged; results in {tmp_path / 'o'}"
@@ -436,7 +436,7 @@ def nearest(scan: Mesh, model: ShapeModel, index: int) -> int:
 
 def test_resume_does_not_take_a_fit_from_other_landmarks(run: Run, world: World, tmp_path: Path) -> None:
     model = ShapeModel.load(world.model)
-    command = ("fit", world.model, world.scan, "-o", tmp_path, "--resume")
+    command = ("fit", world.model, world.scan, "-o", tmp_path)
     run(*command)
     write_landmarks(tmp_path / "marks.csv", {name: model.mean_vertices[i] for name, i in model.landmarks.items()})
     run(*command, "--landmarks", tmp_path / "marks.csv")
@@ -455,8 +455,21 @@ def test_two_jobs_give_what_one_gives(run: Run, world: World, fitted: Path, tmp_
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
 
 
+def test_resume_changes_nothing_and_is_said_to_be_no_longer_needed(run: Run, world: World, tmp_path: Path) -> None:
+    command = ("fit", world.model, world.scan, "-o", tmp_path, "--quiet")
+    assert run(*command).code == 0
+    before = (tmp_path / "scan_0.fit.json").stat().st_mtime_ns
+    outcome = run(*command, "--resume")
+    assert outcome.code == 0 and (tmp_path / "scan_0.fit.json").stat().st_mtime_ns == before
+    needless = "shapespace: --resume is no longer needed, since valid results are kept by default."
+    assert outcome.err.splitlines().count(needless) == 1
+    assert outcome.err.replace(f"{needless}\n", "") == run(*command).err
+    assert "--resume" not in run("fit", "--help").out
+    assert run(*command, "--resume", "--again").code == 2
+
+
 def test_resume_fits_only_what_is_missing_or_changed(run: Run, world: World, tmp_path: Path) -> None:
-    command = ("fit", world.model, *world.scans[:2], "-o", tmp_path, "--resume")
+    command = ("fit", world.model, *world.scans[:2], "-o", tmp_path)
     assert run(*command).code == 0
     times = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.fit.json")}
     (tmp_path / "scan_1.fitted.ply").unlink()
@@ -471,7 +484,7 @@ def test_resume_fits_only_what_is_missing_or_changed(run: Run, world: World, tmp
 
 
 def test_a_damaged_record_is_fitted_again(run: Run, world: World, tmp_path: Path) -> None:
-    command = ("fit", world.model, world.scan, "-o", tmp_path, "--resume")
+    command = ("fit", world.model, world.scan, "-o", tmp_path)
     run(*command)
     good = record_of(tmp_path)
     for damage in ({"distances_mm": None}, {"b": [1.0]}, {"status": "splendid"}, {"scan": 3}):
@@ -521,7 +534,7 @@ def test_strict_turns_a_doubtful_fit_into_exit_code_1(run: Run, world: World, tm
     lenient = run("fit", world.model, tmp_path / "flat.ply", "-o", tmp_path / "o")
     assert record_of(tmp_path / "o", "flat")["status"] == "doubtful"
     assert lenient.code == 0 and "flat.ply: doubtful: " in lenient.err
-    assert run("fit", world.model, tmp_path / "flat.ply", "-o", tmp_path / "o", "--strict", "--resume").code == 1
+    assert run("fit", world.model, tmp_path / "flat.ply", "-o", tmp_path / "o", "--strict").code == 1
 
 
 def test_a_cap_on_iterations_is_a_status_of_its_own(run: Run, world: World, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_record_and_stages_hold_it(dense: Path) -> None:
 
 
 def test_resume_knows_whether_it_was_asked_for(run: Run, world: World, tmp_path: Path) -> None:
-    command = ("fit", world.model, world.scan, "-o", tmp_path, "--resume", "--quiet")
+    command = ("fit", world.model, world.scan, "-o", tmp_path, "--quiet")
     surface = tmp_path / "scan_0.dense.ply"
     assert run(*command).code == 0 and not surface.exists()
     asked = run(*command, "--dense")

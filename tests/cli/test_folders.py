@@ -76,7 +76,7 @@ def test_recursive_takes_folders_below_and_tells_scans_apart_by_their_path(run: 
     elsewhere = run("fit", world.model, tree, "-o", tree.parent / "o", *FAST, "--recursive", "--json", "--quiet")
     assert elsewhere.facts["scans"] == 3, "surfaces beside their records are results"
     assert "3 surfaces of earlier fits are not taken" in elsewhere.err
-    text = run("fit", world.model, tree, "-o", out, *FAST, "--recursive", "--resume").out
+    text = run("fit", world.model, tree, "-o", out, *FAST, "--recursive").out
     assert "p1_neutral (neutral.ply): " in text and "\na.ply: " in "\n" + text
 
 

@@ -39,7 +39,7 @@ def test_scans_of_any_name_are_fitted(name: str, run: Run, world: World, tmp_pat
     text = (out / "coefficients.csv").read_text(encoding="utf-8")
     (row,) = csv.DictReader(io.StringIO(text, newline=""))
     assert row["scan"][0] not in "=+-@"
-    assert run("fit", world.model, scan, "-o", out, *FAST, "--resume", "--json").facts["max_iterations"] == 1
+    assert run("fit", world.model, scan, "-o", out, *FAST, "--json").facts["max_iterations"] == 1
     assert run("check", scan, "--json").facts[0]["usable"]
     assert run("info", record, "--json").facts["status"] == "max_iterations"
 

@@ -33,7 +33,7 @@ def test_a_vrml_scan_gives_the_fit_of_the_same_scan_in_ply(run: Run, world: Worl
     assert one["b"] == other["b"] and one["status"] == other["status"]
 
 
-@pytest.mark.parametrize("name", ["a.bnt", "a.raw", "a.wrl"])
+@pytest.mark.parametrize("name", ["a.bnt", "a.wrl"])
 def test_check_and_info_read_them(run: Run, tmp_path: Path, name: str) -> None:
     y, x = np.mgrid[0:6, 0:7].astype(float)
     grid = np.stack([x, y, 0.1 * x * y]).reshape(3, -1)
@@ -42,7 +42,6 @@ def test_check_and_info_read_them(run: Run, tmp_path: Path, name: str) -> None:
     points = grid.T.tolist()
     content = {
         "a.bnt": head + grid.astype("<f8").tobytes() + bytes(8 * 84),
-        "a.raw": "\n".join(" ".join(str(v) for i in face for v in points[i]) for face in cell).encode(),
         "a.wrl": vrml(points, cell).encode(),
     }[name]
     (tmp_path / name).write_bytes(content)

@@ -87,7 +87,7 @@ def test_rows_can_be_taken_in_any_order() -> None:
         ("file,age\na,1\na,2\n", "two or more rows of 'a'"),
         ("file,age\na,1\n,2\n", "has no file in row 2"),
         ("file,age\na.ply,1\na.stl,2\n", "two or more rows of 'a'"),
-        ("file,age,age\na,1,2\n", "two columns of one name"),
+        ("file,age,age\na,1,2\n", r"two columns of one name \('age'\)"),
         ("file,age\na,1,2\n", "3 cells in row 1"),
         ('file,age\n"a,1\n', "not a CSV table"),
     ],
@@ -180,6 +180,14 @@ def test_long_words_that_differ_in_one_letter_are_named(other: str) -> None:
 )
 def test_numbers_other_words_numbered_words_and_names_are_no_misspellings(cells: tuple[str, ...]) -> None:
     assert all(note.startswith("Shapes in each class") for note in notes_on_classes("x", cells))
+
+
+def test_groups_coded_as_two_numbers_are_counted() -> None:
+    assert notes_on_classes("sex", ("0", *"11111", "")) == [
+        "Shapes in each class of sex: 1 5, 0 1.",
+        "sex has 1 class with one shape ('0'); check the spelling, or leave these shapes out.",
+    ]
+    assert not notes_on_classes("age", ("20", "21", "21", "22"))
 
 
 def test_names_that_differ_in_case_are_named_and_not_counted() -> None:

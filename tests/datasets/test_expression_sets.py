@@ -64,7 +64,7 @@ def test_a_whole_person_of_bu3dfe_is_25_scans(tmp_path: Path, subject: str, ance
 
 
 def test_the_cut_out_face_in_vrml_is_preferred_then_what_is_left(tmp_path: Path):
-    order = ["F3D.wrl", "F3D.ply", "F3D.raw", "RAW.wrl", "RAW.obj", "RAW.raw"]
+    order = ["F3D.wrl", "F3D.ply", "F3D.pcd", "RAW.wrl", "RAW.obj", "RAW.xyz"]
     put(tmp_path, *(f"F0001/F0001_AN01WH_{rest}" for rest in order))
     for rest in order:
         (scan,) = find_scans(tmp_path)
@@ -188,14 +188,14 @@ def label(folder: Path, *lines: str, header: str = "file,subject,expression,inte
 
 
 def test_labels_beside_the_scans_win_over_names(tmp_path: Path):
-    put(tmp_path, "F0001_AN01WH_F3D.wrl", "b/c.ply", "d.raw")
-    label(tmp_path, "F0001_AN01WH_F3D.wrl,anna,Happy,0.3", "b/c.ply,anna,neutral,1", "d.raw,anna,kiss,")
+    put(tmp_path, "F0001_AN01WH_F3D.wrl", "b/c.ply", "d.obj")
+    label(tmp_path, "F0001_AN01WH_F3D.wrl,anna,Happy,0.3", "b/c.ply,anna,neutral,1", "d.obj,anna,kiss,")
     found = scan_set(tmp_path)
     assert found.layout == "labels.csv"
     assert [(s.path, s.subject, s.expression, s.intensity, s.kind) for s in found.scans] == [
         (tmp_path / "b/c.ply", "anna", "neutral", 0.0, "neutral"),
         (tmp_path / "F0001_AN01WH_F3D.wrl", "anna", "smile", 0.3, "expression"),
-        (tmp_path / "d.raw", "anna", "kiss", 1.0, "expression"),
+        (tmp_path / "d.obj", "anna", "kiss", 1.0, "expression"),
     ]
     assert "Expressions of other names: kiss." in found.summary()
 

@@ -518,7 +518,10 @@ def test_the_reference_lists_every_command_and_every_option_and_no_other() -> No
     assert sorted(re.findall(r"^## shapespace (.*)$", text, re.MULTILINE)) == sorted(known)
     for command, parser in known.items():
         options = {
-            o for a in parser._actions for o in a.option_strings if o not in ("-h", "--help", "--quiet", "--json")
+            o
+            for a in parser._actions
+            for o in a.option_strings
+            if o not in ("-h", "--help", "--quiet", "--json") and a.help is not argparse.SUPPRESS
         }
         written = {
             part.split()[0] for row in rows(document, f"shapespace {command}") for part in code_in(row[0])

@@ -9,10 +9,10 @@ from robust_reference import gauss_newton_step
 from shapespace.errors import FitError, InputError
 from shapespace.fit.equations import Estimate
 from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.matching import Matcher
+from shapespace.fit.matching import Matcher, MatchHint
 from shapespace.fit.methods import method_named
-from shapespace.fit.moving_model import MovingSurface, prepare
-from shapespace.fit.robust import Problem
+from shapespace.fit.moving_model import LinearShape, ModelSurface, prepare
+from shapespace.fit.robust import Iterate, Problem
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.span import in_span
@@ -27,20 +27,17 @@ Z = np.array([1.5, -1.8, 1.3, 1.6, -1.4])
 NEAR = similarity(3, 6.0, 1.0, 2.0)
 
 
-def problem_at(scan: Mesh, level: Level, b: FloatArray) -> tuple[Problem, Matcher, Estimate]:
+def problem_at(scan: Mesh, level: Level, b: FloatArray) -> tuple[Problem, Matcher, Iterate, MatchHint]:
     """Return the fit of the blobs to `scan` about to do a step on `level` from coefficients `b`."""
     settings = RobustSettings()
     problem = Problem.of(prepare(blob_model()), ScanTarget(scan), settings, NEAR.scale, with_scale=True)
-    problem.surface.deform(b)
-    at = Estimate(NEAR, b)
-    return problem, problem.matcher(level, at, problem.surface.vertex_tree(), None), at
+    iterate, matcher = problem.iterate(Estimate(NEAR, b)), problem.matcher(level)
+    return problem, matcher, iterate, matcher.first_hint(iterate.surface, NEAR)
 
 
-def surface_at(b: FloatArray) -> MovingSurface:
+def surface_at(b: FloatArray) -> ModelSurface:
     prepared = prepare(blob_model())
-    surface = MovingSurface(prepared.topology, blob_model().mean_vertices, prepared.modes)
-    surface.deform(b)
-    return surface
+    return LinearShape(prepared.topology, blob_model().mean_vertices, prepared.modes).surface(b)
 
 
 def error_mm(result, model: ShapeModel, truth: FloatArray, scale: float = 1.0) -> float:
@@ -52,20 +49,20 @@ def error_mm(result, model: ShapeModel, truth: FloatArray, scale: float = 1.0) -
 def test_a_step_is_that_of_plain_numpy(modes: int, triangles: bool) -> None:
     b = 0.3 * blob_model().stddev * (np.arange(5) < modes)
     level = Level(modes, 400, 200, triangles, 1, 0.0)
-    problem, matcher, at = problem_at(raw_scan(Z, NEAR, noise_mm=0.3).scan, level, b)
-    look = problem.look(matcher, at)
-    expected, hessian = gauss_newton_step(problem, look, at, modes)
-    _, equations = problem.equations(look, at, modes)
+    problem, matcher, iterate, hint = problem_at(raw_scan(Z, NEAR, noise_mm=0.3).scan, level, b)
+    weighted = problem.match(matcher, iterate, hint)
+    expected, hessian = gauss_newton_step(problem, weighted, iterate, modes)
+    _, equations = problem.equations(weighted, iterate, modes)
     whole = equations.data + np.diag(equations.prior)
     np.testing.assert_allclose(whole, hessian, rtol=1e-4, atol=1e-4 * np.abs(hessian).max())
-    step = problem.step(matcher, at, modes)
-    np.testing.assert_allclose(step.at.b[:modes] - b[:modes], expected[POSE:], rtol=2e-3, atol=1e-4)
-    assert step.at.T_scan_model.scale / NEAR.scale == pytest.approx(np.exp(expected[6]), rel=1e-4)
-    moved = NEAR.inverse().apply(step.at.T_scan_model.translation)
+    step = problem.step(matcher, iterate, hint, modes)
+    np.testing.assert_allclose(step.iterate.b[:modes] - b[:modes], expected[POSE:], rtol=2e-3, atol=1e-4)
+    assert step.iterate.T_scan_model.scale / NEAR.scale == pytest.approx(np.exp(expected[6]), rel=1e-4)
+    moved = NEAR.inverse().apply(step.iterate.T_scan_model.translation)
     np.testing.assert_allclose(moved, expected[3:6], rtol=2e-3, atol=1e-3)
 
 
-def test_normals_of_the_moving_surface_are_those_of_the_mesh() -> None:
+def test_normals_of_a_surface_are_those_of_the_mesh() -> None:
     b = Z * blob_model().stddev
     surface = surface_at(b)
     mesh = blob_model().mesh(b)
@@ -81,7 +78,7 @@ def test_walks_end_where_brute_force_does_near_the_surface() -> None:
     vertex = rng.integers(0, len(mesh.vertices), 3000).astype(np.int32)
     vertex[:] = surface.vertex_tree().nearest(points)[0]
     triangle = np.full(3000, -1, dtype=np.int32)
-    weights = surface.walk(points, vertex, triangle)
+    vertex, triangle, weights = surface.closest(points, vertex, triangle)
     found = (weights[:, :, None] * mesh.vertices[mesh.faces[triangle]]).sum(axis=1)
     distance = np.linalg.norm(found - points, axis=1)
     exact = build_engine(mesh).query(points).distance
@@ -89,7 +86,7 @@ def test_walks_end_where_brute_force_does_near_the_surface() -> None:
     assert np.mean(distance < exact + 1e-3) > 0.99
     # Once more from there, after a small move, as the next iteration does it.
     points += rng.normal(0, 0.2, points.shape)
-    weights = surface.walk(points, vertex, triangle)
+    vertex, triangle, weights = surface.closest(points, vertex, triangle)
     found = (weights[:, :, None] * mesh.vertices[mesh.faces[triangle]]).sum(axis=1)
     exact = build_engine(mesh).query(points).distance
     assert np.mean(np.linalg.norm(found - points, axis=1) < exact + 0.05) > 0.98

@@ -10,7 +10,7 @@ from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity,
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig, FitResult, fit_scan
 from shapespace.fit.marks import Marks
-from shapespace.fit.moving_model import MovingSurface, prepare
+from shapespace.fit.moving_model import LinearShape, prepare
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan, similarity, sphere
@@ -121,13 +121,12 @@ def off_vertex(model: ShapeModel, count: int = 6) -> SurfaceLandmarks:
 def test_the_term_of_landmarks_between_vertices_has_the_jacobian_of_their_places() -> None:
     model = replace(blob_model(300), landmarks=off_vertex(blob_model(300)))
     prepared, b = prepare(model), 0.3 * model.stddev
-    surface = MovingSurface(prepared.topology, model.mean_vertices, prepared.modes)
+    surface = LinearShape(prepared.topology, model.mean_vertices, prepared.modes).surface(b)
     T, rng = similarity(3, 15.0, 1.3), np.random.default_rng(0)
 
     def points_at(b: FloatArray) -> FloatArray:
         return T.apply(model.landmarks.interpolate(model.reconstruct(b)))
 
-    surface.deform(b)
     aim = points_at(b) + rng.normal(0, 2.0, (6, 3))
     marks = Marks.of(model, dict(zip(model.landmarks, aim, strict=True)), 2.0)
     assert marks is not None

@@ -169,21 +169,6 @@ def pcd(form: str, points: np.ndarray = POINTS, *, width: int | None = None) -> 
     return head + struct.pack("<II", len(packed), len(runs)) + packed
 
 
-def las(points: np.ndarray = POINTS, *, kind: int = 3, minor: int = 2, row: int = 34) -> bytes:
-    """A header and points in steps of a thousandth from an offset, with what else a point has left zero."""
-    n = len(points)
-    size = 375 if minor == 4 else 227
-    head = bytearray(size)
-    head[:4], head[24], head[25] = b"LASF", 1, minor
-    struct.pack_into("<HII", head, 94, size, size + 10, 0)
-    struct.pack_into("<BHI", head, 104, kind, row, 0 if minor == 4 else n)
-    struct.pack_into("<3d3d", head, 131, 0.001, 0.001, 0.001, 100.0, 200.0, 0.0)
-    if minor == 4:
-        struct.pack_into("<Q", head, 247, n)
-    whole = np.rint((points - (100, 200, 0)) / 0.001).astype("<i4")
-    return bytes(head) + bytes(10) + b"".join(xyz.tobytes() + bytes(row - 12) for xyz in whole)
-
-
 # As Slicer 4.10 and 4.13 write fiducials, and as geomorph's writeland.tps writes a specimen.
 FCSV = """# Markups fiducial file version = 4.10
 # CoordinateSystem = 0

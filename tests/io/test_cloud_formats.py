@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made import las, pcd
+from hand_made import pcd
 
 from refusals import refusal_of
 from shapespace.commands.look import check
+from shapespace.errors import FileFormatError
 from shapespace.io import limits
 from shapespace.io.folders import mesh_files
-from shapespace.io.meshes import MESH_ENDINGS, ending_of, read_mesh, stem_of, write_mesh
+from shapespace.io.meshes import MESH_ENDINGS, ending_of, probe_mesh, read_mesh, stem_of, write_mesh
 from shapespace.types import Mesh
 
 POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32).astype(np.float64)
@@ -102,21 +103,20 @@ def test_packed_data_that_are_wrong_are_refused(packed: bytes, write) -> None:
     assert "packed data" in refusal(write("a.pcd", whole[:start] + struct.pack("<I", len(packed)) + size + packed))
 
 
-@pytest.mark.parametrize(("minor", "kind", "row"), [(0, 0, 20), (2, 3, 34), (4, 7, 36)])
-def test_las_is_read_with_its_scale_and_offset(minor: int, kind: int, row: int, write) -> None:
-    found = read_mesh(write("a.las", las(POINTS, minor=minor, kind=kind, row=row)))
-    assert found.faces is None and np.abs(found.vertices - POINTS).max() <= 0.0005 + 1e-9
-
-
-def test_other_las_is_refused(write) -> None:
-    whole = las(POINTS)
-    assert "packed (LAZ)" in refusal(write("a.las", las(POINTS, kind=3 | 0x80)))
-    assert "50 points" in refusal(write("a.las", whole[:-1]))
-    assert "does not begin" in refusal(write("a.las", b"LASX" + whole[4:]))
-    assert "no points" in refusal(write("a.las", las(POINTS[:0])))
-    assert "contradicts itself" in refusal(
-        write("a.las", las(POINTS, row=12).replace(b"\x03\x0c\x00", b"\x03\x04\x00"))
-    )
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("a.las", "convert it to PLY."),
+        ("a.LAZ", "convert it to PLY."),
+        ("a.raw", "convert a mesh to PLY, a volume to NRRD or NIfTI."),
+        ("a.raw.gz", "convert a mesh to PLY, a volume to NRRD or NIfTI."),
+    ],
+)
+def test_a_scan_in_a_format_that_is_not_read_is_to_be_converted(name: str, advice: str, write) -> None:
+    text = refusal(write(name, b"LASF"))
+    assert "is not a mesh format" in text and text.endswith(advice)
+    with pytest.raises(FileFormatError, match=advice):
+        probe_mesh(write(name, b"LASF"))
 
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl", ".off", ".vtk", ".vtp", ".glb", ".gltf"])

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_made import gltf_tree, las, ply_header
+from hand_made import gltf_tree, ply_header
 
 from shapespace.commands.look import check
 from shapespace.errors import FileError, FileFormatError, ShapespaceError
@@ -197,8 +197,6 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "corners.stl": lambda size: repeated(b"facet\n" + b"vertex 0 0 0\n" * 3, size, b"solid\n", b"endsolid"),
     "lines.stl": lambda size: repeated(b"a\n", size, b"solid facet\n", b"endsolid"),
     "binary.stl": lambda size: bytes(80) + struct.pack("<I", size // 50) + bytes(size // 50 * 50),
-    "points.raw": lambda size: repeated(b"0 0 0\n", size),
-    "names.raw": lambda size: repeated(b"a\n", size, b"0 0 0\n"),
     "grid.bnt": bnt,
     "same.ply": lambda size: ply_ascii(size, b"1 0\n"),
     "other.ply": lambda size: ply_ascii(size, b"0\n"),
@@ -231,7 +229,6 @@ FILES: dict[str, Callable[[int], bytes]] = {
     "counts.pts": lambda size: repeated(b"1\n0 0 0\n", size),
     "runs.pcd": pcd_runs,
     "ones.pcd": pcd_ones,
-    "many.las": lambda size: las(np.zeros((size // 12, 3)), row=12),
     "many.csv": lambda size: b"".join(b"a%d,0,0,0\n" % k for k in range(size // 14)),
     "many.bnd": lambda size: repeated(b"1 0 0 0\n", size),
     "many.lm3": lambda size: b"%d\n" % (size // 8) + b"a\n0 0 0\n" * (size // 8),
@@ -362,7 +359,7 @@ def test_a_file_that_makes_much_of_little_is_refused(name: str, tmp_path: Path) 
     assert memory(path) < MOST_FOR_A_BYTE * path.stat().st_size + MOST_BESIDES
 
 
-@pytest.mark.parametrize("name", ["names.raw", "sections.vtk", "fields.vtk", "elements.vtp", "nodes.wrl", "moves.wrl"])
+@pytest.mark.parametrize("name", ["sections.vtk", "fields.vtk", "elements.vtp", "nodes.wrl", "moves.wrl"])
 def test_a_file_of_too_many_parts_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MOST_PARTS", 200)
     monkeypatch.setattr("shapespace.io.parsing.MOST_PARTS", 200)

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, las, pcd, vtk_5_1, vtp
+from hand_made import BND, FACE, FCSV, LM3, NONE, TPS, bnt, gltf_tree, pcd, vtk_5_1, vtp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is bound
 MINUTES = float(os.environ.get("SHAPESPACE_FUZZ_MINUTES", "0"))
 EXAMPLES = 300
 EXAMPLES_OF_ROWS = 100
-ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".las", ".gz")
+ROWS = (".fcsv", ".tps", ".tlms", ".txt", ".pts", ".xyz", ".gz")
 """Formats of rows of numbers under a short head, where less can go wrong."""
 MOST_MEMORY = 2**29
 MOST_CPU_S = 5.0
@@ -155,11 +155,9 @@ MESHES: dict[str, list[bytes]] = {
         json.dumps(MORPHED).encode(),
     ],
     ".wrl": [FACE.encode(), MOVED.encode(), VRML_1.encode()],
-    ".raw": [b"0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1 -0.0\n", b"a\n1 2 3 # c\n4,5,6\n7 8 9\n"],
     ".xyz": [b"//X Y Z R\n0 0 0 255\n1 0.5 -1e3 0\n", b"2\n1,2,3\n4;5;6\n"],
     ".pts": [b"3\n1 2 3 -700 1 2 3\n4 5 6 0 0 0 0\n7 8 9 0 0 0 0\n"],
     ".pcd": [pcd(form) for form in ("ascii", "binary", "binary_compressed")],
-    ".las": [las(), las(minor=4, kind=7, row=36)],
     ".bnt": [bnt(np.where(np.arange(12.0) == 5, NONE, np.arange(12.0)).reshape(3, 4), name=b"a")],
 }
 LANDMARKS: dict[str, list[bytes]] = {

@@ -16,7 +16,7 @@ from shapespace.io.meshes import MESH_ENDINGS, MESH_FORMATS, read_mesh, write_me
 from shapespace.types import Mesh
 
 MARK = b"\xef\xbb\xbf"
-BINARY = (".stl", ".glb", ".bnt", ".las")
+BINARY = (".stl", ".glb", ".bnt")
 
 
 refusal = partial(refusal_of, read_mesh)

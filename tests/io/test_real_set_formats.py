@@ -196,36 +196,6 @@ def test_moved_shapes_that_share_points_are_refused(write):
     assert "share their points" in refusal(write("a.wrl", text))
 
 
-# RAW
-
-
-def test_rows_of_three_are_points_and_of_nine_are_triangles(write):
-    cloud = read_mesh(write("a.raw", "1 2 3\n\n-4.5e0\t+5 .5 # c\r\n7,8,9\n"))
-    np.testing.assert_array_equal(cloud.vertices, [[1, 2, 3], [-4.5, 5, 0.5], [7, 8, 9]])
-    assert cloud.faces is None
-    soup = read_mesh(write("b.raw", "Object1\n0 0 0 1 0 0 0 1 0\nObject2\n1 0 0 1 1 0 0 1 -0.0\n"))
-    np.testing.assert_array_equal(soup.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
-    np.testing.assert_array_equal(soup.faces, [[0, 1, 2], [1, 3, 2]])
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        ("1 2\n3 4\n", "rows have 2 columns"),
-        ("1 2 3 4 5 6\n", "rows have 6 columns"),
-        ("1 0 0 0 0 0 1 0 0 0 1 0\n", "rows have 12 columns"),
-        ("3 1\n0 0 0\n1 0 0\n0 1 0\n0 1 2\n", "line 1 has 2 columns, but line 2 has 3"),
-        ("0 0 0 1 0 0 0 1 0 RedPlastic\n", "rows have 10 columns"),
-        ("0 0 0\n1 0", "line 1 has 3 columns, but line 2 has 2"),
-        ("0 0 x\n", "text where a number"),
-        ("names\nonly\n", "no rows of 3 or 9"),
-        (bytes(range(256)) * 8, "it is binary"),
-    ],
-)
-def test_other_files_of_that_ending_are_refused_by_name(write, content: str | bytes, why: str):
-    assert why in refusal(write("a.raw", content))
-
-
 # Bosphorus
 
 
@@ -366,12 +336,6 @@ def test_a_file_cut_short_anywhere_is_refused(write, name: str):
     whole = {"a.wrl": FACE.strip().encode(), "a.bnt": bnt(np.zeros((3, 4)))}[name]
     for length in range(0, len(whole), 3):
         refusal(write(name, whole[:length]))
-
-
-def test_rows_of_raw_cut_short_are_refused(write):
-    # Between rows and within the last number a cut cannot be told.
-    for cut in ("0 0 0 1 0 0 0 1 0\n1 0 0 1 1 0 0 1", "0 0 0 1 0 0 0 1", "1 2 3\n4 5", "1 2 3\n4 5 -"):
-        refusal(write("a.raw", cut))
 
 
 # Landmarks

@@ -119,8 +119,9 @@ HEAD = '<row r="1"><c r="A1" t="str"><v>id</v></c><c r="B1" t="str"><v>x</v></c>
 )
 def test_a_workbook_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, sheet: str, fault: str) -> None:
     (tmp_path / "t.xlsx").write_bytes(workbook(sheet))
-    with pytest.raises(FileFormatError, match=fault):
+    with pytest.raises(FileFormatError, match=fault) as error:
         read_table(tmp_path / "t.xlsx")
+    assert str(error.value).count(";") == 1
 
 
 def test_a_workbook_that_unpacks_to_much_is_refused_before_it_does() -> None:

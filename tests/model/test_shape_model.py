@@ -1,5 +1,6 @@
 import errno
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from shapespace.geometry.procrustes import centroid_size
 from shapespace.io.hdf5 import write_hdf5
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.pca import principal_components
+from shapespace.model.quality import QualitySettings
 from shapespace.model.shape_model import ShapeModel
+from shapespace.store.results import Results
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, similarity, training_meshes
 
@@ -521,3 +524,14 @@ def test_coefficients_in_mm_and_in_standard_deviations_are_each_others_inverse()
     for wrong in (np.zeros(6), 1.0):
         with pytest.raises(InputError, match="at most 5"):
             model.to_z(wrong)
+
+
+def test_arguments_of_another_type_are_refused_in_a_sentence() -> None:
+    calls: list[Callable[[], object]] = [
+        lambda: QualitySettings(folds="a"),  # type: ignore[arg-type]
+        lambda: ShapeModel.load(3),  # type: ignore[arg-type]
+        lambda: Results(3),  # type: ignore[arg-type]
+    ]
+    for call in calls:
+        with pytest.raises(InputError, match=r", not (str|int); give "):
+            call()

@@ -178,7 +178,7 @@ def test_without_stages_scans_and_fitted_surfaces_are_drawn_with_their_distances
     page = report(fits)
     words = Page(page).words
     assert 'class="broken"' not in page and "No picture: the scan is" not in words
-    assert "shapespace fit ../model.h5 ../scans -o . --stages --resume" in words
+    assert "shapespace fit ../model.h5 ../scans -o . --stages" in words
     alts = [str(image["alt"]) for image in Page(page).images()]
     assert [alt for alt in alts if alt.startswith("able: the scan, scan and model over each other, and a map")]
     assert [alt for alt in alts if alt.startswith("Signed distance maps of charlie")]

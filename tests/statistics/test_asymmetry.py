@@ -21,7 +21,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import read_part
 from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry
 from shapespace.statistics.sides import find_sides, given_sides, read_pairs
-from shapespace.types import Mesh, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, read_only
 from symmetric_object import FLIP, Symmetric, cohort_of, posed, symmetric_object
 
 
@@ -231,11 +231,60 @@ def test_vertices_that_do_not_pair_up_are_mixed_and_give_about_the_same_scores()
     take = np.unique(fine.faces[:, 0], return_index=True)[1]
     weights = np.array([0.2, 0.5, 0.3])
     shapes = np.stack([np.einsum("fcd,c->fd", (fine.x + o)[fine.faces[take]], weights) for o in own])
-    faces = ConvexHull(slid[take] / np.linalg.norm(slid[take], axis=1, keepdims=True)).simplices.astype(np.int32)
+    faces = hull(slid[take] / np.linalg.norm(slid[take], axis=1, keepdims=True))
     mixed = measure_asymmetry(Cohort.of_shapes(shapes, {}, faces=faces, gauge="form"), permutations=0)
     paired = measure_asymmetry(cohort_of(fine, fine.x + own), pairs=fine.pairs, permutations=0)
     assert not mixed.sides.paired and "do not pair up" in mixed.sides.notes[-1]
     assert np.allclose(mixed.vertex_scores.mm, paired.vertex_scores.mm, rtol=0.15)
+
+
+def hull(directions: FloatArray) -> IntArray:
+    """Return the triangles of points on a sphere, all facing outwards."""
+    faces = ConvexHull(directions).simplices.astype(np.int32)
+    a, b, c = (directions[faces[:, j]] for j in range(3))
+    inward = np.einsum("fd,fd->f", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return faces
+
+
+def egg(vertices: int) -> tuple[FloatArray, IntArray]:
+    """Return a surface that is symmetric about x = 0, while its vertices are not."""
+    k = np.arange(vertices) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / vertices), np.pi * (1 + 5**0.5) * k
+    ball = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
+    x = ball * [50.0, 70.0, 40.0]
+    x[:, 1] += 0.006 * x[:, 2] ** 2 + 0.1 * x[:, 2]
+    x[:, 2] += 0.15 * x[:, 1] + 0.003 * x[:, 1] ** 2
+    return x, hull(ball)
+
+
+def test_vertices_that_do_not_pair_up_show_no_directional_asymmetry_of_a_symmetric_population() -> None:
+    x, faces = egg(1200)
+    rng = np.random.default_rng(5)
+    on_maps, p_side = 0, list[float]()
+    for _ in range(8):
+        waves, phases = rng.normal(size=(20, 3, 3)) / 30, rng.uniform(0, 6, (20, 1, 3))
+        fields = np.sin(x @ waves + phases)
+        noise = 0.7 * np.einsum("nk,kvd->nvd", rng.normal(size=(16, 20)), fields)
+        shapes = x + noise + 0.2 * rng.normal(size=(16, *x.shape))
+        found = measure_asymmetry(Cohort.of_shapes(shapes, {}, faces=faces, gauge="form"), permutations=99)
+        assert not found.sides.paired
+        on_maps += bool((found.directional_p <= 0.05).any())
+        p_side.append(next(one.p for one in found.anova if one.source == "side") or 1.0)
+    assert on_maps <= 2
+    assert min(p_side) < 0.5
+
+
+def test_the_height_of_a_surface_above_its_triangles_is_that_of_its_curvature() -> None:
+    x, faces = egg(1200)
+    cohort = Cohort.of_shapes(
+        x + 1e-3 * np.random.default_rng(0).normal(size=(3, *x.shape)), {}, faces=faces, gauge="form", align=False
+    )
+    sides = find_sides(cohort)
+    normals = vertex_normals(Mesh(x, faces))
+    off = ((x - sides.image(x)) * normals).sum(axis=1)
+    left = off - sides.chord_heights(x, normals)
+    assert off.mean() > 0.05 and abs(left.mean()) < 0.2 * off.mean() and left.std() < 0.5 * off.std()
 
 
 def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:

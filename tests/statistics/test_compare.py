@@ -18,7 +18,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareOptions, SquaresType, compare
-from shapespace.statistics.compare_formula import FUNCTIONS, design_of
+from shapespace.statistics.compare_formula import FUNCTIONS, design_of, random_effects_of
 from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.effect_size import EFFECT_SIZES, effect_size
 from shapespace.types import FloatArray, IntArray, Mesh
@@ -646,6 +646,47 @@ def test_unequal_dispersion_warns_unless_the_test_allows_it_and_stands_in_the_an
     assert not [one for one in compare(unequal_groups(), "~ sex", allowed).warnings if "ispersion" in one]
     equal = compare(unequal_groups(1.0), "~ sex", CompareOptions(permutations=200, maps=False))
     assert equal.methods.dispersions[0].equal and not [one for one in equal.warnings if "ispersion" in one]
+
+
+def test_groups_coded_as_two_numbers_are_groups() -> None:
+    words = unequal_groups()
+    codes = tuple("2" if sex == "male" else "1" for sex in words.table.texts("sex"))
+    numbers = replace(words, table=Table({"sex": codes}, words.names))
+    for options in (QUICK, replace(QUICK, unequal_variances=True)):
+        by_words, by_numbers = compare(words, "~ sex", options), compare(numbers, "~ sex", options)
+        (one,), (other,) = by_words.dispersions, by_numbers.dispersions
+        assert (other.counts, other.p) == (one.counts, one.p) and other.groups == ("1", "2")
+        np.testing.assert_allclose(other.stddev_mm, one.stddev_mm, rtol=1e-9)
+        assert len(by_numbers.warnings) == len(by_words.warnings)
+        np.testing.assert_allclose(by_numbers.tests[0].arrangements, by_words.tests[0].arrangements, rtol=1e-6)
+        assert [size.subjects for size in by_numbers.methods.sizes] == [
+            size.subjects for size in by_words.methods.sizes
+        ]
+
+
+def test_a_rare_one_of_two_numbers_is_compared_with_the_other() -> None:
+    table = {"group": ["0"] * 2 + ["1"] * 60}
+    (effect,) = compare(cohort(table), "~ group", QUICK).effects
+    assert (effect.low, effect.high) == ("group 0", "group 1")
+
+
+def test_the_number_of_arrangements_is_that_of_sign_flips_with_unequal_variances() -> None:
+    table = {"group": ["a"] * 2 + ["b"] * 2}
+    assert any("only 6 arrangements" in one for one in compare(cohort(table), "~ group", QUICK).warnings)
+    flipped = compare(cohort(table), "~ group", replace(QUICK, unequal_variances=True)).warnings
+    assert any("only 8 arrangements" in one for one in flipped)
+
+
+def test_a_formula_and_options_of_another_type_are_refused() -> None:
+    shapes = cohort({"sex": ["f", "m"] * 4})
+    for formula, options in ((None, QUICK), ("~ sex", "quick")):
+        with pytest.raises(InputError, match="compare takes a"):
+            compare(shapes, formula, options)  # type: ignore[arg-type]
+
+
+def test_random_terms_may_stand_in_brackets() -> None:
+    table = Table({"subject": ("a", "b"), "time": ("0", "1")}, ("x", "y"))
+    assert random_effects_of("(1 + time | subject)", table) == random_effects_of("1 + time | subject", table)
 
 
 def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:

@@ -102,6 +102,18 @@ def test_answers_state_the_share_of_estimates_and_the_shape_with_most() -> None:
     assert shape_notes(whole) == () and shape_settings(whole) == {"shape_source": "surfaces"}
 
 
+def test_positions_that_are_not_observed_change_nothing() -> None:
+    whole, observed, faces = shapes(), mask(), training_meshes(3, vertices=V)[0].faces
+    observed[:, 60] = False
+    made = [
+        Cohort.of_shapes(np.where(observed[:, :, None], whole, junk), {"group": GROUPS}, faces=faces, observed=observed)
+        for junk in (np.nan, 0.0, 9999.0)
+    ]
+    for other in made[1:]:
+        for k in range(N):
+            np.testing.assert_allclose(other.vertices(k), made[0].vertices(k), atol=1e-8)
+
+
 def test_the_estimates_do_not_depend_on_the_table() -> None:
     one, other = cohort(), cohort(age=list(range(N)))
     np.testing.assert_array_equal(one.coefficients, other.coefficients)

@@ -328,8 +328,8 @@ def _add_fit(commands: Any) -> None:
     _add_where(sub, "scans")
     results = sub.add_mutually_exclusive_group()
     results.add_argument("--again", action="store_true", help="fit all scans again, also those with valid results")
-    results.add_argument("--resume", action="store_true",
-                         help="keep valid results of earlier runs (the default)")  # fmt: skip
+    # It has no effect; to be removed after the next release.
+    results.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)
     sub.add_argument("--dense", action="store_true",
                      help="also write NAME.dense.ply, the fitted surface deformed further onto the scan")  # fmt: skip
     sub.add_argument("--stages", action="store_true", help="also write NAME.stages.npz, for figures")

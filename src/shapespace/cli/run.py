@@ -358,6 +358,8 @@ def info(arguments: argparse.Namespace) -> int:
 
 def fit(arguments: argparse.Namespace) -> int:
     """Fit a model to scans."""
+    if arguments.resume:
+        warn("--resume is no longer needed, since valid results are kept by default.")
     several = len(arguments.scans) > 1 or not Path(arguments.scans[0]).is_file()
     if several and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading

@@ -17,7 +17,7 @@ _LONG = 5
 
 
 def class_notes(table: Table, columns: Iterable[str]) -> tuple[str, ...]:
-    """Return sentences on the classes in some columns of a table; none on columns of numbers.
+    """Return sentences on the classes in some columns of a table; none on columns of three numbers or more.
 
     Raises:
         InputError: there is no such column.
@@ -36,7 +36,8 @@ def notes_on_classes(column: str, cells: Sequence[str]) -> list[str]:
     """
     counts = Counter(cell for cell in cells if cell)
     total = counts.total()
-    if not total or 2 * sum(count for cell, count in counts.items() if is_number(cell)) > total:
+    if not total or (len(counts) != 2 and 2 * sum(n for cell, n in counts.items() if is_number(cell)) > total):
+        # Two numbers are often codes of two groups.
         return []
     has_names = 2 * len(counts) > total
     notes: list[str] = []

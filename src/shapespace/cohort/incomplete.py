@@ -87,7 +87,9 @@ def completed_shapes(
     out = np.empty_like(shapes)
     out[:, analysed] = found.shapes
     if not analysed.all():
-        moved = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, shapes, strict=True)])
+        # Positions that are not observed may be anything: other programs write zeros there.
+        given = np.where(observed[:, :, None], shapes, np.nan)
+        moved = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, given, strict=True)])
         out[:, ~analysed] = _one_position(moved, found.shapes.mean(axis=0), analysed, faces)
     return CompletedShapes(out, sizes, known, analysed)
 
@@ -107,7 +109,7 @@ def _one_position(moved: FloatArray, mean: FloatArray, analysed: BoolArray, face
     """Return one position (M, 3) for each vertex that is not analysed: the mean of those known, or a smooth filling.
 
     Args:
-        moved: (N, V, 3) shapes as given, aligned.
+        moved: (N, V, 3) shapes as given, aligned; NaN where not observed.
         mean: (A, 3) of the analysed vertices.
         analysed: (V,).
         faces: (F, 3).

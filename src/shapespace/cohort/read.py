@@ -18,8 +18,8 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.meshes import stem_of
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.store.corresponding import SURFACE, surface_files
-from shapespace.store.results import ENDINGS, Results, mesh_at, modes_of
+from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
+from shapespace.store.results import Results, mesh_at, modes_of
 from shapespace.store.rows import META
 from shapespace.types import FloatArray, Mesh, read_only
 
@@ -28,7 +28,6 @@ SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
 """Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense where all have one."""
 
 _USED = ("converged", "max_iterations")
-_ENDINGS = (*ENDINGS.values(), SURFACE)
 
 
 @dataclass(frozen=True)
@@ -250,9 +249,9 @@ def _of_surfaces(
     notes = list(found.notes)
     if options.gauge == "form":
         found.refuse_mixed_units()
-    files = {_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
+    files = {surface_stem(file): file for file in found.files if file.suffix.lower() != ".csv"}
     kept = [(files[key], at) for at, key in enumerate(keys) if key in files]
-    _tell_unmatched(notes, table, keys, files, [_stem(file) for file, _ in kept], list(files), folder)
+    _tell_unmatched(notes, table, keys, files, [surface_stem(file) for file, _ in kept], list(files), folder)
     least = options.least if onto is None else 1
     if len(kept) < least:
         raise InputError(f"{folder}: {len(kept)} of its meshes are in {table.where}, and {_count_is(least)} the least.")
@@ -260,7 +259,7 @@ def _of_surfaces(
     for done, (file, _) in enumerate(kept, 1):
         mesh = mesh_at(file)
         ratio = found.unit_ratios.get(file, 1.0)
-        meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=_stem(file)))
+        meshes.append(replace(mesh.with_vertices(mesh.vertices / ratio), name=surface_stem(file)))
         if on_shape is not None:
             on_shape(done, len(kept))
     cohort = Cohort.of_meshes(meshes, table.take([at for _, at in kept]), options.gauge, onto, options.least)
@@ -330,10 +329,6 @@ def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeMod
     if model.content_hash != fit.model_hash:
         raise InputError(f"{path} is not the model of the fits in {results.folder}; give the right one with --model.")
     return model, additive
-
-
-def _stem(file: Path) -> str:
-    return next((file.name.removesuffix(end) for end in _ENDINGS if file.name.endswith(end)), stem_of(file))
 
 
 def _count_is(count: int) -> str:

@@ -132,7 +132,8 @@ def read_table(path: Path) -> tuple[Table, tuple[str, ...]]:
         heads = next(lines)
         rows = [[plain_cell(cell) for cell in line] for line in lines]
     except ValueError as error:
-        raise FileFormatError(f"{path} {error}; write it as CSV with a header.") from error
+        advice = "" if ";" in str(error) else "; write it as CSV with a header"
+        raise FileFormatError(f"{path} {error}{advice}.") from error
     key = key_column(heads)
     if key is None or not rows:
         raise FileFormatError(f"{path} is no table of shapes; it needs rows, and a column {' or '.join(KEYS)}.")

@@ -23,7 +23,7 @@ from shapespace.model.quality import Curve, ModelQuality, QualitySettings, Runne
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text
-from shapespace.store.corresponding import SURFACE, surface_files
+from shapespace.store.corresponding import SURFACE, surface_files, surface_stem
 from shapespace.store.results import mesh_at
 from shapespace.types import Mesh
 
@@ -68,7 +68,7 @@ class _Target:
     @property
     def names(self) -> list[str]:
         """Names of its meshes, without endings."""
-        return [] if isinstance(self.what, ShapeModel) else [_stem(Path(mesh.name)) for mesh in self.what]
+        return [] if isinstance(self.what, ShapeModel) else [surface_stem(Path(mesh.name)) for mesh in self.what]
 
 
 def quality(
@@ -187,7 +187,7 @@ def _meshes(folder: Path, notes: list[str], gauge: Gauge, *, quiet: bool) -> tup
                 raise MeshError(f"{file}: it has no vertices; leave it out.")
             out.append(_scaled(replace(mesh, name=file.name), found.unit_ratios.get(file, 1.0)))
             bar.update()
-    return out, {_stem(file): ratio for file, ratio in found.unit_ratios.items()}
+    return out, {surface_stem(file): ratio for file, ratio in found.unit_ratios.items()}
 
 
 def _scaled(mesh: Mesh, ratio: float) -> Mesh:
@@ -195,18 +195,11 @@ def _scaled(mesh: Mesh, ratio: float) -> Mesh:
     return mesh if ratio == 1.0 else mesh.with_vertices(mesh.vertices / ratio)
 
 
-def _stem(path: Path) -> str:
-    for ending in _SURFACES:
-        if path.name.endswith(ending):
-            return path.name.removesuffix(ending)
-    return path.stem
-
-
 def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
     if folder is None or isinstance(target.what, ShapeModel):
         return None
-    by_name = {_stem(file): file for file in mesh_files([folder]).files}
+    by_name = {surface_stem(file): file for file in mesh_files([folder]).files}
     lacking = [name for name in target.names if name not in by_name]
     if lacking:
         raise InputError(f"{folder} has no scan of {', '.join(lacking[:3])}; scans are named as the surfaces are.")

@@ -167,7 +167,7 @@ def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expressio
 
     With a `labels.csv` (file, subject, expression, and intensity if known) in `folder`, it alone counts. Otherwise
     names are read. Of several files of the same BU-3DFE scan, `_F3D` (the face, cut out) is taken before a name
-    without part and before `_RAW` (the whole scan); of equal ones, `.wrl` before other endings and `.raw` last, then
+    without part and before `_RAW` (the whole scan); of equal ones, `.wrl` before other endings, then
     the first path. Of the same Bosphorus scan, `.bnt` is taken before other endings. The number at the end of a
     Bosphorus name counts repeated takes, which are scans of their own.
 
@@ -255,9 +255,7 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
 
 def _ending_rank(path: Path, own: str) -> int:
     ending = path.suffix.lower()
-    if ending == own:
-        return -1
-    return len(MESH_ENDINGS) if ending == ".raw" else MESH_ENDINGS.index(ending)
+    return -1 if ending == own else MESH_ENDINGS.index(ending)
 
 
 def _bu3dfe(path: Path) -> tuple[ScanEntry, tuple[str, ...], tuple[int, int]] | None:

@@ -22,8 +22,8 @@ import numpy as np
 from shapespace.errors import FitError
 from shapespace.fit.field_kernels import compare_triangles, solve_field
 from shapespace.fit.kernels import normals_into
-from shapespace.fit.matching import Matcher, Matches, Weights
-from shapespace.fit.moving_model import MovingSurface, Topology, prepare
+from shapespace.fit.matching import Matcher, Matches, MatchHint, Weights
+from shapespace.fit.moving_model import ModelSurface, Topology, prepare
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.weights import spread
@@ -84,15 +84,11 @@ def dense_surface(
     """
     topology, T = prepare(model).topology, T_scan_model
     start = T.inverse().apply(vertices_scan_mm)
-    surface = MovingSurface(topology, start)
-    up = surface.normals.copy()
-    matcher = _matcher(target, surface, T, settings)
+    surface = ModelSurface.of(topology, start)
+    up = surface.normals
+    matcher = _matcher(target, topology, settings)
     size_mm = rms_size(model.mean_vertices)
-
-    def look() -> WeightedMatches:
-        return _look(matcher, surface, T, target, settings)
-
-    now = look()
+    now = _match(matcher, surface, T, matcher.first_hint(surface, T), settings)
     noise_mm, left_mm = now.noise_mm, now.unexplained_mm
     moved = np.zeros_like(start)
     if left_mm > settings.least_unexplained_mm:
@@ -101,19 +97,19 @@ def dense_surface(
             seen_at, pull_at = now.gathered(max(noise_mm, now.spread_mm))
             want = seen_at * np.einsum("vd,vd->v", surface.normals, moved) - pull_at
             coarse.solve(seen_at, want, surface.normals, moved, settings)
-            surface.move_to(start + moved)
-            now = look()
+            surface = ModelSurface.of(topology, start + moved)
+            now = _match(matcher, surface, T, now.matches.hint, settings)
             # Neighbours also disagree where the surface is steep beside the scan, so the last is the best.
             noise_mm = min(noise_mm, now.noise_mm)
 
     fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
     base, held = unfolded(start, start, start + moved, topology, settings.turn_cosine)
-    out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals.copy()
+    out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals
     seen_at = np.zeros(len(start))
     for round_ in range(settings.fine_rounds):
         if round_:
-            surface.move_to(base + out * normals)
-            now = look()
+            surface = ModelSurface.of(topology, base + out * normals)
+            now = _match(matcher, surface, T, now.matches.hint, settings)
         seen_at, pull_at = now.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     kept, held_back = unfolded(start, base, base + out * normals, topology, settings.turn_cosine)
@@ -161,23 +157,26 @@ class WeightedMatches:
         return gathered.weight / spread_mm**2, gathered.pull / spread_mm**2
 
 
-def _matcher(target: ScanTarget, surface: MovingSurface, T: Similarity, settings: DenseSettings) -> Matcher:
+def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:
     count = len(target.mesh.vertices)
     chosen = np.arange(count, dtype=np.int32)
     if count > settings.scan_points:
         chosen = np.sort(np.random.default_rng(settings.seed).choice(chosen, settings.scan_points, replace=False))
-    return Matcher(
-        target, surface, T, chosen, surface.topology.used, target.engine, settings.normal_cosine, bulging=True
-    )
+    return Matcher.of(target, chosen, topology.used, target.engine, settings.normal_cosine, bulging=True)
 
 
-def _look(
-    matcher: Matcher, surface: MovingSurface, T: Similarity, target: ScanTarget, settings: DenseSettings
+def _match(
+    matcher: Matcher, surface: ModelSurface, T: Similarity, hint: MatchHint, settings: DenseSettings
 ) -> WeightedMatches:
-    matches = matcher.match(surface, T)
+    """Return the matches of the surface, and the spread and the noise of their residuals.
+
+    Raises:
+        FitError: hardly anything of the scan matches the surface.
+    """
+    matches = matcher.match(surface, T, hint)
     points = np.flatnonzero(matches.points.allowed)
     if len(points) < _FEWEST_MATCHES:
-        raise FitError(f"{target.mesh.name}: too little of it matches the fitted surface to go on from there.")
+        raise FitError(f"{matcher.target.mesh.name}: too little of it matches the fitted surface to go on from there.")
     residual = matches.points.residual
     spread_mm = spread(residual[points])
     # How much points that lie next to each other disagree is noise.

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.fit.kernels import rows_into
 from shapespace.fit.matching import Gathered
-from shapespace.fit.moving_model import MovingSurface
+from shapespace.fit.moving_model import ModelSurface
 from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray, Similarity
 
@@ -105,7 +105,7 @@ class NormalEquations:
 
 
 def normal_equations(
-    surface: MovingSurface, gathered: Gathered, prior: Prior, sigma_mm: float, at: Estimate, modes: int
+    surface: ModelSurface, gathered: Gathered, prior: Prior, sigma_mm: float, at: Estimate, modes: int
 ) -> NormalEquations:
     """Return the equations of one Gauss-Newton step on the pose and the first `modes` coefficients.
 

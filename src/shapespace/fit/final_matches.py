@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.fit.matching import match_vertices
-from shapespace.fit.moving_model import MovingSurface
+from shapespace.fit.moving_model import ModelSurface
 from shapespace.fit.regions import BORDER, FOLLOWED, REJECTED, UNSEEN
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.weights import match_weights
@@ -40,7 +40,7 @@ class FinalMatches:
 
     target: ScanTarget
     T_scan_model: Similarity
-    surface: MovingSurface
+    surface: ModelSurface
     winding: float
     normal_cosine: float
     weight: str

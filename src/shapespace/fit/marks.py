@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.fit.moving_model import MovingSurface
+from shapespace.fit.moving_model import ModelSurface
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.shape_model import ShapeModel
@@ -55,12 +55,12 @@ class Marks:
             SHARE * rms_size(model.mean_vertices),
         )
 
-    def off_mm(self, surface: MovingSurface, T_scan_model: Similarity) -> FloatArray:
+    def off_mm(self, surface: ModelSurface, T_scan_model: Similarity) -> FloatArray:
         """Return (L,) the distance of each landmark of the surface from that of the scan, mm of the scan."""
         at = self.landmarks.interpolate(surface.vertices)
         return np.linalg.norm(T_scan_model.apply(at) - self.points_mm, axis=1)
 
-    def equations(self, surface: MovingSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
+    def equations(self, surface: ModelSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
         """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.
 
         Args:
@@ -82,7 +82,7 @@ class Marks:
         hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)
         return hessian, np.asarray(heavy.T @ off.ravel(), dtype=np.float64)
 
-    def notes(self, surface: MovingSurface, T_scan_model: Similarity) -> list[str]:
+    def notes(self, surface: ModelSurface, T_scan_model: Similarity) -> list[str]:
         """Return a sentence on each landmark that lies where the fit does not have it."""
         off_mm = self.off_mm(surface, T_scan_model)
         far = off_mm > _FAR * max(self.stddev_mm, _MAD * float(np.median(off_mm)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.fit.kernels import gather_into
-from shapespace.fit.moving_model import MovingSurface
+from shapespace.fit.moving_model import ModelSurface
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.weights import match_weights
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, on_boundary
@@ -72,6 +72,11 @@ class Matches:
     points: PointMatches
     vertices: VertexMatches
     winding: float
+
+    @property
+    def hint(self) -> MatchHint:
+        """For the next search of the same points and vertices."""
+        return MatchHint(self.points.nearest, self.points.triangle, self.vertices.near, self.winding)
 
     def residuals(self) -> FloatArray:
         """Return the residuals of all matches that are allowed, both ways."""
@@ -146,60 +151,90 @@ class Gathered:
     seen: BoolArray
 
 
-class Matcher:
-    """Matches the same points of a scan and the same vertices of a surface again and again while the surface moves.
+@dataclass(frozen=True, eq=False)
+class MatchHint:
+    """Where the last search ended. It shortens the next search of the same points and vertices.
 
-    It remembers where it found them last, which makes the next search short, and nothing else.
+    Args:
+        vertex: (M,) of the model, near each scan point.
+        triangle: (M,) of the model, near each scan point; -1 where none is known.
+        near: closest points of the scan to the vertices; None where none are known.
+        winding: -1 where the scan's normals are reversed, else 1; None where it is not known.
+    """
+
+    vertex: IntArray
+    triangle: IntArray
+    near: ClosestPoints | None
+    winding: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """Matches a sample of scan points and a sample of model vertices, both ways.
 
     Args:
         target: the scan.
-        surface: as it is now.
-        T_scan_model: where it is now, in the scan's mm frame.
-        points: indices of the scan points that look for the surface.
-        vertex: indices of the vertices that look for the scan.
+        points_mm: (M, 3) sample of its points, mm of the scan's frame.
+        point_normals: (M, 3) their normals.
+        vertex: (N,) sample of the model's vertices.
         engine: the scan's search structure.
         normal_cosine: matches whose normals disagree more than this are not allowed.
-        tree: of the surface's vertices, as they are or were a little ago; None to make one.
-        winding: of the scan where it is known; None to find it.
         bulging: whether flat triangles stand for the smooth surface through their corners.
     """
 
-    def __init__(
-        self, target: ScanTarget, surface: MovingSurface, T_scan_model: Similarity, points: IntArray, vertex: IntArray,
-        engine: ClosestPointEngine, normal_cosine: float, *, tree: KdTree | None = None, winding: float | None = None,
-        bulging: bool = False,
-    ) -> None:  # fmt: skip
-        self._target, self._engine, self._normal_cosine, self._bulging = target, engine, normal_cosine, bulging
-        self._points_mm, self._normals = target.mesh.vertices[points], target.normals[points]
-        self._vertex, self._winding = vertex, winding
-        self._near: ClosestPoints | None = None
+    target: ScanTarget
+    points_mm: FloatArray
+    point_normals: FloatArray
+    vertex: IntArray
+    engine: ClosestPointEngine
+    normal_cosine: float
+    bulging: bool = False
+
+    @staticmethod
+    def of(
+        target: ScanTarget, points: IntArray, vertex: IntArray, engine: ClosestPointEngine, normal_cosine: float,
+        *, bulging: bool = False,
+    ) -> Matcher:  # fmt: skip
+        """Return the matcher of the scan points `points` (M,) and the model vertices `vertex` (N,)."""
+        return Matcher(
+            target, target.mesh.vertices[points], target.normals[points], vertex, engine, normal_cosine, bulging
+        )
+
+    def first_hint(
+        self, surface: ModelSurface, T_scan_model: Similarity, tree: KdTree | None = None, winding: float | None = None
+    ) -> MatchHint:
+        """Return a hint for the first search.
+
+        Args:
+            surface: of the model.
+            T_scan_model: its pose.
+            tree: of the vertices of a similar surface; None to build one.
+            winding: of the scan where it is known.
+        """
         tree = tree or surface.vertex_tree()
-        self._walks: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
-        self._triangles = np.full_like(self._walks, -1)
+        vertex: IntArray = surface.topology.used[tree.nearest(self._in_model(T_scan_model))[0]]
+        return MatchHint(vertex, np.full_like(vertex, -1), None, winding)
 
     def _in_model(self, T: Similarity) -> FloatArray:
-        return ((self._points_mm - T.translation) @ T.rotation) / T.scale
+        return ((self.points_mm - T.translation) @ T.rotation) / T.scale
 
-    def match(self, surface: MovingSurface, T_scan_model: Similarity) -> Matches:
-        """Return the matches of `surface` where it is now (eqs 4 to 6)."""
-        q, n = self._in_model(T_scan_model), self._normals @ T_scan_model.rotation
-        barycentric = surface.walk(q, self._walks, self._triangles)
-        triangle = self._triangles.copy()
-        residual, distance, cosine, covered = surface.meet(q, n, triangle, barycentric, bulging=self._bulging)
-        if self._winding is None:
-            self._winding = _winding_of(cosine, covered)
-        agree = self._winding * cosine > self._normal_cosine
-        points = PointMatches(triangle, barycentric, self._walks.copy(), residual, distance, covered & agree)
+    def match(self, surface: ModelSurface, T_scan_model: Similarity, hint: MatchHint) -> Matches:
+        """Return the matches of `surface` at a pose (eqs 4 to 6); their `hint` is that of the next search."""
+        q, n = self._in_model(T_scan_model), self.point_normals @ T_scan_model.rotation
+        nearest, triangle, barycentric = surface.closest(q, hint.vertex, hint.triangle)
+        residual, distance, cosine, covered = surface.meet(q, n, triangle, barycentric, bulging=self.bulging)
+        winding = _winding_of(cosine, covered) if hint.winding is None else hint.winding
+        agree = winding * cosine > self.normal_cosine
+        points = PointMatches(triangle, barycentric, nearest, residual, distance, covered & agree)
         vertices = match_vertices(
-            self._target, self._engine, T_scan_model, surface, self._vertex, self._near,
-            winding=self._winding, normal_cosine=self._normal_cosine,
+            self.target, self.engine, T_scan_model, surface, self.vertex, hint.near,
+            winding=winding, normal_cosine=self.normal_cosine,
         )  # fmt: skip
-        self._near = vertices.near
-        return Matches(points, vertices, self._winding)
+        return Matches(points, vertices, winding)
 
 
 def match_vertices(
-    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: MovingSurface, vertex: IntArray,
+    target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface, vertex: IntArray,
     near: ClosestPoints | None, *, winding: float, normal_cosine: float,
 ) -> VertexMatches:  # fmt: skip
     """Match some of the surface's vertices to the scan (eqs 5 and 6).

@@ -1,4 +1,4 @@
-"""A shape model made ready for a fit: modes at hand, a surface that moves in place, closest points by walking."""
+"""A shape model with precomputed data for fitting, and its surfaces, on which closest points are found by walking."""
 
 from __future__ import annotations
 
@@ -105,50 +105,52 @@ def prepare(model: ShapeModel) -> PreparedModel:
     return _PREPARED[model]
 
 
-class MovingSurface:
-    """The model's surface while it is fitted, in the model's frame (mm).
+@dataclass(frozen=True, eq=False)
+class ModelSurface:
+    """A surface on the model's triangles, in the model's frame.
 
     Args:
         topology: its triangles.
-        vertices: (V, 3) where it begins, mm; for modes, the mean.
-        modes: (V, 3, K) float32 in which it deforms; None where it is moved vertex by vertex.
+        vertices: (V, 3) mm.
+        normals: (V, 3) unit normals of the vertices.
+        modes: (V, 3, K) float32 in which it deforms; K is 0 where it is moved vertex by vertex.
     """
 
-    def __init__(self, topology: Topology, vertices: FloatArray, modes: Float32Array | None = None) -> None:
-        self.topology = topology
-        self.modes = np.empty((len(vertices), 3, 0), dtype=np.float32) if modes is None else modes
-        self._mean = vertices
-        self.vertices = np.array(vertices)
-        self.normals = np.empty_like(self.vertices)
-        self._refresh()
+    topology: Topology
+    vertices: FloatArray
+    normals: FloatArray
+    modes: Float32Array
 
-    def _refresh(self) -> None:
-        normals_into(self.vertices, self.topology.faces, self.normals)
-
-    def deform(self, b: FloatArray) -> None:
-        """Take the shape with coefficients `b` (k,) mm."""
-        k = len(b)
-        flat = self.modes.reshape(-1, self.modes.shape[2])
-        moved = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)
-        np.add(self._mean, moved.reshape(-1, 3), out=self.vertices)
-        self._refresh()
-
-    def move_to(self, vertices: FloatArray) -> None:
-        """Take the shape with `vertices` (V, 3) mm."""
-        self.vertices[:] = vertices
-        self._refresh()
+    @staticmethod
+    def of(topology: Topology, vertices: FloatArray, modes: Float32Array | None = None) -> ModelSurface:
+        """Return the surface with these vertices (V, 3) mm, and the normals that follow from them."""
+        normals = np.empty_like(vertices)
+        normals_into(vertices, topology.faces, normals)
+        modes = np.empty((len(vertices), 3, 0), dtype=np.float32) if modes is None else modes
+        return ModelSurface(topology, vertices, normals, modes)
 
     def vertex_tree(self) -> KdTree:
-        """Return a tree of the vertices as they are now that some triangle has: entry i is vertex `used[i]`."""
+        """Return a tree of the vertices that some triangle has: entry i is vertex `used[i]`."""
         return KdTree(self.vertices[self.topology.used])
 
-    def walk(self, points: FloatArray, vertex: IntArray, triangle: IntArray) -> FloatArray:
-        """Bring `vertex` and `triangle` (M,) of the closest points up to date; return their weights (M, 3)."""
-        weights, t = np.empty((len(points), 3)), self.topology
+    def closest(
+        self, points: FloatArray, vertex: IntArray, triangle: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Find the closest points by walking over the surface from a vertex and a triangle near each.
+
+        Args:
+            points: (M, 3) mm.
+            vertex: (M,) where each walk begins.
+            triangle: (M,) near it; -1 where none is known.
+
+        Returns:
+            (M,) vertex where each walk ends, (M,) triangle of the closest point, (M, 3) barycentric coordinates.
+        """
+        vertex, triangle, weights, t = vertex.copy(), triangle.copy(), np.empty((len(points), 3)), self.topology
         walk_into(
             points, vertex, self.vertices, t.faces, t.ring_start, t.ring, t.fan_start, t.fan, triangle, weights
         )  # fmt: skip
-        return weights
+        return vertex, triangle, weights
 
     def meet(
         self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray, *, bulging: bool
@@ -166,3 +168,25 @@ class MovingSurface:
         if bulging:
             less_sag(triangle, weights, self.vertices, self.normals, self.topology.faces, residual)
         return residual, distance, cosine, covered
+
+
+@dataclass(frozen=True, eq=False)
+class LinearShape:
+    """The surfaces that a mean and modes can take (eq 1).
+
+    Args:
+        topology: of all of them.
+        mean: (V, 3) mm.
+        modes: (V, 3, K) float32.
+    """
+
+    topology: Topology
+    mean: FloatArray
+    modes: Float32Array
+
+    def surface(self, b: FloatArray) -> ModelSurface:
+        """Return the surface with coefficients `b` (k,) mm of the first k modes (eq 1)."""
+        k = len(b)
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        offset = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)
+        return ModelSurface.of(self.topology, self.mean + offset.reshape(-1, 3), self.modes)

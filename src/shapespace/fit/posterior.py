@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from shapespace.fit.equations import SCALE, NormalEquations, Prior
 from shapespace.fit.marks import worth
 from shapespace.fit.matching import Weights
-from shapespace.fit.moving_model import MovingSurface
+from shapespace.fit.moving_model import ModelSurface
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
@@ -65,7 +65,7 @@ class Posterior:
 
 def posterior(
     model: ShapeModel,
-    surface: MovingSurface,
+    surface: ModelSurface,
     prior: Prior,
     equations: NormalEquations,
     weights: Weights,
@@ -117,7 +117,7 @@ def posterior(
     return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
 
 
-def covariance_of_landmarks(known: Posterior, surface: MovingSurface, landmarks: SurfaceLandmarks) -> FloatArray:
+def covariance_of_landmarks(known: Posterior, surface: ModelSurface, landmarks: SurfaceLandmarks) -> FloatArray:
     """Return the covariance (L, 3, 3), mm^2 of the model's frame, of the positions of landmarks.
 
     It is the covariance of the sum of the effects of pose, coefficients and off-model modes.
@@ -159,7 +159,7 @@ def lack_of_new_shapes(model: ShapeModel) -> float:
     return float(np.sqrt((left + outside) / model.n_vertices))
 
 
-def _gram(surface: MovingSurface) -> FloatArray:
+def _gram(surface: ModelSurface) -> FloatArray:
     """Return (7 + K + R, 7 + K + R): inner products over the surface of what each parameter moves."""
     flat, modes = small_poses(surface.vertices), surface.modes
     gram = np.eye(POSE + modes.shape[2])

@@ -27,8 +27,8 @@ from shapespace.errors import FitError
 from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
 from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.marks import Marks, worth
-from shapespace.fit.matching import Gathered, Matcher, Matches, Weights
-from shapespace.fit.moving_model import MovingSurface, PreparedModel, prepare
+from shapespace.fit.matching import Gathered, Matcher, Matches, MatchHint, Weights
+from shapespace.fit.moving_model import LinearShape, ModelSurface, PreparedModel, prepare
 from shapespace.fit.posterior import Posterior, covariance_of_landmarks, lack_of_new_shapes, new_shapes, posterior
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
@@ -54,12 +54,35 @@ _LACK_LEFT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
+class Iterate:
+    """Current state of the fit.
+
+    Args:
+        estimate: pose and coefficients.
+        surface: of the model, with these coefficients (eq 1).
+    """
+
+    estimate: Estimate
+    surface: ModelSurface
+
+    @property
+    def T_scan_model(self) -> Similarity:
+        """From the model's frame to the scan's mm frame."""
+        return self.estimate.T_scan_model
+
+    @property
+    def b(self) -> FloatArray:
+        """Coefficients (K,), mm."""
+        return self.estimate.b
+
+
+@dataclass(frozen=True, eq=False)
 class WeightedMatches:
-    """What the fit sees where it is.
+    """Matches of an iterate with their weights.
 
     Args:
         matches: both ways.
-        weights: of those.
+        weights: of the matches.
         sigma_mm: spread of their residuals.
     """
 
@@ -69,7 +92,7 @@ class WeightedMatches:
 
     @property
     def rms_mm(self) -> float:
-        """RMS closest distance of the model's vertices that were looked at, mm of the model's frame."""
+        """RMS closest distance of the sampled vertices of the model, mm of the model's frame."""
         return float(np.sqrt((self.matches.vertices.distance**2).mean()))
 
 
@@ -78,34 +101,34 @@ class Step:
     """One Gauss-Newton step.
 
     Args:
-        look: what it went by.
-        at: where it led.
+        weighted: the matches that the step used.
+        iterate: where it led.
         motion_mm: largest movement of a vertex, mm of the model's frame.
     """
 
-    look: WeightedMatches
-    at: Estimate
+    weighted: WeightedMatches
+    iterate: Iterate
     motion_mm: float
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What stays the same from step to step.
+    """The constants of the fit.
 
     Args:
         prepared: the model.
         target: the scan.
         settings: of the method.
         prior: of pose and shape.
-        surface: the model's surface, which moves.
-        marks: landmarks that it is held to, if any.
+        shape: the surfaces that the coefficients give.
+        marks: landmarks, if any.
     """
 
     prepared: PreparedModel
     target: ScanTarget
     settings: RobustSettings
     prior: Prior
-    surface: MovingSurface
+    shape: LinearShape
     marks: Marks | None = None
 
     @staticmethod
@@ -115,35 +138,43 @@ class Problem:
     ) -> Problem:  # fmt: skip
         """Return the problem with the model's own modes."""
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
-        surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        return Problem(prepared, target, settings, prior, surface, marks)
+        shape = LinearShape(prepared.topology, prepared.model.mean_vertices, prepared.modes)
+        return Problem(prepared, target, settings, prior, shape, marks)
 
-    def with_modes_beside(self) -> Problem:
-        """Return the problem with the modes that the model lacks, weighed as `beyond_prior` says."""
+    def with_residual_modes(self) -> Problem:
+        """Return the problem with the residual modes as well, which `beyond_prior` weighs."""
         prepared, s = self.prepared, self.settings
         extra = residual_modes(prepared.model, s.residual)
         prior = replace(self.prior, stddev=np.concatenate([self.prior.stddev, extra.stddev]), weight=s.beyond_prior)
-        surface = MovingSurface(prepared.topology, prepared.model.mean_vertices, extra.modes)
-        return replace(self, prior=prior, surface=surface)
+        return replace(self, prior=prior, shape=replace(self.shape, modes=extra.modes))
 
-    def matcher(self, level: Level, at: Estimate, tree: KdTree, winding: float | None) -> Matcher:
-        """Return what matches the points that `level` draws, from where the fit is."""
+    def iterate(self, estimate: Estimate) -> Iterate:
+        """Return the iterate with this pose and these coefficients (eq 1)."""
+        return Iterate(estimate, self.shape.surface(estimate.b))
+
+    def matcher(self, level: Level) -> Matcher:
+        """Return the matcher of the points and vertices that `level` samples."""
         s, target, rng = self.settings, self.target, np.random.default_rng(self.settings.seed)
         points = target.draw(level.scan_points, rng)
         vertex = _some(self.prepared.topology.used, level.vertices, rng)
         engine = target.engine if level.triangles else target.vertex_engine
-        return Matcher(
-            target, self.surface, at.T_scan_model, points, vertex, engine, s.normal_cosine, tree=tree, winding=winding
-        )
+        return Matcher.of(target, points, vertex, engine, s.normal_cosine)
 
-    def look(self, matcher: Matcher, at: Estimate) -> WeightedMatches:
-        """Return the matches and how much each counts.
+    def match(self, matcher: Matcher, iterate: Iterate, hint: MatchHint) -> WeightedMatches:
+        """Return the matches of an iterate with their weights (eqs 4 to 9).
+
+        Raises:
+            FitError: hardly anything matches.
+        """
+        return self.weigh(matcher.match(iterate.surface, iterate.T_scan_model, hint))
+
+    def weigh(self, matches: Matches) -> WeightedMatches:
+        """Return the matches with their weights (eqs 7 to 9).
 
         Raises:
             FitError: hardly anything matches.
         """
         s = self.settings
-        matches = matcher.match(self.surface, at.T_scan_model)  # eqs 4 to 6
         residual = matches.residuals()
         if len(residual) < _FEWEST_MATCHES:
             raise FitError(
@@ -152,30 +183,32 @@ class Problem:
             )
         sigma_mm = max(spread(residual), s.least_spread_mm)
         width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
-        fineness = min(1.0, len(self.target.mesh.vertices) / len(self.surface.vertices))
+        fineness = min(1.0, len(self.target.mesh.vertices) / len(self.shape.mean))
         weights = matches.weights(
             s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share * fineness**2
         )  # eqs 8, 9
         return WeightedMatches(matches, weights, sigma_mm)
 
-    def equations(self, look: WeightedMatches, at: Estimate, modes: int) -> tuple[Gathered, NormalEquations]:
-        """Return what each vertex carries of the matches, and the equations of a step from there."""
-        gathered = look.matches.gathered(look.weights, self.prepared.topology.faces, len(self.surface.vertices))
-        equations = normal_equations(self.surface, gathered, self.prior, look.sigma_mm, at, modes)
+    def equations(self, weighted: WeightedMatches, iterate: Iterate, modes: int) -> tuple[Gathered, NormalEquations]:
+        """Return what each vertex carries of the matches, and the normal equations of a step (eqs 10 to 14)."""
+        surface = iterate.surface
+        gathered = weighted.matches.gathered(weighted.weights, self.prepared.topology.faces, len(surface.vertices))
+        equations = normal_equations(surface, gathered, self.prior, weighted.sigma_mm, iterate.estimate, modes)
         if self.marks is None:
             return gathered, equations
-        hessian, gradient = self.marks.equations(self.surface, at.T_scan_model, modes)
-        gain = look.sigma_mm**2 * worth(float(look.weights.points.sum() + look.weights.vertices.sum()))
+        hessian, gradient = self.marks.equations(surface, iterate.T_scan_model, modes)
+        weights = weighted.weights
+        gain = weighted.sigma_mm**2 * worth(float(weights.points.sum() + weights.vertices.sum()))
         return gathered, replace(equations, gradient=equations.gradient + gain * gradient, marks=gain * hessian)
 
-    def step(self, matcher: Matcher, at: Estimate, modes: int) -> Step:
-        """Return one Gauss-Newton step on the pose and the first `modes` coefficients; the surface moves with it.
+    def step(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, modes: int) -> Step:
+        """Return one Gauss-Newton step on the pose and the first `modes` coefficients.
 
         Raises:
             FitError: hardly anything matches, or the fit diverged.
         """
-        look = self.look(matcher, at)  # eqs 4 to 9
-        _, equations = self.equations(look, at, modes)  # eqs 10 to 14
+        weighted = self.match(matcher, iterate, hint)  # eqs 4 to 9
+        _, equations = self.equations(weighted, iterate, modes)  # eqs 10 to 14
         try:
             delta = equations.step()  # eq 15
         except LinAlgError as error:
@@ -183,62 +216,71 @@ class Problem:
                 f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
                 "what the model shows (--crop)."
             ) from error
+        estimate = iterate.estimate.moved_by(delta)  # eq 16
+        # Without free modes the shape stays as it is.
+        following = self.iterate(estimate) if modes else replace(iterate, estimate=estimate)
         some = slice(None, None, _MOTION_STRIDE)
-        before, at = at.T_scan_model.apply(self.surface.vertices[some]), at.moved_by(delta)  # eq 16
-        if modes:
-            self.surface.deform(at.b)  # eq 1
-        moved = at.T_scan_model.apply(self.surface.vertices[some]) - before
-        return Step(look, at, float(np.linalg.norm(moved, axis=1).max()) / at.T_scan_model.scale)
+        before = iterate.T_scan_model.apply(iterate.surface.vertices[some])
+        moved = estimate.T_scan_model.apply(following.surface.vertices[some]) - before
+        return Step(weighted, following, float(np.linalg.norm(moved, axis=1).max()) / estimate.T_scan_model.scale)
 
-    def descent(self, matcher: Matcher, at: Estimate, level: Level) -> Generator[Step]:
+    def descent(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, level: Level) -> Generator[Step]:
         """Yield steps with the modes that are free on `level`, until hardly anything moves.
 
         Raises:
             FitError: hardly anything matches, or the fit diverged.
         """
-        modes = level.free(len(at.b))
+        modes = level.free(len(iterate.b))
         for _ in range(level.iterations):
-            step = self.step(matcher, at, modes)
-            at = step.at
+            step = self.step(matcher, iterate, hint, modes)
+            iterate, hint = step.iterate, step.weighted.matches.hint
             yield step
             if step.motion_mm < level.stop_motion_mm:
                 return
 
-    def unexplained_variance(self, look: WeightedMatches) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17)."""
-        return look.matches.unexplained_variance(
-            look.weights, self.prepared.topology.faces, len(self.surface.vertices), self.settings.seed
+    def unexplained_variance(self, weighted: WeightedMatches) -> float:
+        """Return the variance, mm^2, of the part of the residuals that is not noise (eq 17)."""
+        return weighted.matches.unexplained_variance(
+            weighted.weights, self.prepared.topology.faces, len(self.shape.mean), self.settings.seed
         )
 
-    def told(self, at: Estimate, surface_mm: float, modes: int) -> Estimate:
-        """Return the surface at `at` in the first `modes` of the model's own modes; `surface_mm` is its uncertainty."""
+    def in_model(self, iterate: Iterate, surface_mm: float, modes: int) -> Estimate:
+        """Return the pose and the first `modes` of the model's own coefficients of an iterate (eqs 18 and 19).
+
+        Args:
+            iterate: of the fit, with residual modes or without.
+            surface_mm: uncertainty of its surface, RMS over the vertices.
+            modes: number of coefficients.
+        """
         own = self.prepared.model.n_modes
-        if len(at.b) == modes == own:
-            return at
+        if len(iterate.b) == modes == own:
+            return iterate.estimate
         return in_span(
-            self.prepared, self.surface.vertices, at, np.sqrt(new_shapes(self.prepared.model)), surface_mm, modes,
-            with_scale=not self.prior.holds_scale,
+            self.prepared, iterate.surface.vertices, iterate.estimate, np.sqrt(new_shapes(self.prepared.model)),
+            surface_mm, modes, with_scale=not self.prior.holds_scale,
         )  # fmt: skip
 
-    def mismatch_mm(self, matcher: Matcher, at: Estimate) -> float:
-        """Return the mean distance both ways, mm, of which none counts more than the reach."""
-        matches, most = matcher.match(self.surface, at.T_scan_model), _FARTHEST * self.settings.reach_mm
+    def mismatch_mm(self, matches: Matches) -> float:
+        """Return the mean distance in both directions, mm, each distance cut at the reach."""
+        most = _FARTHEST * self.settings.reach_mm
         return sum(float(np.minimum(way.distance, most).mean()) for way in (matches.points, matches.vertices))
 
-    def preferred(self, at: Estimate, matcher: Matcher, start: Start, level: Level, tree: KdTree) -> Estimate:
-        """Return where `level` leads from `start` and its coefficients if that matches clearly better, else `at`."""
-        limit_mm = _CLEARLY_BETTER * self.mismatch_mm(matcher, at)
-        free, b = level.free(len(at.b)), np.zeros(len(at.b))
-        b[: min(len(start.b), free)] = start.b[:free]
-        other = Estimate(start.T_scan_model, b)
-        self.surface.deform(b)
-        matcher = self.matcher(level, other, tree, None)
-        for step in self.descent(matcher, other, level):
-            other = step.at
-        if self.mismatch_mm(matcher, other) <= limit_mm:
-            return other
-        self.surface.deform(at.b)
-        return at
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Where the iterations of the levels led.
+
+    Args:
+        iterate: the last one.
+        state: of it, which is not yielded yet.
+        matcher: of the last level.
+        hint: for its next search.
+    """
+
+    iterate: Iterate
+    state: IcpState
+    matcher: Matcher
+    hint: MatchHint
 
 
 def robust_icp(
@@ -267,95 +309,144 @@ def robust_icp(
         InputError: the model has no triangles.
         FitError: hardly anything matches, or the fit diverged.
     """
-    prepared = prepare(model)
     scale = start.T_scan_model.scale
-    problem = Problem.of(prepared, target, settings, scale, with_scale=with_scale, marks=start.marks)
-    at = Estimate(start.T_scan_model, np.zeros(model.n_modes))
-    tree, tree_fits = prepared.tree, False
-    matcher = problem.matcher(settings.levels[0], at, tree, None)
-    look = problem.look(matcher, at)
-    state, winding = IcpState(1, 0, at.T_scan_model, at.b, look.rms_mm, float("inf")), look.matches.winding
-    for level in settings.levels:
+    problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
+    course, tree = yield from _coarse_to_fine(problem, start, max_iterations)
+    weighted = problem.match(course.matcher, course.iterate, course.hint)
+    unexplained_mm2 = problem.unexplained_variance(weighted)  # eq 17
+    least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)
+    if unexplained_mm2 >= least_mm2 and course.state.iteration < max_iterations:
+        problem = problem.with_residual_modes()
+        course = yield from _extended(problem, course, tree, max_iterations)
+        weighted = problem.match(course.matcher, course.iterate, course.hint)
+    yield course.state
+    return _summary(problem, course.iterate, weighted, unexplained_mm2, modes)
+
+
+def _coarse_to_fine(
+    problem: Problem, start: Start, max_iterations: int
+) -> Generator[IcpState, None, tuple[Course, KdTree]]:
+    """Fit on all levels with the model's modes; return where that led, and a tree of the vertices for hints."""
+    prepared, levels = problem.prepared, problem.settings.levels
+    iterate = problem.iterate(Estimate(start.T_scan_model, np.zeros(prepared.model.n_modes)))
+    tree, tree_fits, matcher = prepared.tree, False, problem.matcher(levels[0])
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree)
+    first = problem.match(matcher, iterate, hint)
+    state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
+    for level in levels:
         begins = level.modes != 0 and state.phase == 1
         if begins:
             yield replace(state, stopped=state.stopped or "rate")
             state = replace(state, phase=2, iteration=0, stopped=None)
-        # The surface changes little from level to level, and what it does the walks make up for.
+        # The surface changes little from level to level; the walks make up for it.
         if level.modes is None and not tree_fits:
-            tree, tree_fits = tree.moved(problem.surface.vertices[prepared.topology.used]), True
-        matcher = problem.matcher(level, at, tree, winding)
-        at, state = yield from _states(problem.descent(matcher, at, level), at, state, level, max_iterations)
+            tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
+        matcher = problem.matcher(level)
+        hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, first.matches.winding)
+        steps = problem.descent(matcher, iterate, hint, level)
+        course = yield from _states(steps, Course(iterate, state, matcher, hint), level, max_iterations)
+        iterate, state = course.iterate, course.state
         if begins and len(start.b) and state.iteration < max_iterations:
-            at = problem.preferred(at, matcher, start, level, tree)
+            iterate = _preferred(problem, course, start, level, tree)
+            course = replace(course, iterate=iterate)
+    return course, tree
 
-    look = problem.look(matcher, at)
-    left_mm2 = problem.unexplained_variance(look)  # eq 17
-    more = left_mm2 >= max(settings.beyond_share * look.sigma_mm**2, settings.beyond_mm**2)
-    if more and state.iteration < max_iterations:
-        problem = problem.with_modes_beside()
-        at = Estimate(at.T_scan_model, np.pad(at.b, (0, len(problem.prior.stddev) - len(at.b))))
-        problem.surface.deform(at.b)
-        matcher = problem.matcher(settings.beyond, at, tree, winding)
-        steps = problem.descent(matcher, at, settings.beyond)
-        at, state = yield from _states(steps, at, state, settings.beyond, max_iterations)
-        look = problem.look(matcher, at)
-    yield state
 
-    gathered, equations = problem.equations(look, at, len(at.b))
-    surface, vertices = problem.surface, look.matches.vertices
+def _preferred(problem: Problem, course: Course, start: Start, level: Level, tree: KdTree) -> Iterate:
+    """Return where `level` leads from `start` and its coefficients if that matches clearly better, else the iterate."""
+
+    def mismatch_mm(iterate: Iterate, matcher: Matcher, hint: MatchHint) -> float:
+        return problem.mismatch_mm(matcher.match(iterate.surface, iterate.T_scan_model, hint))
+
+    limit_mm = _CLEARLY_BETTER * mismatch_mm(course.iterate, course.matcher, course.hint)
+    free, b = level.free(len(course.iterate.b)), np.zeros(len(course.iterate.b))
+    b[: min(len(start.b), free)] = start.b[:free]
+    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), problem.matcher(level)
+    hint = matcher.first_hint(other.surface, other.T_scan_model, tree)
+    for step in problem.descent(matcher, other, hint, level):
+        other, hint = step.iterate, step.weighted.matches.hint
+    return other if mismatch_mm(other, matcher, hint) <= limit_mm else course.iterate
+
+
+def _extended(problem: Problem, course: Course, tree: KdTree, max_iterations: int) -> Generator[IcpState, None, Course]:
+    """Continue with the residual modes of `problem`, whose coefficients begin at zero."""
+    level, own = problem.settings.beyond, course.iterate.b
+    b = np.pad(own, (0, len(problem.prior.stddev) - len(own)))
+    iterate, matcher = problem.iterate(Estimate(course.iterate.T_scan_model, b)), problem.matcher(level)
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, course.hint.winding)
+    steps = problem.descent(matcher, iterate, hint, level)
+    return (yield from _states(steps, Course(iterate, course.state, matcher, hint), level, max_iterations))
+
+
+def _summary(
+    problem: Problem, iterate: Iterate, weighted: WeightedMatches, unexplained_mm2: float, modes: int | None
+) -> Fitted:
+    """Return the result: coefficients of the model, their covariance, regions and evidence.
+
+    Args:
+        problem: of the fit.
+        iterate: the last one.
+        weighted: its matches.
+        unexplained_mm2: variance of the residuals that is not noise, before residual modes joined (eq 17).
+        modes: how many coefficients to report; None for all.
+    """
+    model, target, settings = problem.prepared.model, problem.target, problem.settings
+    gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
+    surface, vertices, T = iterate.surface, weighted.matches.vertices, iterate.T_scan_model
+    beyond_mm = float(np.sqrt(max(unexplained_mm2, 0.0)))
     try:
         known = posterior(
-            model, surface, problem.prior, equations, look.weights, look.sigma_mm,
-            beyond_model_mm=float(np.sqrt(max(left_mm2, 0.0))), allowed_share=float(vertices.allowed.mean()),
+            model, surface, problem.prior, equations, weighted.weights, weighted.sigma_mm,
+            beyond_model_mm=beyond_mm, allowed_share=float(vertices.allowed.mean()),
         )  # fmt: skip
     except LinAlgError as error:
         raise FitError(
             f"{target.mesh.name}: the matches do not determine the pose; check the scan's unit (--unit), or give "
             "landmarks (--landmarks)."
         ) from error
-    # Modes that nobody asked for are no reason to doubt the fit, so the verdict is on all of them.
-    every = told = problem.told(at, known.surface_mm, model.n_modes)
+    # Modes that are not reported are no reason to doubt the fit, so the verdict is on all of them.
+    whole = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     if wanted < model.n_modes:
-        told = problem.told(at, known.surface_mm, wanted)
-    reported = (at.T_scan_model.inverse() @ every.T_scan_model).apply(model.reconstruct(every.b))
-    left_out_mm2 = float(((surface.vertices - reported) ** 2).sum(axis=1).mean())
+        reported = problem.in_model(iterate, known.surface_mm, wanted)
+    in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
+    left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())
     return Fitted(
-        T_scan_model=told.T_scan_model,
-        b=told.b,
+        T_scan_model=reported.T_scan_model,
+        b=reported.b,
         b_stddev=known.b_stddev(wanted),
         b_covariance=known.b_covariance(wanted),
         shrinkage=known.shrinkage(wanted),
-        T_scan_fitted=at.T_scan_model,
-        vertices_scan_mm=at.T_scan_model.apply(surface.vertices),
-        outside_mm=float(np.linalg.norm(at.b[wanted:]) / np.sqrt(len(surface.vertices))),
+        T_scan_fitted=T,
+        vertices_scan_mm=T.apply(surface.vertices),
+        outside_mm=float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
         regions=FinalMatches(
-            target, at.T_scan_model, MovingSurface(prepared.topology, surface.vertices), winding,
-            settings.normal_cosine, settings.weight, look.weights.width_mm, look.weights.far_mm,
+            target, T, surface, weighted.matches.winding, settings.normal_cosine, settings.weight,
+            weighted.weights.width_mm, weighted.weights.far_mm,
         ),
         evidence={
-            **_matched(look, gathered, at, model, known.prior_variance[: model.n_modes]),
-            "beyond_model_mm": float(np.sqrt(max(left_mm2, 0.0))),
+            **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
+            "beyond_model_mm": beyond_mm,
             "left_out_mm": float(np.sqrt(left_out_mm2)),
             "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
             "model_lack_mm": lack_of_new_shapes(model),
-            **_of_marks(problem, at),
+            **_of_marks(problem, iterate),
             "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         },
-        notes=() if problem.marks is None else problem.marks.notes(surface, at.T_scan_model),
-        landmark_covariance=_of_landmarks(model, known, surface, at.T_scan_model),
+        notes=() if problem.marks is None else problem.marks.notes(surface, T),
+        landmark_covariance=_of_landmarks(model, known, surface, T),
     )  # fmt: skip
 
 
-def _of_marks(problem: Problem, at: Estimate) -> dict[str, float]:
+def _of_marks(problem: Problem, iterate: Iterate) -> dict[str, float]:
     """Return the standard deviation of landmarks that were given, and how far off they are (RMS), mm of the scan."""
     if problem.marks is None:
         return {}
-    off_mm = problem.marks.off_mm(problem.surface, at.T_scan_model)
+    off_mm = problem.marks.off_mm(iterate.surface, iterate.T_scan_model)
     return {"marks_stddev_mm": problem.marks.stddev_mm, "marks_rms_mm": float(np.sqrt((off_mm**2).mean()))}
 
 
-def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T: Similarity) -> FloatArray:
+def _of_landmarks(model: ShapeModel, known: Posterior, surface: ModelSurface, T: Similarity) -> FloatArray:
     """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
     covariance = covariance_of_landmarks(known, surface, model.landmarks)
     # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
@@ -364,19 +455,19 @@ def _of_landmarks(model: ShapeModel, known: Posterior, surface: MovingSurface, T
 
 
 def _matched(
-    look: WeightedMatches, gathered: Gathered, at: Estimate, model: ShapeModel, variance: FloatArray
+    weighted: WeightedMatches, gathered: Gathered, iterate: Iterate, model: ShapeModel, variance: FloatArray
 ) -> dict[str, float]:
     """Return how much of model and scan found a match, and how plausible pose and shape are.
 
     Args:
-        look: at the end,
-        gathered: what of that each vertex carries.
-        at: where that is.
+        weighted: matches of the last iterate.
+        gathered: what each vertex carries of them.
+        iterate: the last one.
         model: the shape space.
         variance: (K,) of the coefficients of new shapes, mm^2.
     """
-    points, vertices, v = look.matches.points, look.matches.vertices, look.weights.vertices
-    size_mm, z2 = rms_size(model.mean_vertices), at.b[: model.n_modes] ** 2 / variance
+    points, vertices, v = weighted.matches.points, weighted.matches.vertices, weighted.weights.vertices
+    size_mm, z2 = rms_size(model.mean_vertices), iterate.b[: model.n_modes] ** 2 / variance
     return {
         "size_mm": size_mm,
         "seen_share": float(gathered.seen.mean()),
@@ -387,26 +478,26 @@ def _matched(
         "model_near_share": float((vertices.distance < _NEAR * size_mm).mean()),
         "z2": float(z2.mean()),
         "z2_leading": float(z2[:_LEADING].mean()),
-        "log_scale": float(np.log(at.T_scan_model.scale)),
-        "spread_mm": look.sigma_mm,
+        "log_scale": float(np.log(iterate.T_scan_model.scale)),
+        "spread_mm": weighted.sigma_mm,
     }
 
 
 def _states(
-    steps: Iterator[Step], at: Estimate, state: IcpState, level: Level, max_iterations: int
-) -> Generator[IcpState, None, tuple[Estimate, IcpState]]:
-    """Yield each state when the next is there; return the last one, which is not yielded, and where it is."""
+    steps: Iterator[Step], course: Course, level: Level, max_iterations: int
+) -> Generator[IcpState, None, Course]:
+    """Yield each state when the next one is known; return where the steps led, with the last state."""
+    state = course.state
     left = max_iterations - state.iteration
     for step in islice(steps, left):
         yield replace(state, stopped=None)
-        at = step.at
+        T, b = step.iterate.T_scan_model, step.iterate.b[: len(state.b)].copy()
         # Where parts of the scan match now one way and now another, the last bit of motion never ends.
         still = step.motion_mm < _FLICKER * level.stop_motion_mm
-        state = IcpState(
-            state.phase, state.iteration + 1, at.T_scan_model, at.b[: len(state.b)].copy(), step.look.rms_mm,
-            step.motion_mm, "rate" if still else "cap",
-        )  # fmt: skip
-    return at, state if left > 0 else replace(state, stopped="cap")
+        stopped = "rate" if still else "cap"
+        state = IcpState(state.phase, state.iteration + 1, T, b, step.weighted.rms_mm, step.motion_mm, stopped)
+        course = replace(course, iterate=step.iterate, hint=step.weighted.matches.hint)
+    return replace(course, state=state if left > 0 else replace(state, stopped="cap"))
 
 
 def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:

@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.io.landmarks import LANDMARK_FORMATS
+from shapespace.io.landmarks import LANDMARK_FORMATS, fcsv_text
 from shapespace.io.tables import rows_text
+from shapespace.types import FloatArray
 
 FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
 """Of the files that hold the landmarks of a fit, after NAME."""
 
-_FCSV = """# Markups fiducial file version = 4.11
-# CoordinateSystem = LPS
-# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
-"""
 _AXES = "xyz"
 
 Found = Mapping[str, Mapping[str, Any]]
@@ -29,7 +26,9 @@ def fiducial_texts(found: Found) -> dict[str, str]:
 
     Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
     """
-    texts = _table(found), _markups(found), _fcsv(found)
+    points = {name: np.array(one["at"], dtype=np.float64) for name, one in found.items()}
+    descriptions = {name: _described(one["stddev_mm"]) for name, one in found.items()}
+    texts = _table(found), _markups(points, descriptions), fcsv_text(points, descriptions)
     return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
 
 
@@ -38,20 +37,11 @@ def _table(found: Found) -> str:
     return rows_text([header, *([name, *_told(one["at"]), *_told(one["stddev_mm"])] for name, one in found.items())])
 
 
-def _markups(found: Found) -> str:
-    points = {name: np.array(one["at"], dtype=np.float64) for name, one in found.items()}
+def _markups(points: Mapping[str, FloatArray], descriptions: Mapping[str, str]) -> str:
     content = json.loads(LANDMARK_FORMATS[".mrk.json"].write(points))
     for point in content["markups"][0]["controlPoints"]:
-        point["description"] = _described(found[point["label"]]["stddev_mm"])
+        point["description"] = descriptions[point["label"]]
     return json.dumps(content, indent=1) + "\n"
-
-
-def _fcsv(found: Found) -> str:
-    rows = [
-        [str(number), *_told(one["at"]), "0", "0", "0", "1", "1", "1", "0", name, _described(one["stddev_mm"]), ""]
-        for number, (name, one) in enumerate(found.items(), 1)
-    ]
-    return _FCSV + rows_text(rows)
 
 
 def _told(numbers: Sequence[float] | None) -> list[str]:

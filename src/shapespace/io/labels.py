@@ -61,7 +61,8 @@ def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -
         heads = next(lines)
         rows = [[_printable(cell) for cell in line] for line in lines]
     except ValueError as error:
-        raise FileFormatError(f"{path} {error}; write it as CSV with a header.") from error
+        advice = "" if ";" in str(error) else "; write it as CSV with a header"
+        raise FileFormatError(f"{path} {error}{advice}.") from error
     name, intensity, owner = key_column(heads), key_column(heads, ("intensity",)), key_column(heads, ("subject",))
     label = key_column(heads, [head for head in _LABELS if head != "subject"])
     if label is None and of_any:

@@ -120,7 +120,7 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
         FileFormatError: another header, a name twice, or a vertex that is not a whole number from 0.
     """
     path = Path(path)
-    rows = _csv_rows(_content(path), path)
+    rows = csv_rows(_content(path), path)
     if not _has_vertex_header(rows):
         raise damaged(path, "it does not start with the header 'name,vertex'")
     indices: dict[str, int] = {}
@@ -145,7 +145,7 @@ def is_of_vertices(path: Path | str) -> bool:
         FileFormatError: it is empty, or not comma-separated text.
     """
     path = Path(path)
-    return _has_vertex_header(_csv_rows(_content(path), path))
+    return _has_vertex_header(csv_rows(_content(path), path))
 
 
 def _has_vertex_header(rows: list[list[str]]) -> bool:
@@ -167,7 +167,7 @@ def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
     """
     path = Path(path)
     indices = read_landmark_indices(path)
-    rows = _csv_rows(_content(path), path)
+    rows = csv_rows(_content(path), path)
     header = [cell.lower() for cell in rows[0]]
     columns = [name for pair in _CORNER_COLUMNS for name in pair]
     try:
@@ -416,7 +416,12 @@ def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
     return "<!DOCTYPE PickedPoints>\n" + ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _csv_rows(data: bytes, path: Path) -> list[list[str]]:
+def csv_rows(data: bytes, path: Path) -> list[list[str]]:
+    """Return the rows of comma-separated UTF-8 text, without white space around cells, empty lines and comments (`#`).
+
+    Raises:
+        FileFormatError: it is something else.
+    """
     try:
         text = data.decode("utf-8-sig")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
@@ -426,7 +431,7 @@ def _csv_rows(data: bytes, path: Path) -> list[list[str]]:
 
 
 def _read_csv(data: bytes, path: Path) -> Pairs:
-    rows = _csv_rows(data, path)
+    rows = csv_rows(data, path)
     columns = [1, 2, 3]
     if rows and not all(is_number(cell) for cell in rows[0][1:4]):
         header = [cell.lower() for cell in rows[0]]
@@ -498,7 +503,7 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
         raise damaged(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
     sign = np.array([-1.0, -1.0, 1.0]) if system == "RAS" else np.ones(3)
     out: Pairs = []
-    for row in _csv_rows(data, path):
+    for row in csv_rows(data, path):
         entry = dict(zip(columns, row, strict=False))
         name = entry.get("label") or entry.get("id") or ""
         point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)
@@ -506,10 +511,11 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
     return out
 
 
-def _write_fcsv(landmarks: Mapping[str, FloatArray]) -> str:
+def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return landmarks in LPS as the text of a 3D Slicer fiducial file, with descriptions by name."""
     head = f"# Markups fiducial file version = 5.6\n# CoordinateSystem = LPS\n# columns = {_FCSV_COLUMNS}\n"
     rows = (
-        [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, "", ""]
+        [str(i), *map(repr, _numbers(point)), "0", "0", "0", "1", "1", "1", "0", name, descriptions.get(name, ""), ""]
         for i, (name, point) in enumerate(landmarks.items(), start=1)
     )
     return head + rows_text(rows)
@@ -580,7 +586,7 @@ LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
         ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
         ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
-        ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, _write_fcsv),
+        ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
     }
 )
 """File name ending -> landmark format that is read and written."""

@@ -15,7 +15,6 @@ from shapespace.errors import FileFormatError
 from shapespace.io.bnt import read_bnt
 from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
 from shapespace.io.gltf import read_gltf, write_glb, write_gltf
-from shapespace.io.las import read_las
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.mat_mesh import read_mat_mesh
 from shapespace.io.obj import read_obj, write_obj
@@ -24,7 +23,6 @@ from shapespace.io.packed import GZIP, unpacked
 from shapespace.io.parsing import plain_text
 from shapespace.io.pcd import read_pcd
 from shapespace.io.ply import probe_ply, read_ply, write_ply
-from shapespace.io.raw import read_raw
 from shapespace.io.stl import probe_stl, read_stl, write_stl
 from shapespace.io.vrml import read_vrml
 from shapespace.io.vtk import read_vtk, read_vtp, write_vtk, write_vtp
@@ -35,6 +33,12 @@ _PACKED = ".gz"
 _PROBED_BYTES = 2**16
 _Probe: TypeAlias = Callable[[bytes, int, Path], None]
 _PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
+_CONVERT: Mapping[str, str] = {
+    ".las": "convert it to PLY",
+    ".laz": "convert it to PLY",
+    ".raw": "convert a mesh to PLY, a volume to NRRD or NIfTI",
+}
+"""File name ending -> what to do with a file that is not read."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +159,8 @@ def _format(path: Path, verb: str) -> MeshFormat:
         known = ending in READ_ONLY_FORMATS
         what = "can be read, not written" if known else "is not a mesh format"
         endings = MESH_ENDINGS if verb == "read" else MESH_FORMATS
-        raise FileFormatError(
-            f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; use one of {', '.join(endings)}."
-        )
+        advice = _CONVERT.get(ending, f"use one of {', '.join(endings)}")
+        raise FileFormatError(f"Cannot {verb} {path}: the ending '{path.suffix}' {what}; {advice}.")
     return found
 
 
@@ -184,12 +187,10 @@ MESH_FORMATS: Mapping[str, MeshFormat] = MappingProxyType(
 READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType(
     {
         ".wrl": read_vrml,
-        ".raw": read_raw,
         ".bnt": read_bnt,
         ".xyz": read_xyz,
         ".pts": read_xyz,
         ".pcd": read_pcd,
-        ".las": read_las,
     }
 )
 """File name ending -> reader (content, path) -> mesh, for formats that are not written."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from shapespace.errors import FileFormatError
 from shapespace.io.files import read_bytes
+from shapespace.io.landmarks import csv_rows
 from shapespace.io.limits import LARGEST_LANDMARK_FILE_BYTES
 
 _COLUMN = "vertex"
@@ -22,11 +22,10 @@ def read_region(path: Path | str) -> tuple[int, ...]:
     """
     path = Path(path)
     again = "give one vertex number in each line, or a column named vertex"
+    data = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES)
     try:
-        text = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES).decode("utf-8-sig")
-        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, strict=True)]
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = csv_rows(data, path)
+    except FileFormatError as error:
         raise FileFormatError(f"{path} is no list of vertices; {again}.") from error
     header = [cell.lower() for cell in rows[0]] if rows else []
     column = header.index(_COLUMN) if _COLUMN in header else 0

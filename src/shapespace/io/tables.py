@@ -141,7 +141,8 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
         header = [as_written(name).strip() for name in raw]
         known = [name for name in header if name]
         if len(set(known)) != len(known):
-            raise ValueError("has two columns of one name")
+            twice = next(name for name in known if known.count(name) > 1)
+            raise ValueError(f"has two columns of one name ({twice[:40]!r})")
         yield header
         at, lacking = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):
@@ -222,7 +223,10 @@ def _sheet(content: bytes) -> Iterator[list[str]]:
         last = max(row) + 1
         if last > width:
             # Cells outside the table, such as notes, would be lost without a column name.
-            raise ValueError(f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name")
+            raise ValueError(
+                f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name, and leave no title"
+                " above the names of columns"
+            )
         line = [row.get(at, "") for at in range(width)]
         if any(cell.strip() for cell in line):
             yield line

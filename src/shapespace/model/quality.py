@@ -29,7 +29,7 @@ from shapespace.model.missing import MIN_SEEN, Kept
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, common_faces, require_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,6 +209,7 @@ class QualitySettings:
     control_points: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
+        require_whole(self.folds, "folds")
         if self.folds is not None and self.folds < 2:
             raise InputError(f"Shapes are left out in at least two folds, not in {self.folds}.")
         if self.samples < 2 or (self.modes is not None and self.modes < 1):

@@ -42,7 +42,7 @@ from shapespace.model.streamed import (
     too_large,
 )
 from shapespace.reprs import short_repr
-from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
+from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only, require_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -577,7 +577,9 @@ class ShapeModel:
         Raises:
             FileError: it cannot be read.
             ModelFileError: it is damaged, of another version, or not a model.
+            InputError: the argument is no path.
         """
+        require_path(path, "ShapeModel.load")
         if is_foreign(Path(path)):
             return cls.of_foreign(load_foreign(Path(path)), Path(path))
         fields = model_file.load(Path(path))

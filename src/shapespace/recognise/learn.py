@@ -23,7 +23,7 @@ try:
     from sklearn.utils.validation import validate_data as _validate_data  # pyright: ignore[reportUnknownVariableType]
 except ImportError as error:
     raise ShapespaceError(
-        "Recognition needs the extra recognise (scikit-learn 1.6 and skops, or newer); install it with: "
+        "Recognition needs the extra recognise (scikit-learn 1.8 and skops, or newer); install it with: "
         'pip install "shapespace[recognise]"'
     ) from error
 

@@ -282,7 +282,7 @@ class FolderPage:
                 "before the fit and after phase 1, the regions and the iterations:",
                 "soft",
             ),
-            Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages --resume"),
+            Command(f"shapespace fit {record.model.path or 'MODEL.h5'} {scans} -o . --stages"),
         ]
 
     def not_drawn(self) -> list[str]:

@@ -35,6 +35,8 @@ from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 ERROR_ASYMMETRIC, ERROR_SYMMETRIC = "measurement error, asymmetric", "measurement error, symmetric"
 LEVEL = 0.95
 _BLOCK = 100
+_HEIGHT_OFF = 2.0
+"""Error of the height of the surface above a triangle, as a share of the height: curvature differs at its corners."""
 _FEWEST = 3
 _MOSTLY = 0.5
 """Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
@@ -238,6 +240,10 @@ def measure_asymmetry(
     pairs_observed = _pairs_observed(cohort, sides)
     counts = np.bincount(codes)
     normals = None if sides.faces is None else vertex_normals(Mesh(mean, sides.faces))
+    heights = None
+    if normals is not None and not sides.paired:
+        heights = sides.chord_heights(mean, normals)
+        difference -= heights[:, None] * normals
     rng = np.random.default_rng(seed)
 
     who = _Means(codes, counts)
@@ -248,10 +254,19 @@ def measure_asymmetry(
     vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
     z = _standardised(scores, group)
     steps = _Steps(permutations, on_step)
-    anova = _anova(symmetric, difference, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
+    parts = symmetric, difference
+    if normals is not None and not sides.paired:
+        # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
+        parts = _along(symmetric, normals), along
+    anova = _anova(*parts, who, sides.dimensions(scaled=cohort.gauge == "shape"), rng, steps)
     directional = own.mean(axis=0) if normals is not None else np.linalg.norm(own.mean(axis=0), axis=1)
     observed = None if pairs_observed is None else who.of(pairs_observed.astype(np.float64)) >= _MOSTLY
-    p = _family_wise(own, rng, steps, None if observed is None else weights_of(observed.mean(axis=0)))
+    weight = None if observed is None else weights_of(observed.mean(axis=0))
+    if heights is not None:
+        # Signs do not change the weights, so permutations stay exchangeable.
+        known = _known_beyond(own, heights)
+        weight = known if weight is None else weight * known
+    p = _family_wise(own, rng, steps, weight)
     return Asymmetry(
         cohort, sides, names, counts, mean, normals, who.of(symmetric), own_difference, anova, scores,
         vertex_scores, *z, group, read_only(directional), p, permutations, seed, observed,
@@ -436,6 +451,12 @@ def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator
             beyond += int(float((between * gram[np.ix_(order, order)]).sum()) >= observed * (1 - 1e-12))
         steps.add(count)
     return beyond / (1 + steps.each) if steps.each else None
+
+
+def _known_beyond(own: FloatArray, heights: FloatArray) -> FloatArray:
+    """Return the weights (M,) of vertices whose differences `own` (n, M) vary more than the heights (M,) may be off."""
+    squares = (own**2).mean(axis=0)
+    return squares / np.maximum(squares + (_HEIGHT_OFF * heights) ** 2, 1e-300)
 
 
 def _family_wise(

@@ -282,7 +282,9 @@ def compare(
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
+    require(formula, str, "compare", "write a formula such as '~ sex + age'")
     options = options or CompareOptions()
+    require(options, CompareOptions, "compare", "give options as CompareOptions(...)")
     own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)
     random, options = _random(options, cohort)
@@ -401,9 +403,7 @@ def _methods(
                     unequal_variances=options.unequal_variances,
                 )
             )
-    classes = [
-        (one.name, [str(value) for value in design.values[one.column]]) for one in design.variables if one.levels
-    ]
+    classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
     return methods_of(
         cohort,
         len(set(owners)),
@@ -795,9 +795,10 @@ def _warnings(
                 "once, by its mean, and p is approximate where means of few scans are noisier."
             )
     for stratum in strata:
-        if stratum.fewest_log_arrangements < math.log(_FEWEST):
+        fewest = stratum.fewest_log_arrangements(flips=options.unequal_variances)
+        if fewest < math.log(_FEWEST):
             yield (
-                f"There are only {round(math.exp(stratum.fewest_log_arrangements))} arrangements"
+                f"There are only {round(math.exp(fewest))} arrangements"
                 f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
             )
 

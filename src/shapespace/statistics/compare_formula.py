@@ -58,14 +58,16 @@ class Variable:
         name: of the column; in C() where its numbers are taken for classes.
         column: its name inside.
         levels: classes in order; none of numbers.
-        low: 5th percentile of numbers.
-        high: 95th percentile.
+        groups: classes whose sizes and dispersion count: the levels, or both values of numbers that have only two.
+        low: 5th percentile of numbers; the smaller of two values.
+        high: 95th percentile; the larger of two values.
         middle: their mean.
     """
 
     name: str
     column: str
     levels: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
     low: float = 0.0
     high: float = 0.0
     middle: float = 0.0
@@ -160,6 +162,11 @@ class Design:
             frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
         return pandas.DataFrame(frame)
 
+    def groups_of(self, one: Variable) -> list[str]:
+        """Return the group of each row by a variable that has groups."""
+        values = self.values[one.column]
+        return [str(value) for value in values] if one.levels else [_group(float(value)) for value in values]
+
     def average(self, fixed: Mapping[str, str | float]) -> FloatArray:
         """Return the (p,) columns, averaged over the classes of variables in the terms, with numbers at their mean.
 
@@ -239,7 +246,11 @@ def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], 
         InputError: it cannot be read, leaves out the 1, or names something that is no column.
         ShapespaceError: the extra `statistics` is not installed.
     """
-    effects, bar, column = (part.strip() for part in random.partition("|"))
+    inner = random.strip()
+    if inner.startswith("(") and inner.endswith(")"):
+        # lme4 writes them in brackets.
+        inner = inner[1:-1]
+    effects, bar, column = (part.strip() for part in inner.partition("|"))
     column = column.strip("`")
     if not bar or not effects or not column:
         raise InputError(f"The random terms {random[:80]!r} cannot be read; write them as '1 + time | subject'.")
@@ -546,9 +557,11 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
         if np.ptp(numbers) == 0:
             raise InputError(f"{table.where}: {name!r} is {numbers[0]:g} for all {len(table)} shapes; leave it out.")
         low, high = (float(value) for value in np.percentile(numbers, [5, 95]))
-        if low == high:
+        two = len(set(numbers.tolist())) == 2
+        if two or low == high:
             low, high = float(numbers.min()), float(numbers.max())
-        return Variable(name, column, (), low, high, float(numbers.mean())), [float(value) for value in numbers]
+        groups = (_group(low), _group(high)) if two else ()
+        return Variable(name, column, (), groups, low, high, float(numbers.mean())), [float(v) for v in numbers]
     told = table.kind(name) == "number"
     cells = [f"{float(cell):g}" if told else cell for cell in table.texts(name)]
     levels = tuple(sorted(set(cells), key=float) if told else sorted(set(cells)))
@@ -556,7 +569,11 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
         raise InputError(
             f"{table.where}: {name!r} is {levels[0][:40]!r} for all {len(table)} shapes; a comparison needs two groups."
         )
-    return Variable(f"C({name})" if told else name, column, levels), cells
+    return Variable(f"C({name})" if told else name, column, levels, levels), cells
+
+
+def _group(value: float) -> str:
+    return f"{value:.15g}"
 
 
 def _first(error: Exception) -> str:

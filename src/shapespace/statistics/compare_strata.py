@@ -81,10 +81,13 @@ class Stratum:
         """(n, p) orthonormal columns of the whole model."""
         return np.linalg.qr(self.matrix)[0]
 
-    @cached_property
-    def fewest_log_arrangements(self) -> float:
-        """Logarithm of the number of different arrangements, for the term with the fewest."""
-        return min(self.log_arrangements(flips=self.flips(self.reduced(term, "III"))) for term in self.terms)
+    def fewest_log_arrangements(self, *, flips: bool = False) -> float:
+        """Return the logarithm of the number of different arrangements, for the term with the fewest.
+
+        Args:
+            flips: whether the arrangements of all terms are flips of signs.
+        """
+        return min(self.log_arrangements(flips=flips or self.flips(self.reduced(term, "III"))) for term in self.terms)
 
     def log_arrangements(self, *, flips: bool = False) -> float:
         """Return the logarithm of the number of arrangements that differ."""

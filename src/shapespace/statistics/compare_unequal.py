@@ -65,7 +65,7 @@ class Units:
     def grouping(self, terms: Sequence[Term]) -> list[Variable]:
         """Return the variables of classes in some terms that are the same in all shapes of a unit."""
         named = {column for term in terms for column in term.variables} - self.varying
-        return [one for one in self.design.variables if one.column in named and one.levels]
+        return [one for one in self.design.variables if one.column in named and one.groups]
 
     def estimate(
         self, own: FloatArray, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
@@ -92,9 +92,9 @@ class Units:
         """Yield the tests of equal dispersion of the classes of each variable that differs between units."""
         residual = self.shapes - self.full @ (self.full.T @ self.shapes)
         for one in self.grouping(self.stratum.terms):
-            codes = np.array([one.levels.index(value) for value in self._values(one)], dtype=np.intp)
+            codes = np.array([one.groups.index(value) for value in self._values(one)], dtype=np.intp)
             test = dispersion_test(
-                one.name, residual, self.leverage, codes, one.levels, n_vertices * self.stratum.width, permutations,
+                one.name, residual, self.leverage, codes, one.groups, n_vertices * self.stratum.width, permutations,
                 seed, self.stratum.name,
             )  # fmt: skip
             if test is not None:
@@ -106,9 +106,9 @@ class Units:
         return np.full((count, 1 if self.stratum.removed else 0), count**-0.5)
 
     def _values(self, one: Variable) -> list[str]:
-        values = self.design.values[one.column]
+        groups = self.design.groups_of(one)
         rows: list[int] = self.rows.tolist()
-        return [str(values[row]) for row in rows]
+        return [groups[row] for row in rows]
 
 
 def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -> Units:

@@ -64,6 +64,22 @@ class Sides:
             return fields[..., self.corners[:, 0], :] * FLIP
         return sum(self.weights[:, c, None] * fields[..., self.corners[:, c], :] for c in range(3)) * FLIP
 
+    def chord_heights(self, mean: FloatArray, normals: FloatArray) -> FloatArray:
+        """Return how far (M,) the curved surface lies outside its triangle where each vertex has its mirror image.
+
+        Each vertex lies on the surface, and would seem to stand further out than the other side. Near the plane, where
+        sides hardly vary, that would pass for directional asymmetry. The height is exact for quadratic surfaces: half
+        of the projection of Boubekeur and Alexa (Phong tessellation, 2008).
+
+        Args:
+            mean: (M, 3) mm.
+            normals: (M, 3) of it.
+        """
+        place = np.einsum("mc,mcd->md", self.weights, mean[self.corners])
+        return 0.5 * np.einsum(
+            "mc,mcd,mcd->m", self.weights, mean[self.corners] - place[:, None], normals[self.corners], optimize=True
+        )
+
     @cached_property
     def on_the_plane(self) -> float:
         """How many vertices are their own mirror image; in shares where places are mixed."""
@@ -73,12 +89,13 @@ class Sides:
         """Return how many dimensions symmetric and asymmetric variation have, poses divided out.
 
         With l pairs and k vertices on the plane they are 3 l + 2 k less 3, and 3 l + k less 3; symmetric variation
-        loses one more where size is divided out (Klingenberg, Barluenga and Meyer 2002, table 2).
+        loses one more where size is divided out (Klingenberg, Barluenga and Meyer 2002, table 2). Where vertices do not
+        pair up, displacements along the normals count, of which those on the plane are symmetric.
 
         Args:
             scaled: whether size is divided out.
         """
-        half, plane = 1.5 * len(self), 0.5 * self.on_the_plane
+        half, plane = (1.5 if self.paired else 0.5) * len(self), 0.5 * self.on_the_plane
         return half + plane - (4 if scaled else 3), half - plane - 3
 
 
@@ -115,7 +132,8 @@ def find_sides(cohort: Cohort) -> Sides:
         return Sides(everything, cohort.faces, corners, weights, True, found.off_share, tuple(notes))
     notes.append(
         "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; what "
-        "the mean's sides differ by along the surface cannot be seen so."
+        "the mean's sides differ by along the surface cannot be seen so, and the Procrustes ANOVA takes differences "
+        "along the normals alone."
     )
     return Sides(everything, cohort.faces, found.corners, found.weights, False, found.off_share, tuple(notes))
 

@@ -9,12 +9,14 @@ from pathlib import Path
 from shapespace.errors import InputError
 from shapespace.io.folders import mesh_files
 from shapespace.io.json_files import read_json
+from shapespace.io.meshes import stem_of
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord
-from shapespace.store.results import results_at, surfaces_of
+from shapespace.store.results import ENDINGS, results_at, surfaces_of
 
 SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 LANDMARKS = "landmarks.csv"
+_ENDINGS = (*ENDINGS.values(), SURFACE)
 _NAMED = 3
 
 
@@ -53,6 +55,11 @@ class SurfaceFiles:
         named += ", ..." if len(self.unit_ratios) > _NAMED else ""
         of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
         return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({named})"
+
+
+def surface_stem(path: Path) -> str:
+    """Return the name of the scan of a surface: its file's name without `.dense.ply` and the like, or its ending."""
+    return next((path.name.removesuffix(end) for end in _ENDINGS if path.name.endswith(end)), stem_of(path))
 
 
 def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceFiles:

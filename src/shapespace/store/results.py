@@ -27,7 +27,7 @@ from shapespace.schemas import FIT_AGAIN, FitRecord
 from shapespace.store.manifest import Manifest, read_manifest
 from shapespace.store.rows import FLAGS, META, coefficient_columns, kind_of, store_row
 from shapespace.store.shard import ROW, Shard
-from shapespace.types import Mesh
+from shapespace.types import Mesh, require_path
 
 ENDING = ".fit.json"
 """Of the record of a fit, after NAME."""
@@ -157,6 +157,7 @@ class Results:
     """
 
     def __init__(self, folder: Path | str, store: Store | None = None) -> None:
+        require_path(folder, "Results")
         self.folder = Path(folder)
         manifest = None if store is not None else read_manifest(self.folder)
         self.store = store if manifest is None else Store(self.folder, manifest)

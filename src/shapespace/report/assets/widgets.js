@@ -388,7 +388,7 @@
         bar.hidden = limit.hidden = !distances;
         beyond.row.hidden = !distances || state.threshold === null;
         legend.hidden = state.map !== "regions";
-        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: parts of the scan without a match." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
+        said.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: vertices where the fit does not follow the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
         said.hidden = !said.textContent;
       }
 
