@@ -332,23 +332,23 @@ def _coarse_to_fine(
     tree, tree_fits, matcher = prepared.tree, False, problem.matcher(levels[0])
     hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree)
     first = problem.match(matcher, iterate, hint)
-    state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
+    start_state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
+    course = Course(iterate, start_state, matcher, first.matches.hint)
     for level in levels:
-        begins = level.modes != 0 and state.phase == 1
+        begins = level.modes != 0 and course.state.phase == 1
         if begins:
-            yield replace(state, stopped=state.stopped or "rate")
-            state = replace(state, phase=2, iteration=0, stopped=None)
+            yield replace(course.state, stopped=course.state.stopped or "rate")
+            course = replace(course, state=replace(course.state, phase=2, iteration=0, stopped=None))
+        iterate = course.iterate
         # The surface changes little from level to level; the walks make up for it.
         if level.modes is None and not tree_fits:
             tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
         matcher = problem.matcher(level)
         hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, first.matches.winding)
         steps = problem.descent(matcher, iterate, hint, level)
-        course = yield from _states(steps, Course(iterate, state, matcher, hint), level, max_iterations)
-        iterate, state = course.iterate, course.state
-        if begins and len(start.b) and state.iteration < max_iterations:
-            iterate = _preferred(problem, course, start, level, tree)
-            course = replace(course, iterate=iterate)
+        course = yield from _states(steps, replace(course, matcher=matcher, hint=hint), level, max_iterations)
+        if begins and len(start.b) and course.state.iteration < max_iterations:
+            course = replace(course, iterate=_preferred(problem, course, start, level, tree))
     return course, tree
 
 
