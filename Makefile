@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
+READY_FOR_DEMO = $(VENV)/.ready-for-demo
 READY_TO_LINT = $(VENV)/.ready-to-lint
 READY_FOR_DOCS = $(VENV)/.ready-for-docs
 # What shows in a minute or two whether other versions of the dependencies do.
@@ -11,7 +12,7 @@ QUICK = tests/api tests/contracts tests/formats tests/geometry tests/io/test_mes
 
 .PHONY: demo test test-all test-oldest test-newest lint types contracts check bench docs dist clean
 
-demo: $(READY)
+demo: $(READY_FOR_DEMO)
 	$(BIN)/shapespace demo --out demo-out $(DEMO)
 
 test: $(READY)
@@ -51,8 +52,13 @@ docs: $(READY_FOR_DOCS)
 	$(BIN)/python -m sphinx -q -W --keep-going --fresh-env -c docs/site -d build/site-trees . build/site
 	@echo "The documentation is build/site/index.html; open it in a browser, it needs no server."
 
-$(READY): pyproject.toml
+# The demo needs one extra. Python compiles what it imports; to compile all that pip installs takes time and space.
+$(READY_FOR_DEMO): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[report]'
+	touch $@
+
+$(READY): $(READY_FOR_DEMO)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test
 	touch $@

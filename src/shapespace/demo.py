@@ -28,6 +28,7 @@ from shapespace.datasets.james import james_available, load_james
 from shapespace.datasets.simulated_scan import Collar, Hair, Hole, SimulatedScan, random_similarity, simulate_scan
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.paper_method import Paper
+from shapespace.fit.robust_method import Robust
 from shapespace.fit.state import IcpState
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import make_folder, write_text
@@ -114,7 +115,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
     make_folder(folder)
     for part in ("experiment1", "experiment2"):
         shutil.rmtree(folder / part, ignore_errors=True)
-    clock = _Clock(17 + 4 + 4, quiet=quiet)
+    clock = _Clock(17 + 4 + 4 + 3, quiet=quiet)
     with clock.bar:
         faces = load_faces()
         first = _experiment_1(folder, faces, scale, clock)
@@ -168,7 +169,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
         scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
         labels[name] = (expression, level)
-    fits = _fit_all(home, model, scans, labels, scale, clock)
+    fits = _fit_all(home, model, scans, labels, _paper(scale), clock)
 
     make_folder(home / "training")
     examples: list[Example] = []
@@ -303,7 +304,11 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
         model.save(home / file)
     mesh = story.scan.scan if isinstance(story.scan, SimulatedScan) else story.scan
     name = f"{Path(mesh.name).stem}_{story.model_name}"
-    (fit,) = _fit_all(home, model, {name: story.scan}, {name: ("neutral", 0.0)}, scale, clock, file)
+    paper = _paper(scale)
+    fit, robust = (
+        _fit_all(home, model, {name: story.scan}, {name: ("neutral", 0.0)}, config, clock, file)[0]
+        for name, config in ((name, paper), (f"{name}_robust", FitConfig(Robust())))
+    )
     return Case(
         title=story.title,
         short=story.short,
@@ -316,7 +321,13 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
         modes_for_98_5=model.modes_for_variance(_PAPER_VARIANCE),
         cumulative_variance=tuple(model.cumulative_variance.tolist()),
         fit=fit,
+        robust=robust,
     )
+
+
+def _paper(scale: DemoScale) -> FitConfig:
+    """Return the settings of the paper's method."""
+    return FitConfig(Paper(stop_motion_mm=scale.stop_motion_mm))
 
 
 def _fit_all(
@@ -324,7 +335,7 @@ def _fit_all(
     model: ShapeModel,
     scans: Mapping[str, SimulatedScan | Mesh],
     labels: Mapping[str, tuple[str, float]],
-    scale: DemoScale,
+    config: FitConfig,
     clock: _Clock,
     model_name: str = "model.h5",
 ) -> list[FitEntry]:
@@ -332,7 +343,6 @@ def _fit_all(
     make_folder(home / "scans")
     for name, scan in scans.items():
         write_mesh(home / "scans" / f"{name}.ply", scan.scan if isinstance(scan, SimulatedScan) else scan)
-    config = FitConfig(Paper(stop_motion_mm=scale.stop_motion_mm))
 
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")

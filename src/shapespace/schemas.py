@@ -325,12 +325,18 @@ class ExpressionsOfOne(DemoModel, frozen=True, kw_only=True):
 
 
 class Case(DemoModel, frozen=True, kw_only=True):
-    """One scan of experiment 2, fitted by a model of other people."""
+    """One scan of experiment 2, fitted by a model of other people.
+
+    Args:
+        fit: by the method of the paper.
+        robust: by the robust method; None in the file of an older demo.
+    """
 
     short: str = ""
     simulated: bool = False
     note: str = ""
     fit: FitEntry
+    robust: FitEntry | None = None
 
 
 class ManyPeople(Struct, frozen=True, kw_only=True):

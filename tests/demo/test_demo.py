@@ -71,6 +71,15 @@ def test_without_downloads_the_only_scan_is_a_labelled_simulation(summary):
     assert "imulated" in cases[0]["title"]
 
 
+def test_the_robust_fit_is_shown_beside_the_papers_and_is_nearer_to_the_truth(demo, summary):
+    (case,) = summary["experiment2"]["cases"]
+    paper, robust = (case[method]["vertex_error_mm"]["mean"] for method in ("fit", "robust"))
+    floor = case["fit"]["floor_mm"]["mean"]
+    assert floor <= robust and robust - floor < 0.5 * (paper - floor)
+    page = (demo / "report.html").read_text()
+    assert f"mean true vertex error {paper:.2f} mm by the method of the paper, {robust:.2f} mm by the robust" in page
+
+
 def test_the_saved_files_agree_with_each_other(demo, summary):
     first = summary["experiment1"]
     model = ShapeModel.load(demo / first["model"])

@@ -176,7 +176,9 @@ class DemoPage:
         usable = [fit for fit in _tests(fits) if fit.pictured]
         usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
         wanted = [(fit.entry, f"{fit.label} (simulated)") for fit in usable[len(usable) // 2 :][:1]]
-        wanted += [(case.fit, _short(case)) for case in self.cases if case.fit.stages]
+        for case in self.cases:
+            both = ((case.fit, "paper"), (case.robust, "robust"))
+            wanted += [(fit, f"{_short(case)}, {method}") for fit, method in both if fit and fit.stages]
         shown, unread = sections.usable(wanted, lambda pair: self.staged(self.fit(pair[0]), pair[1]))
         if not shown:
             raise FileFormatError("No fit kept a surface to show; run the demo again.")
@@ -184,12 +186,26 @@ class DemoPage:
         return [
             self.page.figure(
                 figures.portrait_figure(shown, labels, title="Raw scans and the models fitted to them"),
-                "Rows: the test expression with the median distance, then each scan of experiment 2. The last column "
-                "maps the distance of each model vertex to the scan, all rows on one scale.",
+                "Rows: the test expression with the median distance, then each scan of experiment 2, fitted by the "
+                "method of the paper and by the robust method. The last column maps the distance of each model vertex "
+                f"to the scan, all rows on one scale.{self.true_errors()}",
                 alt="Scan, fitted model, both overlaid, and a distance map, for " + "; ".join(labels),
             ),
             Notice("Not in the picture", unread),
         ]
+
+    def true_errors(self) -> str:
+        """Return the mean true vertex errors of both methods in experiment 2, where the truth is known."""
+        sentences: list[str] = []
+        for case in self.cases:
+            paper, robust = case.fit.vertex_error_mm, case.robust and case.robust.vertex_error_mm
+            if paper and robust and case.fit.floor_mm:
+                sentences.append(
+                    f" {_short(case).capitalize()}: mean true vertex error {mm(paper.mean)} by the method of the "
+                    f"paper, {mm(robust.mean)} by the robust method; the best possible with this model is "
+                    f"{mm(case.fit.floor_mm.mean)}."
+                )
+        return "".join(sentences)
 
     def paper_table(self) -> Table:
         """Return what the paper states beside what this run measured."""
