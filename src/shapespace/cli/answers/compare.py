@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.statistics.compare import CompareOptions, compare
 
     options = CompareOptions(
-        anova_type=arguments.squares,
+        anova_type=arguments.anova_type,
         blocks=arguments.blocks,
         random=arguments.random,
         permutations=arguments.permutations,
