@@ -429,8 +429,8 @@ class _State:
             return
         shapes, seen = self._stacked(order)
         shapes, _ = aligned(shapes, seen, self.template.vertices)
-        told = predict_leave_one_out(shapes, seen, self.settings.noise_share)
-        apart = ((shapes - told) ** 2).sum(axis=2)
+        predicted = predict_leave_one_out(shapes, seen, self.settings.noise_share)
+        apart = ((shapes - predicted) ** 2).sum(axis=2)
         rms = np.sqrt((seen * apart).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
         usual = float(np.median(rms))
         for i, value in zip(order, rms, strict=True):
@@ -466,8 +466,8 @@ class _State:
             self.moves[i].append(float(np.sqrt(square)) / SIZE)
             self.placed[i] = replace(now, vertices=shape, T_scan_template=T)
         if self.settings.guided and len(order) >= _ENOUGH_TO_SETTLE:
-            told = predict_leave_one_out(shapes, seen, self.settings.noise_share, images)
-            self.expected = dict(zip(order, told, strict=True))
+            predicted = predict_leave_one_out(shapes, seen, self.settings.noise_share, images)
+            self.expected = dict(zip(order, predicted, strict=True))
         self.template = Mesh(mean, self.template.faces, name=self.template.name)
         self.places = agreed(self.template, [(self.placed[i].vertices, self._landmarks(i)) for i in order])
         return float(np.sqrt(np.mean(squares))) / SIZE

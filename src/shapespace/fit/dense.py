@@ -121,7 +121,7 @@ def dense_surface(
 
 @dataclass(frozen=True, eq=False)
 class WeightedMatches:
-    """What the stage sees where the surface is.
+    """Matches of the surface, with the spread and the noise of their residuals.
 
     Args:
         matches: both ways.

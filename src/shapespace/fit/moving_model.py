@@ -172,7 +172,7 @@ class ModelSurface:
 
 @dataclass(frozen=True, eq=False)
 class LinearShape:
-    """The surfaces that a mean and modes can take (eq 1).
+    """A linear shape model on fixed triangles (eq 1).
 
     Args:
         topology: of all of them.

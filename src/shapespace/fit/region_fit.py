@@ -28,7 +28,7 @@ class RegionFit:
 
     @staticmethod
     def of(whole: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
-        """Return what holds fits to a region.
+        """Return the region fit of a model.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.

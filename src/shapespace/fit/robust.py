@@ -421,8 +421,8 @@ def _summary(
         vertices_scan_mm=T.apply(surface.vertices),
         outside_mm=float(np.linalg.norm(iterate.b[wanted:]) / np.sqrt(len(surface.vertices))),
         regions=FinalMatches(
-            target, T, surface, weighted.matches.winding, settings.normal_cosine, settings.weight,
-            weighted.weights.width_mm, weighted.weights.far_mm,
+            target, T, ModelSurface.of(surface.topology, surface.vertices), weighted.matches.winding,
+            settings.normal_cosine, settings.weight, weighted.weights.width_mm, weighted.weights.far_mm,
         ),
         evidence={
             **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
