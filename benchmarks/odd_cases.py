@@ -39,7 +39,7 @@ from shapespace import FitConfig, ShapeModel, fit_scan
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Collar, Hair, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.reliability import FAILED_SHARE
+from shapespace.fit.failure_model import FAILED_SHARE
 from shapespace.geometry import remesh
 from shapespace.geometry.surface import face_areas, faces_of, rms_size
 from shapespace.io.meshes import read_mesh
@@ -425,7 +425,7 @@ def judge(case: Case) -> dict[str, Any]:
         "reason": result.reason,
         "wrong": case.wrong or error is None or error > FAILED_SHARE,
         "error_share": error,
-        "evidence": dict(result.evidence),
+        "evidence": result.evidence.to_dict(),
         "cpu_s": cpu_s,
     }
 

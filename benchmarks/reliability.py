@@ -2,11 +2,11 @@
 
 Fits whose truth is known, of faces, the bundled heads and femora, over noise, outliers, few triangles or points alone,
 missing parts, expressions, two of the kind in one scan, things of another kind, and models of few or many shapes, too
-narrow or too wide. The three splits share no shape, no model and no seed: the coefficients of `fit/reliability.py` are
+narrow or too wide. The three splits share no shape, no model and no seed: the coefficients of the failure model are
 learnt on "dev", its intervals set on "calibration", and "test" judges them.
 
     python benchmarks/reliability.py --fits 240            # of each split; goes on where it was cut short
-    python benchmarks/reliability.py --tune                # prints the constants of fit/reliability.py
+    python benchmarks/reliability.py --tune                # prints the constants of fit/failure_model.py
     python benchmarks/reliability.py --report docs/images  # tables and the figure, of the split "test"
 """
 
@@ -37,7 +37,8 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, load_ict
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit import reliability
+from shapespace.fit import failure_model
+from shapespace.fit.evidence import FitEvidence
 from shapespace.geometry.surface import face_areas, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
@@ -279,7 +280,7 @@ def judge(drawn: Drawn) -> dict[str, Any]:
         "reason": result.reason,
         "notes": list(result.notes),
         "error_mm": min(errors, default=None),
-        "evidence": dict(result.evidence),
+        "evidence": result.evidence.to_dict(),
         "cpu_s": seconds,
     }
 
@@ -322,18 +323,19 @@ def log_share(record: Mapping[str, Any]) -> float:
 def failed(record: Mapping[str, Any]) -> bool:
     if record["error_mm"] is None:
         return True
-    return record["error_mm"] > reliability.FAILED_SHARE * record["evidence"]["size_mm"]
+    return record["error_mm"] > failure_model.FAILED_SHARE * record["evidence"]["size_mm"]
 
 
 def tune(found: list[dict[str, Any]]) -> str:
-    """Return the constants of `shapespace.fit.reliability`.
+    """Return the constants of `shapespace.fit.failure_model`.
 
     Weights: a regression of the logarithm of the error on "dev", by Huber's loss with a small ridge on standardised
     inputs and no weight below zero. Offset and interval: quantiles of what that leaves on "calibration". The
     probability of failure: a logistic regression on both.
     """
     dev, held = (told([r for r in found if r["split"] == split]) for split in ("dev", "calibration"))
-    raw = np.array([[value(r["evidence"]) for value in reliability.INPUTS.values()] for r in dev])
+    terms = failure_model.ERROR_TERMS
+    raw = np.array([[term.value(FitEvidence(**r["evidence"])) for term in terms.values()] for r in dev])
     truth = np.array([log_share(r) for r in dev])
     middle, spread = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
     inputs = np.column_stack([(raw - middle) / spread, np.ones(len(raw))])
@@ -344,20 +346,21 @@ def tune(found: list[dict[str, Any]]) -> str:
         ridge = _RIDGE * np.append(t[:-1], 0.0)
         return float((pull * (off - 0.5 * pull)).sum() + 0.5 * ridge @ t), ridge - inputs.T @ pull
 
-    bounds = [(0, None)] * len(reliability.INPUTS) + [(None, None)]
+    bounds = [(0, None)] * len(terms) + [(None, None)]
     t = minimize(loss, np.zeros(inputs.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
-    weights = dict(zip(reliability.INPUTS, (t[:-1] / spread).round(3), strict=True))
+    weights = dict(zip(terms, (t[:-1] / spread).round(3), strict=True))
 
     def foretold(record: Mapping[str, Any]) -> float:
-        return sum(weight * reliability.INPUTS[name](record["evidence"]) for name, weight in weights.items())
+        evidence = FitEvidence(**record["evidence"])
+        return sum(weight * terms[name].value(evidence) for name, weight in weights.items())
 
     left = np.sort([log_share(r) - foretold(r) for r in held])
-    offset, outside = float(np.median(left)), (1.0 - reliability.COVERAGE) / 2
+    offset, outside = float(np.median(left)), (1.0 - failure_model.COVERAGE) / 2
     low = left[max(int(np.floor((len(left) + 1) * outside)) - 1, 0)] - offset
     high = left[min(int(np.ceil((len(left) + 1) * (1 - outside))) - 1, len(left) - 1)] - offset
     judged = [r for r in found if r.get("evidence") and r["split"] != "test"]
     wrong = np.array([failed(r) for r in judged])
-    bound = np.log(reliability.FAILED_SHARE)
+    bound = np.log(failure_model.FAILED_SHARE)
     x = np.array([(min(offset + foretold(r), 0.0) - bound, 1.0) for r in judged])
     sign = np.where(wrong, -1.0, 1.0)
 
@@ -369,11 +372,10 @@ def tune(found: list[dict[str, Any]]) -> str:
     return "\n".join(
         [
             f"# {len(dev)} fits of dev, {len(held)} of calibration; {int(wrong.sum())} of {len(judged)} failed",
-            "WEIGHTS: Mapping[str, float] = {",
-            *(f'    "{name}": {weight:.3f},' for name, weight in weights.items()),
-            "}",
-            f"OFFSET = {offset:.3f}",
-            f"LOW, HIGH = {np.exp(low):.3f}, {np.exp(high):.3f}",
+            "# weights of ERROR_TERMS",
+            *(f'"{name}": {weight:.3f}' for name, weight in weights.items()),
+            f"ERROR_OFFSET = {offset:.3f}",
+            f"INTERVAL = {np.exp(low):.3f}, {np.exp(high):.3f}",
             f"FAILURE_OFFSET, FAILURE_SLOPE = {f[1]:.3f}, {f[0]:.3f}",
         ]
     )
@@ -382,7 +384,8 @@ def tune(found: list[dict[str, Any]]) -> str:
 def again(record: dict[str, Any]) -> dict[str, Any]:
     """Return `record` with the figures that the constants of today give its evidence."""
     evidence = record["evidence"]
-    return {**record, "evidence": {**evidence, **reliability.reliability(evidence).as_evidence()}}
+    estimate = failure_model.estimate_error(FitEvidence(**evidence))
+    return {**record, "evidence": {**evidence, **dataclasses.asdict(estimate)}}
 
 
 def table(found: list[dict[str, Any]]) -> str:
@@ -469,7 +472,8 @@ def picture(found: list[dict[str, Any]], judged: list[dict[str, Any]], path: Pat
         ends = np.array([0.05, 30.0])
         ax.plot(ends, ends, color="0.5", lw=1)
         if key == "expected_error_mm":
-            ax.fill_between(ends, reliability.LOW * ends, reliability.HIGH * ends, color="0.9", zorder=0)
+            low, high = failure_model.INTERVAL
+            ax.fill_between(ends, low * ends, high * ends, color="0.9", zorder=0)
         ax.set(
             xscale="log", yscale="log", xlim=ends, ylim=ends, title=said,
             xlabel="expected error, % of size", ylabel="true mean vertex error, % of size",

@@ -33,7 +33,8 @@ from shapespace import FitConfig, fit_scan
 from shapespace.datasets.ict import EXPRESSIONS
 from shapespace.datasets.simulated_scan import Collar, Hair, retriangulate, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.trust import INPUTS
+from shapespace.fit.evidence import FitEvidence
+from shapespace.fit.failure_model import SCORE_TERMS
 from shapespace.geometry.surface import face_areas
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
@@ -262,7 +263,7 @@ def judge(index: int) -> Outcome:
         return Outcome(*said, "failed", str(error), None, {}, time.process_time() - begun)
     seconds = time.process_time() - begun
     off = None if scan.truth is None else float(error_mm(result.surface(model).vertices, scan).mean())
-    return Outcome(*said, result.status, result.reason, off, dict(result.evidence), seconds)
+    return Outcome(*said, result.status, result.reason, off, result.evidence.to_dict(), seconds)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -283,13 +284,13 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def tune(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return offset, usual values and weights of the inputs of `shapespace.fit.trust` that judge `records` best.
+    """Return offset, usual values and weights of the score in `fit.failure_model` that judge `records` best.
 
     A logistic regression with a small ridge on standardised inputs and no negative weights; the bound is where 5 % of
     the good fits are doubted, each judged by the four fifths it is not in.
     """
     judged = [r for r in records if r["evidence"]]
-    raw = np.array([[max(i.value(r["evidence"]), i.least) for i in INPUTS] for r in judged])
+    raw = np.array([[term.value(FitEvidence(**r["evidence"])) for term in SCORE_TERMS] for r in judged])
     wrong = np.array([r["wrong"] for r in judged])
     usual, spread = np.median(raw[~wrong], axis=0), raw.std(axis=0)
     inputs = np.column_stack([(raw - usual) / spread, np.ones(len(raw))])
@@ -302,7 +303,7 @@ def tune(records: Sequence[Mapping[str, Any]]) -> str:
             slope = x.T @ (sign / (1 + np.exp(-margin))) + np.append(t[:-1], 0.0)
             return float(np.logaddexp(0, margin).sum() + 0.5 * (t[:-1] ** 2).sum()), slope
 
-        bounds = [(0, None)] * len(INPUTS) + [(None, None)]
+        bounds = [(0, None)] * len(SCORE_TERMS) + [(None, None)]
         return minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
 
     fold = np.arange(len(raw)) % 5

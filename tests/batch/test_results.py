@@ -147,7 +147,7 @@ def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp
     assert row["size_mm"] == pytest.approx(np.sqrt(((surface - surface.mean(axis=0)) ** 2).sum(axis=1).mean()))
     assert row["path"] == "../scans/raw.ply"
     for key in ("expected_error_mm", "beyond_model_mm"):
-        assert row[key] == result.evidence[key]
+        assert row[key] == getattr(result.evidence, key)
 
 
 def test_a_record_of_an_earlier_version_still_makes_a_row(result: FitResult) -> None:

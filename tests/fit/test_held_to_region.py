@@ -47,7 +47,7 @@ def test_a_back_of_something_else_does_not_bend_the_front_of_a_fit_that_is_held_
         free_mm.append(rms_mm(fit_scan(MODEL, scan, MM), raw.truth, front))
         assert held.status == "converged", held.reason
         assert held.distances.model_to_scan.count == len(FRONT)
-        assert held.shown.model_to_scan.mean < 0.5
+        assert held.overlap_distances.model_to_scan.mean < 0.5
     assert max(held_mm) < 0.8 and min(free_mm) > 2.0 * max(held_mm), (held_mm, free_mm)
 
 
@@ -59,7 +59,7 @@ def test_the_region_of_all_vertices_gives_the_fit_of_the_whole() -> None:
     np.testing.assert_allclose(part.z, whole.z, atol=2e-3)
     np.testing.assert_allclose(part.b_stddev, whole.b_stddev, rtol=0.02)
     np.testing.assert_allclose(part.surface().vertices, whole.surface().vertices, atol=0.02)
-    assert part.evidence["expected_error_mm"] == pytest.approx(whole.evidence["expected_error_mm"], rel=0.02)
+    assert part.evidence.expected_error_mm == pytest.approx(whole.evidence.expected_error_mm, rel=0.02)
     assert part.distances.model_to_scan.mean == pytest.approx(whole.distances.model_to_scan.mean, rel=0.01)
 
 

@@ -8,8 +8,8 @@ import pytest
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.fit.chirality import is_asymmetric
 from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.odd_scans import chirality_of
 from shapespace.fit.result import FitResult
-from shapespace.fit.trust import chirality_of, doubts_of_reliability
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob_model, sphere, training_meshes
@@ -69,14 +69,14 @@ def test_a_symmetric_model_leaves_the_chirality_undecidable_and_doubts_nothing()
     for each in (scan, mirrored(scan)):
         result = fit_scan(model, each)
         assert (result.status, result.chirality) == ("converged", "undecidable"), result.reason
-        assert "mirrored_log_odds" not in result.evidence
+        assert result.evidence.mirrored_log_odds is None
 
 
 @pytest.mark.parametrize(
     ("log_odds", "decided"), [(4.9, "undecidable"), (-4.9, "undecidable"), (5.1, "mirrored"), (-5.1, "as scanned")]
 )
 def test_chirality_is_decided_by_odds_of_150_to_1(log_odds: float, decided: str) -> None:
-    assert chirality_of({"mirrored_log_odds": log_odds}) == decided
+    assert chirality_of(log_odds) == decided
 
 
 def test_halves_of_different_scale_are_doubted() -> None:
@@ -92,7 +92,7 @@ def test_two_overlapping_instances_are_doubted() -> None:
         blob_model(), together(scanned(), second.with_vertices(second.vertices + np.array([50.0, 20.0, 20.0])))
     )
     assert odd.status == "doubtful" and "overlapping instances" in odd.reason
-    assert odd.evidence["second_instance_gap_mm"] < 0
+    assert odd.evidence.second_instance_gap_mm < 0
 
 
 def test_strong_noise_is_doubted() -> None:
@@ -109,12 +109,3 @@ def test_a_shape_outside_a_model_of_three_is_doubted_and_one_inside_is_not() -> 
     assert of_few_shapes(inside).status == "converged"
     odd = of_few_shapes(scanned(SECOND))
     assert odd.status == "doubtful" and "made of 3 shapes" in odd.reason
-
-
-@pytest.mark.parametrize(("probability", "doubted"), [(0.49, False), (0.59, True)])
-def test_a_fit_that_has_probably_failed_is_doubted(probability: float, doubted: bool) -> None:
-    evidence = {
-        "failure_probability": probability, "expected_error_mm": 3.2, "error_low_mm": 1.9, "error_high_mm": 7.3,
-        "size_mm": 80.0,
-    }  # fmt: skip
-    assert bool(doubts_of_reliability(evidence)) == doubted

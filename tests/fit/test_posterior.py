@@ -43,14 +43,14 @@ def test_shrinkage_is_the_share_of_the_variance_that_the_scan_took_away() -> Non
 @pytest.mark.parametrize("worse", [{"cut": True}, {"noise_mm": 1.0}])
 def test_what_is_missing_or_noisy_is_known_less(worse: dict[str, float]) -> None:
     assert (fitted(**worse).b_stddev > fitted().b_stddev).all()
-    assert fitted(**worse).evidence["expected_error_mm"] > fitted().evidence["expected_error_mm"]
+    assert fitted(**worse).evidence.expected_error_mm > fitted().evidence.expected_error_mm
 
 
 def test_the_expected_error_is_about_the_error() -> None:
     model, result = blob_model(), fitted(noise_mm=1.0)
     truth = model.reconstruct(B * model.stddev)
     error = np.sqrt(((result.surface(model).vertices - truth) ** 2).sum(axis=1).mean())
-    assert error / 3 < result.evidence["expected_error_mm"] < 3 * error
+    assert error / 3 < result.evidence.expected_error_mm < 3 * error
 
 
 def test_the_paper_method_tells_shrinkage_too() -> None:

@@ -157,7 +157,7 @@ def test_the_first_modes_reported_are_those_of_the_whole_fit() -> None:
 def test_what_few_shapes_teach_too_little_of_is_told_in_millimetres() -> None:
     few = ShapeModel.fit(list(training_meshes(4, 700, seed=3)))
     raw = raw_scan(Z, NEAR, vertices=5000, noise_mm=0.1)
-    assert fit_scan(few, raw.scan, FitConfig(unit="mm"), T_scan_model=NEAR).evidence["beyond_model_mm"] > 0.2
+    assert fit_scan(few, raw.scan, FitConfig(unit="mm"), T_scan_model=NEAR).evidence.beyond_model_mm > 0.2
 
 
 def test_a_held_scale_is_held() -> None:

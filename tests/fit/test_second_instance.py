@@ -5,8 +5,8 @@ import pytest
 
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.fit.fit import fit_scan
+from shapespace.fit.reasons import ReasonCode
 from shapespace.fit.result import FitResult
-from shapespace.fit.trust import doubts_of_layers
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, sphere
 
@@ -55,4 +55,4 @@ def test_two_on_top_of_each_other_are_doubted(points: bool) -> None:
 @pytest.mark.parametrize("how", [{"noise_mm": 3.0}, {"outliers": 0.4}, {}])
 def test_noise_and_outliers_are_no_second_surface(how: dict[str, float]) -> None:
     result = fit_scan(blob_model(), scanned(FIRST, **how))
-    assert doubts_of_layers(result.evidence) == [] and said(result) == []
+    assert ReasonCode.SCAN_LAYERED not in {reason.code for reason in result.reasons} and said(result) == []

@@ -76,7 +76,7 @@ def test_for_the_start_alone_they_leave_the_rest_of_the_fit_as_it_is_to_the_bit(
     plain = fit_scan(model, raw.scan, MM, T_scan_model=pose)
     np.testing.assert_array_equal(started.b, plain.b)
     np.testing.assert_array_equal(started.b_stddev, plain.b_stddev)
-    assert started.evidence == pytest.approx(plain.evidence, abs=0, nan_ok=True)
+    assert started.evidence.to_dict() == pytest.approx(plain.evidence.to_dict(), abs=0, nan_ok=True)
     held = fit_scan(model, raw.scan, MM, landmarks=marks, T_scan_model=pose)
     assert not np.array_equal(held.b, plain.b)
 
@@ -99,7 +99,7 @@ def test_the_firmer_they_are_the_nearer_the_fit_lies_to_them(organs: ShapeModel)
     scan = simulate_scan(organ(rng), rng, triangles=3000, noise_mm=0.3)
     marks = clicked(organs, scan, rng)
     off_mm = [
-        fit_scan(organs, scan.scan, replace(MM, landmark_stddev_mm=sd), landmarks=marks).evidence["marks_rms_mm"]
+        fit_scan(organs, scan.scan, replace(MM, landmark_stddev_mm=sd), landmarks=marks).evidence.marks_rms_mm
         for sd in (0.3, 1.0, 5.0)
     ]
     assert off_mm == sorted(off_mm) and off_mm[0] < 0.7 * off_mm[-1]

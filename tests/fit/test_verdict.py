@@ -52,12 +52,14 @@ def test_what_is_returned_agrees_or_the_fit_is_not_converged(
     np.testing.assert_allclose(result.z * model.stddev, result.b)
     measured = surface_distances(surface, result.scan).model_to_scan
     assert result.distances.model_to_scan.mean * result.scan_mm_per_model_mm == pytest.approx(measured.mean, rel=1e-6)
-    in_scan_mm = result.shown.in_unit(result.scan_mm_per_model_mm)
-    assert in_scan_mm.scan_to_model.mean == pytest.approx(result.shown.scan_to_model.mean * result.T_scan_model.scale)
+    in_scan_mm = result.overlap_distances.in_unit(result.scan_mm_per_model_mm)
+    assert in_scan_mm.scan_to_model.mean == pytest.approx(
+        result.overlap_distances.scan_to_model.mean * result.T_scan_model.scale
+    )
     if result.status == "converged":
         assert (np.abs(result.b) <= 10 * np.sqrt(new_shapes(model))).all()
         assert 0.8 < result.T_scan_model.scale < 1.25
-        assert result.shown.model_to_scan.mean < 3.0
+        assert result.overlap_distances.model_to_scan.mean < 3.0
 
 
 @pytest.mark.parametrize("gauge", ["form", "shape"])
@@ -112,6 +114,12 @@ def test_distances_over_what_the_scan_shows_leave_out_what_it_does_not() -> None
     whole, half = (
         fit_scan(model, raw_scan(INSIDE, noise_mm=0.1, keep=keep).scan, FitConfig(unit="mm")) for keep in (None, 0.0)
     )
-    assert half.distances.model_to_scan.mean > 5 * half.shown.model_to_scan.mean
-    assert half.shown.model_to_scan.mean < 2 * whole.shown.model_to_scan.mean + 0.2
-    assert 0.3 < half.shown.model_seen_share < 0.6 < 0.98 < whole.shown.model_seen_share
+    assert half.distances.model_to_scan.mean > 5 * half.overlap_distances.model_to_scan.mean
+    assert half.overlap_distances.model_to_scan.mean < 2 * whole.overlap_distances.model_to_scan.mean + 0.2
+    assert 0.3 < half.overlap_distances.model_seen_share < 0.6 < 0.98 < whole.overlap_distances.model_seen_share
+
+
+def test_the_former_name_of_the_overlap_distances_still_works_and_warns() -> None:
+    result = fitted(8, "shape", "robust", False)
+    with pytest.warns(DeprecationWarning, match="overlap_distances"):
+        assert result.shown is result.overlap_distances

@@ -68,7 +68,7 @@ def test_a_femur_is_fitted_by_a_gaussian_process_as_well_as_it_says() -> None:
     assert result.distances.model_to_scan.mean < 0.25
     # Taken as variances of new shapes, those of the file promise less than 1.08 mm, which it is.
     assert not model.held_out
-    assert result.evidence["error_low_mm"] < error_mm < result.evidence["error_high_mm"]
+    assert result.evidence.error_low_mm < error_mm < result.evidence.error_high_mm
 
 
 def test_commands_take_a_file_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

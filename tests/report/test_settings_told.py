@@ -63,7 +63,7 @@ def test_damaged_settings_break_nothing(damaged: Mapping[str, Any]) -> None:
 
 def test_all_that_the_verdict_goes_by_is_told_in_words() -> None:
     result = ss.fit_scan(blob_model(), raw_scan(np.array([1.0, -1.0, 0.5, 0.0, 0.3]), vertices=900).scan)
-    assert set(result.evidence) <= set(EVIDENCE), "a new key needs its words in report/evidence.py"
-    told = evidence_facts({**result.evidence, "key_of_later": 2.5}, "Evidence").rows
-    assert len(told) == len(result.evidence) + 1 and told[-1] == ("key of later", "2.5")
+    assert set(result.evidence.to_dict()) <= set(EVIDENCE), "a new key needs its words in report/evidence.py"
+    told = evidence_facts({**result.evidence.to_dict(), "key_of_later": 2.5}, "Evidence").rows
+    assert len(told) == len(result.evidence.to_dict()) + 1 and told[-1] == ("key of later", "2.5")
     assert not any("_" in what or what.endswith(" mm") for what, _ in told)

@@ -145,7 +145,7 @@ def fit_record(
         "b_stddev": result.b_stddev.tolist(),
         "b_stddev_calibrated": result.calibrated,
         "shrinkage": result.shrinkage.tolist(),
-        "evidence": dict(result.evidence),
+        "evidence": {} if result.evidence is None else result.evidence.to_dict(),
         "chirality": result.chirality,
         **({"found_landmarks": found} if (found := found_landmarks(result)) else {}),
         "distances_mm": {name: stage.distances.as_dict() for name, stage in result.stages.items()},
@@ -200,7 +200,7 @@ def _shown(result: FitResult) -> dict[str, Any]:
     told: dict[str, Any] = {}
     for key, stage in (("shown", "final"), ("shown_dense", "dense")):
         if stage in result.stages:
-            shown = result.shown_at(stage)
+            shown = result.overlap_distances_at(stage)
             told |= {key: asdict(shown), f"{key}_scan_mm": asdict(shown.in_unit(result.scan_mm_per_model_mm))}
     return told
 

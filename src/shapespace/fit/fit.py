@@ -25,7 +25,7 @@ from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.settings import DenseSettings
 from shapespace.fit.start import Start, find_unit, start_from_any_pose, start_from_landmarks
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.verdict import verdict
+from shapespace.fit.verdict import judge
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
@@ -202,7 +202,7 @@ def fit_scan(
         stages = _measure(own, placed, driven, config)
         clock.append(time.perf_counter())
         ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, rms_size(own.mean_vertices))
-        status, reason = verdict(config.fitting, ended)
+        status, reasons = judge(config.fitting, ended)
         if held is not None:
             driven = replace(
                 driven,
@@ -216,7 +216,7 @@ def fit_scan(
     return FitResult(
         scan_name=placed.scan.name,
         status=status,
-        reason=reason,
+        reasons=reasons,
         T_scan_model=stages["final"].T_scan_model,
         mm_per_scan_unit=placed.mm_per_scan_unit,
         b=fitted.b,

@@ -1,4 +1,4 @@
-"""What a fitting method is: an object that owns its settings, its loop, its doubts and its reason."""
+"""Protocol of a fitting method: an object that owns its settings, its loop, its doubts and its reason."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+from shapespace.fit.reasons import Reason
 from shapespace.fit.result import Stage
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.start import Start
@@ -72,10 +73,10 @@ class Method(Protocol):
         """
         ...
 
-    def doubts(self, ended: Ended) -> list[str]:
-        """Return its own reasons not to trust the fit, most serious first; none where nothing speaks against it."""
+    def doubts(self, ended: Ended) -> list[Reason]:
+        """Return reasons not to trust the fit, the most serious first; empty where there are none."""
         ...
 
-    def reason(self, ended: Ended) -> str:
-        """Return one sentence on why it ended where it did, of a fit that nothing speaks against."""
+    def reason(self, ended: Ended) -> Reason:
+        """Return why a fit without doubts ended where it did."""
         ...

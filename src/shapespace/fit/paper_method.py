@@ -11,6 +11,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.fit.method import Ended, Limits
+from shapespace.fit.reasons import Reason, ReasonCode
 from shapespace.fit.regions import all_followed
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.shape_icp import shape_icp
@@ -89,42 +90,45 @@ class Paper:
             regions=partial(all_followed, model.n_vertices),
         )
 
-    def reason(self, ended: Ended) -> str:
+    def reason(self, ended: Ended) -> Reason:
         """Return why it stopped."""
-        return (
-            f"Converged; RMS closest distance {ended.phases[2].rms_mm:.2f} mm: its relative change is below "
-            f"{self.stop_rate:g} and no vertex moved more than {self.stop_motion_mm:g} mm."
+        return Reason(
+            ReasonCode.CONVERGED_BY_RATE,
+            {
+                "rms_mm": ended.phases[2].rms_mm,
+                "stop_rate": self.stop_rate,
+                "stop_motion_mm": self.stop_motion_mm,
+            },
         )
 
-    def doubts(self, ended: Ended) -> list[str]:
-        """Return what the distances, the scale and the main coefficients say against the fit."""
+    def doubts(self, ended: Ended) -> list[Reason]:
+        """Return reasons in the distances, the scale and the main coefficients to doubt the fit."""
         model, final, initial = ended.model, ended.stages["final"], ended.stages["initial"]
         forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
         size_mm = ended.size_mm
-        found: list[str] = []
+        found: list[Reason] = []
         shrunk = min(
             final.T_scan_model.scale / initial.T_scan_model.scale / _SHRUNK_BY_SHAPE,
             ended.fitted.T_scan_model.scale / ended.start.T_scan_model.scale / _SHRUNK_IN_ALL,
         )
         if shrunk < 1.0:
-            found.append("the model shrank while it was fitted, as it does when parts of the scan are missing")
+            found.append(Reason(ReasonCode.MODEL_SHRANK))
         if forward.rms > _FAR_SHARE * size_mm:
-            found.append(f"the model stays {forward.rms:.1f} mm (RMS) away from the scan")
+            found.append(Reason(ReasonCode.MODEL_DISTANT, {"rms_mm": forward.rms}))
         if backward.fraction < _SEEN_SHARE:
-            found.append(f"the model covers only {100 * backward.fraction:.0f} % of the scan")
+            found.append(Reason(ReasonCode.SCAN_NOT_COVERED, {"scan_covered_share": backward.fraction}))
         elif backward.median > _GAP_RATIO * forward.median and backward.median > _GAP_SHARE * size_mm:
-            found.append(
-                f"half of the scan lies over {backward.median:.1f} mm from the model, while half of the model lies "
-                f"within {forward.median:.1f} mm of the scan"
-            )
+            medians_mm = {
+                "scan_to_model_median_mm": backward.median,
+                "model_to_scan_median_mm": forward.median,
+            }
+            found.append(Reason(ReasonCode.DISTANCES_DIFFER, medians_mm))
         leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
         z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
         # An extreme shape that lies on the scan all over is what the scan shows.
         if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
-            found.append(
-                f"the shape is implausible: its {leading} main coefficients lie {np.sqrt(z2):.1f} standard deviations "
-                "out on average, where about 1 is usual"
-            )
+            data = {"coefficients": leading, "z_rms": float(np.sqrt(z2))}
+            found.append(Reason(ReasonCode.MAIN_COEFFICIENTS_IMPLAUSIBLE, data))
         return found
 
 

@@ -1,7 +1,8 @@
-"""What a fit gives: pose, coefficients, distances both ways, how it went, and whether to trust it."""
+"""Result of a fit: pose, coefficients, distances in both directions, status and history."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,9 +14,12 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.fit.colours import carried_colours
+from shapespace.fit.evidence import FitEvidence
+from shapespace.fit.odd_scans import Chirality, chirality_of
+from shapespace.fit.reason_text import sentence_of
+from shapespace.fit.reasons import Reason
 from shapespace.fit.regions import MATCHED, SHOWN
 from shapespace.fit.state import IcpState
-from shapespace.fit.trust import Chirality, chirality_of
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import
@@ -28,12 +32,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ShownDistances:
-    """Distances over what scan and model both show, in mm: what a reader of a fit should look at first.
+class OverlapDistances:
+    """Distances over the parts that scan and model both contain, in mm: look at these first.
 
     Args:
-        model_to_scan: over the model's vertices that the scan shows; those beyond its border or over its holes are
-            the model's guess, and say nothing of the fit.
+        model_to_scan: over the model's vertices that the scan shows; the others are estimates.
         scan_to_model: over the scan's vertices that the model covers.
         model_seen_share: share of the model's vertices that the scan shows.
         scan_covered_share: share of the scan's vertices that the model covers.
@@ -44,8 +47,8 @@ class ShownDistances:
     model_seen_share: float
     scan_covered_share: float
 
-    def in_unit(self, length: float) -> ShownDistances:
-        """Return the same with all lengths times `length`, as for millimetres of the scan."""
+    def in_unit(self, length: float) -> OverlapDistances:
+        """Return the distances with all lengths times `length`, as for millimetres of the scan."""
         return replace(
             self, model_to_scan=self.model_to_scan.times(length), scan_to_model=self.scan_to_model.times(length)
         )
@@ -58,15 +61,15 @@ STAGES = ("before", "initial", "final")
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The model's surface at one moment of the fit.
+    """The fitted surface at one stage of the fit.
 
     Args:
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         b: (K,) coefficients, mm.
-        measure: measures the distances; it holds the scan.
+        measure: measures the distances to the scan.
         vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
-        seen: (V,) False where such a surface has only the model to go by; else None.
-        moved_mm: how far such a surface moved along its normals (RMS over what is seen), mm of the model's frame.
+        seen: (V,) False where the scan does not show such a surface; else None.
+        moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the model's frame.
     """
 
     T_scan_model: Similarity
@@ -91,13 +94,13 @@ class FitResult:
     Args:
         scan_name: as the mesh was named.
         status: `converged`, `max_iterations`, or `doubtful` when the fit should not be trusted.
-        reason: one sentence on why it has that status.
+        reasons: why it has that status, as codes with data.
         T_scan_model: from the model's frame (mm) to the scan's frame and unit.
         mm_per_scan_unit: the scan's unit as found or given.
         b: (K,) coefficients, mm.
         b_stddev: (K,) their standard deviation, mm. Of the robust method it is calibrated (docs/uncertainty.md); of the
             paper's it goes by the model's own noise and is mostly too small.
-        shrinkage: (K,) in [0, 1]: near 1 the scan told the coefficient, near 0 only the model did.
+        shrinkage: (K,) in [0, 1]: near 1 where the scan determines the coefficient, near 0 where only the prior does.
         z: (K,) b in standard deviations of the model.
         z_covariance: (K, K) of z, calibrated; None of the paper's method. It is in no file.
         stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
@@ -105,12 +108,12 @@ class FitResult:
         method: name of the method that ran.
         calibrated: whether `b_stddev` was checked against truths (docs/uncertainty.md); not of the paper's method.
         config: every setting in effect, with the software version.
-        start: how the start was found.
-        evidence: what the status goes by, by name; empty for the paper's method, which goes by the distances.
-        notes: what was repaired or noticed in the scan.
-        seconds: by part.
+        start: source of the start: `landmarks`, `upright`, `rotations` or `given`.
+        evidence: diagnostics from which the status is computed; None for the paper's method, which uses distances.
+        notes: sentences on repairs and problems of the scan.
+        seconds: duration of each part.
         model: the model that was fitted.
-        scan: what was fitted: the scan as repaired, in its own frame and unit.
+        scan: the repaired scan, in its own frame and unit.
         find_regions: finds `regions`.
         find_closest: finds the closest points of the scan to vertices (V, 3) in its own frame and unit.
         landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
@@ -121,7 +124,7 @@ class FitResult:
 
     scan_name: str
     status: Status
-    reason: str
+    reasons: tuple[Reason, ...]
     T_scan_model: Similarity
     mm_per_scan_unit: float
     b: FloatArray
@@ -135,7 +138,7 @@ class FitResult:
     calibrated: bool
     config: Mapping[str, Any]
     start: str
-    evidence: Mapping[str, float]
+    evidence: FitEvidence | None
     notes: Sequence[str]
     seconds: Mapping[str, float]
     model: ShapeModel = field(repr=False)
@@ -152,12 +155,17 @@ class FitResult:
             f"the largest {self.z[far]:+.1f} sd (mode {far + 1}); {self.method}, {sum(self.seconds.values()):.2f} s>"
         )
 
+    @property
+    def reason(self) -> str:
+        """One sentence on why it has its status, made of `reasons`."""
+        return sentence_of(self.status, self.reasons)
+
     @cached_property
     def regions(self) -> IntArray:
         """(V,) code of each model vertex in `fit.regions.REGIONS`, found when first asked for.
 
-        The paper's method takes every vertex for followed, whatever the scan shows there: that is what it does.
-        Outside the region that a fit is held to (`FitConfig.region`) nothing is seen.
+        The paper's method follows every vertex, observed or not. Outside the region of a region fit
+        (`FitConfig.region`) nothing is seen.
         """
         return self.find_regions()
 
@@ -193,7 +201,7 @@ class FitResult:
         It is `undecidable` for a mirror-symmetric model, such as one of faces, for a region of a model, and for the
         paper's method, which does not test it.
         """
-        return chirality_of(self.evidence)
+        return chirality_of(None if self.evidence is None else self.evidence.mirrored_log_odds)
 
     @property
     def iterations(self) -> dict[str, int]:
@@ -215,23 +223,29 @@ class FitResult:
 
     @property
     def scan_mm_per_model_mm(self) -> float:
-        """What a mm of the model's frame is in mm of the scan: 1 where the pose has no free scale."""
+        """Millimetres of the scan per millimetre of the model's frame: 1 where the pose has no free scale."""
         return self.T_scan_model.scale * self.mm_per_scan_unit
 
     @cached_property
-    def shown(self) -> ShownDistances:
-        """Distances of the final surface over what the scan shows and the model covers, mm of the model's frame."""
-        return self.shown_at("final")
+    def overlap_distances(self) -> OverlapDistances:
+        """Distances of the final surface where scan and model overlap, mm of the model's frame."""
+        return self.overlap_distances_at("final")
 
-    def shown_at(self, stage: str) -> ShownDistances:
-        """Return the distances at `stage` over what the scan shows, as it is known at the end of the fit."""
+    @property
+    def shown(self) -> OverlapDistances:
+        """Deprecated: use `overlap_distances`."""
+        warnings.warn("FitResult.shown is now FitResult.overlap_distances.", DeprecationWarning, stacklevel=2)
+        return self.overlap_distances
+
+    def overlap_distances_at(self, stage: str) -> OverlapDistances:
+        """Return the distances at `stage` where scan and model overlap at the end of the fit."""
         distances, seen = self.stages[stage].distances, np.isin(self.regions, SHOWN)
         counted = slice(None) if distances.model_counted is None else distances.model_counted
         forward, backward = (
             DistanceSummary.of(distances.model_to_scan_mm[counted], seen[counted]),
             distances.scan_to_model,
         )
-        return ShownDistances(forward, backward, forward.fraction, backward.fraction)
+        return OverlapDistances(forward, backward, forward.fraction, backward.fraction)
 
     def surface(self, model: ShapeModel | None = None, stage: str = "final") -> Mesh:
         """Return the model's surface at `stage` in the scan's own frame and unit, all vertices in model order.
@@ -255,7 +269,7 @@ class FitResult:
         return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
-        """Write what `shapespace fit` writes of a scan, and return the path of the record, NAME.fit.json.
+        """Write the files that `shapespace fit` writes, and return the path of the record, NAME.fit.json.
 
         Record and surfaces are published together, and the row of coefficients.csv is put in; `report`, `view` and
         `recognise` then take the folder. Of a scan or a model that was not read from a file the record tells no path,
@@ -303,5 +317,7 @@ class FitResult:
         return lazy_import("html_of_fit")(self)
 
     def _vertices(self, stage: str) -> FloatArray:
-        at = self.stages[stage]
-        return at.T_scan_model.apply(self.model.reconstruct(at.b)) if at.vertices is None else at.vertices
+        surface = self.stages[stage]
+        if surface.vertices is not None:
+            return surface.vertices
+        return surface.T_scan_model.apply(self.model.reconstruct(surface.b))

@@ -25,6 +25,7 @@ from scipy.linalg import LinAlgError
 
 from shapespace.errors import FitError
 from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
+from shapespace.fit.evidence import MatchEvidence
 from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.marks import Marks, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, MatchHint, Weights
@@ -35,7 +36,7 @@ from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
 from shapespace.fit.span import in_span
 from shapespace.fit.start import Start
-from shapespace.fit.state import Fitted, IcpState
+from shapespace.fit.state import IcpState, RobustFitted
 from shapespace.fit.weights import spread, tails
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import rms_size
@@ -292,7 +293,7 @@ def robust_icp(
     with_scale: bool = True,
     modes: int | None = None,
     max_iterations: int = 500,
-) -> Generator[IcpState, None, Fitted]:
+) -> Generator[IcpState, None, RobustFitted]:
     """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together.
 
     Args:
@@ -380,7 +381,7 @@ def _extended(problem: Problem, course: Course, tree: KdTree, max_iterations: in
 
 def _summary(
     problem: Problem, iterate: Iterate, weighted: WeightedMatches, unexplained_mm2: float, modes: int | None
-) -> Fitted:
+) -> RobustFitted:
     """Return the result: coefficients of the model, their covariance, regions and evidence.
 
     Args:
@@ -411,7 +412,7 @@ def _summary(
         reported = problem.in_model(iterate, known.surface_mm, wanted)
     in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
     left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())
-    return Fitted(
+    return RobustFitted(
         T_scan_model=reported.T_scan_model,
         b=reported.b,
         b_stddev=known.b_stddev(wanted),
@@ -424,15 +425,15 @@ def _summary(
             target, T, ModelSurface.of(surface.topology, surface.vertices), weighted.matches.winding,
             settings.normal_cosine, settings.weight, weighted.weights.width_mm, weighted.weights.far_mm,
         ),
-        evidence={
+        match_evidence=MatchEvidence(
             **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
-            "beyond_model_mm": beyond_mm,
-            "left_out_mm": float(np.sqrt(left_out_mm2)),
-            "model_spread_mm": float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
-            "model_lack_mm": lack_of_new_shapes(model),
+            beyond_model_mm=beyond_mm,
+            left_out_mm=float(np.sqrt(left_out_mm2)),
+            model_spread_mm=float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
+            model_lack_mm=lack_of_new_shapes(model),
             **_of_marks(problem, iterate),
-            "posterior_error_mm": float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
-        },
+            posterior_error_mm=float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
+        ),
         notes=() if problem.marks is None else problem.marks.notes(surface, T),
         landmark_covariance=_of_landmarks(model, known, surface, T),
     )  # fmt: skip

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
+from shapespace.fit.evidence import FitEvidence, ScanEvidence
+from shapespace.fit.failure_model import estimate_error, find_failure_reasons
 from shapespace.fit.method import Ended, Limits
-from shapespace.fit.reliability import reliability
+from shapespace.fit.odd_scans import chirality_of, find_odd_scan_reasons
+from shapespace.fit.reasons import Reason, ReasonCode
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
-from shapespace.fit.start import Start, start_evidence
+from shapespace.fit.start import Start
 from shapespace.fit.state import Fitted, IcpState
-from shapespace.fit.trust import (
-    chirality_of,
-    doubts_of_chirality,
-    doubts_of_few_shapes,
-    doubts_of_inconsistent_parts,
-    doubts_of_layers,
-    doubts_of_reliability,
-    doubts_of_robust,
-)
 from shapespace.model.shape_model import ShapeModel
 
 
@@ -41,7 +35,7 @@ class Robust(RobustSettings):
         """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
         from shapespace.fit.chirality import mirrored_log_odds
         from shapespace.fit.robust import robust_icp
-        from shapespace.fit.second_instance import displaced, find_second_instance, layers  # compiled
+        from shapespace.fit.second_instance import find_displaced, find_layers, find_second_instance  # compiled
 
         fitted = yield from robust_icp(
             model,
@@ -52,38 +46,40 @@ class Robust(RobustSettings):
             modes=limits.modes,
             max_iterations=limits.max_iterations,
         )
-        evidence = {
-            **fitted.evidence,
-            "training_shapes": float(model.n_training),
-            **start_evidence(start),
-            **layers(model, scan, fitted),
-            **displaced(model, scan, fitted),
-        }
-        evidence |= reliability(evidence).as_evidence()
+        measured = ScanEvidence(
+            **asdict(fitted.match_evidence),
+            training_shapes=float(model.n_training),
+            start_score_mm=start.score_mm,
+            start_runner_up_score_mm=start.runner_up_score_mm,
+            **asdict(find_layers(model, scan, fitted)),
+            **asdict(find_displaced(model, scan, fitted)),
+        )
+        evidence = FitEvidence(**asdict(measured), **asdict(estimate_error(measured)))
+        notes = list(fitted.notes)
+        second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
+        if second is not None:
+            evidence = replace(evidence, second_instance_mm=second.away_mm, second_instance_gap_mm=second.gap_mm)
+            notes.append(second.note)
         if not limits.part:
             log_odds = mirrored_log_odds(model, scan, fitted, self, with_scale=limits.with_scale)
-            evidence |= {} if log_odds is None else {"mirrored_log_odds": log_odds}
-        second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
-        notes = [*fitted.notes, *([] if second is None else [second.note])]
-        if "mirrored_log_odds" in evidence and chirality_of(evidence) == "undecidable":
-            notes.append("Whether the scan is mirrored is undecidable: its mirror image fits the model about as well.")
-        return replace(fitted, evidence=evidence | ({} if second is None else second.as_evidence()), notes=notes)
+            evidence = replace(evidence, mirrored_log_odds=log_odds)
+            if log_odds is not None and chirality_of(log_odds) == "undecidable":
+                notes.append(
+                    "Whether the scan is mirrored is undecidable: its mirror image fits the model about as well."
+                )
+        return replace(fitted, evidence=evidence, notes=notes)
 
-    def doubts(self, ended: Ended) -> list[str]:
-        """Return what its evidence says against the fit, beside that of simulated ones whose truth is known."""
+    def doubts(self, ended: Ended) -> list[Reason]:
+        """Return reasons in the evidence to doubt the fit: an odd scan, then a probable failure."""
         evidence = ended.fitted.evidence
-        return [
-            *doubts_of_chirality(evidence),
-            *doubts_of_layers(evidence),
-            *doubts_of_inconsistent_parts(evidence),
-            *doubts_of_few_shapes(evidence),
-            *(doubts_of_robust(evidence) or doubts_of_reliability(evidence)),
-        ]
+        assert evidence is not None
+        return [*find_odd_scan_reasons(evidence), *find_failure_reasons(evidence)]
 
-    def reason(self, ended: Ended) -> str:
+    def reason(self, ended: Ended) -> Reason:
         """Return that the fit converged, with its robust residual standard deviation."""
-        e = ended.fitted.evidence
-        return (
-            f"Converged; robust residual SD {e['spread_mm']:.2f} mm over {100 * e['model_matched_share']:.0f} % of the "
-            "model's vertices."
+        evidence = ended.fitted.evidence
+        assert evidence is not None
+        return Reason(
+            ReasonCode.CONVERGED,
+            {"spread_mm": evidence.spread_mm, "model_matched_share": evidence.model_matched_share},
         )

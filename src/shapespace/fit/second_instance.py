@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.failure_model import failure_score
 from shapespace.fit.robust import robust_icp
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
 from shapespace.fit.start import Start
-from shapespace.fit.state import Fitted, last_of
-from shapespace.fit.trust import score
+from shapespace.fit.state import RobustFitted, last_of
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, part_of, rms_size, vertex_normals
@@ -54,10 +54,6 @@ class SecondInstance:
     away_mm: float
     gap_mm: float
 
-    def as_evidence(self) -> dict[str, float]:
-        """Return the values by name, as evidence of a fit."""
-        return {"second_instance_mm": self.away_mm, "second_instance_gap_mm": self.gap_mm}
-
     @property
     def note(self) -> str:
         """Sentence for the notes of a fit."""
@@ -68,7 +64,7 @@ class SecondInstance:
 
 
 def find_second_instance(
-    model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
+    model: ShapeModel, target: ScanTarget, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
 ) -> SecondInstance | None:
     """Return the second instance that the model fits about as well as the first; None where there is none.
 
@@ -81,7 +77,7 @@ def find_second_instance(
         settings: of the robust method.
         with_scale: whether the pose has a free scale.
     """
-    if fitted.evidence["scan_near_share"] > _EXPLAINED:
+    if fitted.match_evidence.scan_near_share > _EXPLAINED:
         return None
     size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
     placed = build_engine(Mesh(fitted.vertices_scan_mm, model.faces))
@@ -96,7 +92,8 @@ def find_second_instance(
         other = last_of(robust_icp(model, rest, Start(T, "given", float("nan")), settings, with_scale=with_scale))
     except (FitError, InputError):
         return None
-    if score(other.evidence) > 0.0 or other.evidence["spread_mm"] > _AS_GOOD * fitted.evidence["spread_mm"]:
+    own, others = fitted.match_evidence, other.match_evidence
+    if failure_score(others) > 0.0 or others.spread_mm > _AS_GOOD * own.spread_mm:
         return None
     first, second = fitted.vertices_scan_mm, other.vertices_scan_mm
     apart = second.mean(axis=0) - first.mean(axis=0)
@@ -106,8 +103,26 @@ def find_second_instance(
     return SecondInstance(away / scale, gap / scale)
 
 
-def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return the shares of the scan that run along the fitted surface at a distance, and that scatter, by name.
+@dataclass(frozen=True)
+class Displaced:
+    """Unexplained parts of a scan; the fields are those of `ScanEvidence`."""
+
+    displaced_share: float = 0.0
+    displaced_inward_share: float = 0.0
+    displaced_purity: float = 0.0
+    scattered_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Two surfaces of a scan on top of each other; the fields are those of `ScanEvidence`."""
+
+    layered_share: float = 0.0
+    layers_apart_mm: float = 0.0
+
+
+def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> Displaced:
+    """Return the shares of the scan that run along the fitted surface at a distance, and that scatter.
 
     Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
     a distance. Around a point of them the heights over the fitted surface are alike, and little else of the scan is
@@ -120,12 +135,10 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
         fitted: result of the fit to it.
     """
     # Heights are compared with those of neighbours; fewer points than these have too few neighbours.
-    if len(target.mesh.vertices) < _NEIGHBOURS or fitted.evidence["scan_near_share"] > _ALL_EXPLAINED:
-        return {
-            "displaced_share": 0.0, "displaced_inward_share": 0.0, "displaced_purity": 0.0, "scattered_share": 0.0,
-        }  # fmt: skip
+    if len(target.mesh.vertices) < _NEIGHBOURS or fitted.match_evidence.scan_near_share > _ALL_EXPLAINED:
+        return Displaced()
     scale = fitted.T_scan_fitted.scale
-    size, spread = rms_size(model.mean_vertices) * scale, fitted.evidence["spread_mm"] * scale
+    size, spread = rms_size(model.mean_vertices) * scale, fitted.match_evidence.spread_mm * scale
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     at = build_engine(surface).query(points)
@@ -136,16 +149,16 @@ def displaced(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str
     far = max(_DISPLACED[0] * size, _SPREADS * spread)
     moved = (np.abs(height) > far) & (at.distance < _DISPLACED[1] * size) & alike & inside
     moved &= np.abs(height) > _ALONG_NORMAL * at.distance
-    return {
-        "displaced_share": float(moved.mean()),
-        "displaced_inward_share": float((moved & (height < 0.0)).mean()),
-        "displaced_purity": float(moved.mean() / max(float((at.distance > far).mean()), 1.0 / len(points))),
-        "scattered_share": float(((at.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
-    }
+    return Displaced(
+        displaced_share=float(moved.mean()),
+        displaced_inward_share=float((moved & (height < 0.0)).mean()),
+        displaced_purity=float(moved.mean() / max(float((at.distance > far).mean()), 1.0 / len(points))),
+        scattered_share=float(((at.distance > _DISPLACED[0] * size) & inside & ~alike).mean()),
+    )
 
 
-def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, float]:
-    """Return over which share of the scan there are two surfaces on top of each other, and how far apart, by name.
+def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> Layers:
+    """Return the share of the scan with two surfaces on top of each other, and their distance.
 
     Around a point of such a scan the heights over the fitted surface fall into two tight groups with a gap between.
     Noise leaves no gap, and what is thrown off the surface forms no tight group. Both are zero where matched points lie
@@ -157,15 +170,14 @@ def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, f
         fitted: where the fit to it ended.
     """
     size_mm, scale = rms_size(model.mean_vertices), fitted.T_scan_fitted.scale
-    found = {"layered_share": 0.0, "layers_apart_mm": 0.0}
-    if fitted.evidence["spread_mm"] < _APART * size_mm:
-        return found
+    if fitted.match_evidence.spread_mm < _APART * size_mm:
+        return Layers()
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     at = build_engine(surface).query(points)
     near = at.distance < 2 * _NEAR * size_mm * scale
     if near.sum() < _FEWEST:
-        return found
+        return Layers()
     normals = vertex_normals(surface)[at.vertex[near]]
     height = np.einsum("ij,ij->i", (points - at.points)[near], normals)
     feet = at.points[near]
@@ -176,15 +188,12 @@ def layers(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> dict[str, f
     gap = gaps.max(axis=1)
     widest = np.maximum(heights[rows, split - 1] - heights[:, 0], heights[:, -1] - heights[rows, split])
     layered = widest < _TIGHT * gap
-    if layered.any():
-        found = {
-            "layered_share": float(layered.mean()),
-            "layers_apart_mm": float(np.median(gap[layered])) / scale,
-        }
-    return found
+    if not layered.any():
+        return Layers()
+    return Layers(float(layered.mean()), float(np.median(gap[layered])) / scale)
 
 
-def _same_moved(fitted: Fitted, rest: FloatArray, size_mm: float) -> Similarity | None:
+def _same_moved(fitted: RobustFitted, rest: FloatArray, size_mm: float) -> Similarity | None:
     """Return the pose at which the shape that was fitted, turned much as it is, lies on `rest` (R, 3); None for none.
 
     It is far cheaper than a search, which a head or a collar around a face would otherwise cost.

@@ -49,11 +49,6 @@ class Start:
     marks: Marks | None = None
 
 
-def start_evidence(start: Start) -> dict[str, float]:
-    """Return what the search for a start says, by name; not a number, or infinite, where nothing was searched."""
-    return {"start_score_mm": start.score_mm, "start_runner_up_score_mm": start.runner_up_score_mm}
-
-
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
     """Return the unit, a name of `MM_PER_UNIT`, that makes the scan's size most like the model's.
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.fit.evidence import FitEvidence, MatchEvidence
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -46,14 +48,14 @@ class Fitted:
         T_scan_model: from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm.
         b_stddev: (K,) their standard deviation, mm.
-        shrinkage: (K,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did.
-        T_scan_fitted: pose of the surface that was fitted, before it was told in the model's coefficients.
+        shrinkage: (K,) in [0, 1]: 1 where the scan determines the coefficient, 0 where only the prior does.
+        T_scan_fitted: pose of the surface that was fitted, before its projection onto the model's modes.
         vertices_scan_mm: (V, 3) that surface in the scan's mm frame; it may leave the span of the model,
         outside_mm: by this (RMS), mm of the model's frame.
         regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
-        evidence: what the verdict goes by, by name.
+        evidence: diagnostics from which the status is computed; None of a method without any.
         b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
-        notes: what was noticed in the scan, a sentence each.
+        notes: sentences on problems of the scan.
         landmark_covariance: (L, 3, 3) of where the model's landmarks lie in that frame, mm^2, in the model's order,
             where the method finds it.
     """
@@ -66,13 +68,23 @@ class Fitted:
     vertices_scan_mm: FloatArray
     outside_mm: float
     regions: Callable[[], IntArray] = field(repr=False)
-    evidence: Mapping[str, float] = field(default_factory=lambda: dict[str, float]())
+    evidence: FitEvidence | None = None
     b_covariance: FloatArray | None = None
     notes: Sequence[str] = ()
     landmark_covariance: FloatArray | None = None
 
 
-def last_of(states: Generator[IcpState, None, Fitted]) -> Fitted:
+@dataclass(frozen=True, eq=False)
+class RobustFitted(Fitted):
+    """Where the robust method ended, with the diagnostics of its last iterate."""
+
+    match_evidence: MatchEvidence = field(kw_only=True)
+
+
+_F = TypeVar("_F", bound=Fitted)
+
+
+def last_of(states: Generator[IcpState, None, _F]) -> _F:
     """Run a fit to its end, and return its result."""
     while True:
         try:

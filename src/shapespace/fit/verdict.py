@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.fit.method import Ended, Method
+from shapespace.fit.reasons import Reason, ReasonCode
 from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
@@ -17,45 +18,37 @@ _DENSE_MOVED_SHARE = 0.009
 those that move further, most lie elsewhere than they belong (docs/dense.md)."""
 
 
-def verdict(method: Method, ended: Ended) -> tuple[Status, str]:
-    """Return status and reason of a fit: what speaks against what is returned, then what the method doubts itself."""
-    against = [*doubts_of_returned(ended), *method.doubts(ended)]
-    if against:
-        return "doubtful", f"Do not trust this fit: {'; '.join(against)}."
-    for number, name in ((1, "Phase 1"), (2, "Phase 2")):
-        if ended.phases[number].stopped == "cap":
-            return "max_iterations", f"{name} was cut off after {ended.phases[number].iteration} iterations."
-    return "converged", method.reason(ended)
+def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
+    """Return status and reasons of a fit: contradictions in what is returned, then the doubts of the method."""
+    doubts = [*find_contradictions(ended), *method.doubts(ended)]
+    if doubts:
+        return "doubtful", tuple(doubts)
+    for phase in (1, 2):
+        if ended.phases[phase].stopped == "cap":
+            data = {"phase": phase, "iterations": ended.phases[phase].iteration}
+            return "max_iterations", (Reason(ReasonCode.ITERATION_LIMIT, data),)
+    return "converged", (method.reason(ended),)
 
 
-def doubts_of_returned(ended: Ended) -> list[str]:
-    """Return how pose, coefficients and surface contradict each other; none where they agree."""
+def find_contradictions(ended: Ended) -> list[Reason]:
+    """Return how pose, coefficients and surface contradict each other; empty where they agree."""
     from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
 
-    model, fitted, found = ended.model, ended.fitted, list[str]()
+    model, fitted, found = ended.model, ended.fitted, list[Reason]()
     z = np.abs(fitted.b) / np.sqrt(new_shapes(model)[: len(fitted.b)])
     worst = int(z.argmax())
     if z[worst] > _FARTHEST_Z:
-        found.append(
-            f"mode {worst + 1} lies {z[worst]:.3g} standard deviations out, which no shape of this kind does; build "
-            "the model without its faint modes, or of more shapes"
-        )
-    scale = fitted.T_scan_model.scale / fitted.T_scan_fitted.scale
-    if abs(np.log(scale)) > _OTHER_SCALE:
-        found.append(
-            f"projected onto the model's own modes, the fitted surface would be {scale:.3g} times as large as it is"
-        )
-    own = fitted.T_scan_fitted.inverse()
-    told = (own @ fitted.T_scan_model).apply(model.reconstruct(fitted.b))
-    away_mm = float(np.sqrt(((own.apply(fitted.vertices_scan_mm) - told) ** 2).sum(axis=1).mean()))
-    if away_mm > _MOVED_AWAY * fitted.outside_mm + _LEAST_MOVED_SHARE * ended.size_mm:
-        found.append(
-            f"projected onto the model's own modes, the surface moves {away_mm:.2g} mm away from the fitted one"
-        )
+        found.append(Reason(ReasonCode.MODE_IMPLAUSIBLE, {"mode": worst + 1, "z": float(z[worst])}))
+    scale_ratio = float(fitted.T_scan_model.scale / fitted.T_scan_fitted.scale)
+    if abs(np.log(scale_ratio)) > _OTHER_SCALE:
+        found.append(Reason(ReasonCode.PROJECTED_SCALE, {"scale_ratio": scale_ratio}))
+    T_model_scan = fitted.T_scan_fitted.inverse()
+    projected = (T_model_scan @ fitted.T_scan_model).apply(model.reconstruct(fitted.b))
+    moved = T_model_scan.apply(fitted.vertices_scan_mm) - projected
+    moved_mm = float(np.sqrt((moved**2).sum(axis=1).mean()))
+    if moved_mm > _MOVED_AWAY * fitted.outside_mm + _LEAST_MOVED_SHARE * ended.size_mm:
+        found.append(Reason(ReasonCode.PROJECTED_SURFACE, {"moved_mm": moved_mm}))
     dense = ended.stages.get("dense")
     if dense is not None and dense.moved_mm > _DENSE_MOVED_SHARE * ended.size_mm:
-        found.append(
-            f"to follow the scan, the dense surface moved by {dense.moved_mm:.2g} mm along its normals, more than the "
-            "model should lack, so its vertices may lie in other places than those that correspond"
-        )
+        found.append(Reason(ReasonCode.DENSE_SURFACE_MOVED, {"moved_mm": dense.moved_mm}))
     return found

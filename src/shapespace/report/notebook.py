@@ -109,18 +109,18 @@ def html_of_model(model: ShapeModel) -> str:
 
 def html_of_fit(result: FitResult) -> str:
     """Return a fit for a notebook: where it is how far from the scan, the verdict, and the largest coefficients."""
-    shown = result.shown
+    overlap = result.overlap_distances
     largest = sorted(range(len(result.z)), key=lambda k: -abs(result.z[k]))[:_MOST_COEFFICIENTS]
-    seen, covered = percent(shown.model_seen_share), percent(shown.scan_covered_share)
+    seen, covered = percent(overlap.model_seen_share), percent(overlap.scan_covered_share)
     rows = [
-        ("Model to scan", f"{mm(shown.model_to_scan.mean)} mean, over the {seen} that the scan shows"),
-        ("Scan to model", f"{mm(shown.scan_to_model.mean)} mean, over the {covered} that the model covers"),
+        ("Model to scan", f"{mm(overlap.model_to_scan.mean)} mean, over the {seen} that the scan shows"),
+        ("Scan to model", f"{mm(overlap.scan_to_model.mean)} mean, over the {covered} that the model covers"),
         ("Coefficients", f"{len(result.z)}; " + ", ".join(f"z{k + 1} {result.z[k]:+.1f}" for k in largest)),
         ("Scale", f"{result.T_scan_model.scale:.4g} ({result.mm_per_scan_unit:g} mm in the scan's unit)"),
         ("Method", f"{result.method}, started from {result.start}, {sum(result.seconds.values()):.2f} s"),
     ]
-    if (expected := result.evidence.get("expected_error_mm")) is not None:
-        rows.insert(2, ("Expected error", f"{mm(expected)} of its vertices"))
+    if result.evidence is not None:
+        rows.insert(2, ("Expected error", f"{mm(result.evidence.expected_error_mm)} of its vertices"))
     rows += [("Note", note) for note in result.notes]
 
     def draw() -> Drawn:
