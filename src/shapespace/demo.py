@@ -214,7 +214,7 @@ def _scores(folder: Path, fits: Sequence[FitEntry]) -> dict[str, Any]:
 
 
 def _record(folder: Path, fit: FitEntry) -> FitRecord:
-    return FitRecord.from_json(read_record(folder / str(fit.json)), str(fit.json))
+    return read_record(folder / str(fit.json))
 
 
 def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ManyPeople:
@@ -360,20 +360,19 @@ def _fit_all(
     )
     entries: list[FitEntry] = []
     for (name, scan), record in zip(scans.items(), records, strict=True):
-        base, fitted = f"{home.name}/fits/{name}", record["status"] != "failed"
+        base, fitted = f"{home.name}/fits/{name}", record.is_fitted
         errors: dict[str, VertexErrors] = {}
-        if isinstance(scan, SimulatedScan) and fitted:
-            T = record["T_scan_model"]
-            T_scan_model = Similarity(T["scale"], np.array(T["rotation"]), np.array(T["translation"]))
-            surface = T_scan_model.apply(model.reconstruct(record["b"]))
+        if isinstance(scan, SimulatedScan) and (T := record.T_scan_model) is not None:
+            T_scan_model = Similarity(T.scale, np.array(T.rotation), np.array(T.translation))
+            surface = T_scan_model.apply(model.reconstruct(np.array(record.b)))
             errors = {"vertex_error_mm": _vertex_error(surface, scan), "floor_mm": _floor(model, scan)}
         entries.append(
             FitEntry(
                 name=name,
                 expression=labels[name][0],
                 intensity=labels[name][1],
-                status=record["status"],
-                reason=record["reason"],
+                status=record.status,
+                reason=record.reason,
                 scan=f"{home.name}/scans/{name}.ply",
                 json=f"{base}.fit.json",
                 stages=f"{base}.stages.npz" if fitted else None,

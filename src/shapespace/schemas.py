@@ -113,7 +113,7 @@ class Distances(Struct, frozen=True, kw_only=True):
     rms: float | None = None
     p95: float | None = None
     max: float | None = None
-    count: float | None = None
+    count: int | float | None = None
     fraction: float | None = None
 
 
@@ -124,8 +124,8 @@ class BothWays(Struct, frozen=True, kw_only=True):
     scan_to_model: Distances = Distances()
 
 
-class ShownDistances(BothWays, frozen=True, kw_only=True):
-    """Distances over what the scan shows.
+class OverlapDistances(BothWays, frozen=True, kw_only=True):
+    """Distances over the parts that scan and model both contain.
 
     Args:
         model_seen_share: share of the model's vertices that the scan shows, 0 to 1.
@@ -166,8 +166,20 @@ class FoundLandmark(Struct, frozen=True, kw_only=True):
     stddev_mm: tuple[float, float, float] | None = None
 
 
+class ReasonRecord(Struct, frozen=True, kw_only=True):
+    """One reason for the status of a fit.
+
+    Args:
+        code: a value of `fit.reasons.ReasonCode`, or one of a later version.
+        data: its numbers by name.
+    """
+
+    code: str
+    data: Mapping[str, Any] = {}
+
+
 class FitRecord(Struct, frozen=True, kw_only=True):
-    """A NAME.fit.json.
+    """A NAME.fit.json; the fields are in the order of its keys.
 
     Args:
         id: SHA-256 of scan, model, landmarks, settings and version; the fitted surface's header has it too. Empty for a
@@ -176,9 +188,11 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         given_up: of a scan that its workers did not survive, the run that gave it up; else empty.
         status: the verdict; `unreadable` stands in place of a record that cannot be read, and in no file.
         reason: one sentence on why.
-        scan: that was fitted,
-        model: by which,
-        landmarks: and the landmarks it started from.
+        reasons: the same as codes with data; empty for a scan that could not be fitted, and in records of earlier
+            versions.
+        scan: the scan.
+        model: the model.
+        landmarks: the landmarks from which the fit started.
         T_scan_model: pose, in the scan's own frame and unit; None for a scan that could not be fitted, as are the rest.
         b: (K,) coefficients in mm: norms over all vertices, so that b over the root of `n_vertices` is the RMS by
             which a mode moves a vertex,
@@ -206,13 +220,17 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     format: str = FORMAT
     format_version: int = VERSION
     id: str = ""
-    metadata: Mapping[str, str | int | float | None] = {}
-    given_up: str = ""
-    status: Status | Literal["unreadable"]
-    reason: str = ""
     scan: File = File()
     model: File = File()
     landmarks: File | None = None
+    metadata: Mapping[str, str | int | float | None] = {}
+    status: Status | Literal["unreadable"]
+    reason: str = ""
+    reasons: tuple[ReasonRecord, ...] = ()
+    shown: OverlapDistances | None = None
+    shown_scan_mm: OverlapDistances | None = None
+    shown_dense: OverlapDistances | None = None
+    shown_dense_scan_mm: OverlapDistances | None = None
     method: str = ""
     config: Mapping[str, Any] = {}
     start: str | None = None
@@ -233,14 +251,26 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     chirality: Literal["as scanned", "mirrored", "undecidable"] | None = None
     found_landmarks: Mapping[str, FoundLandmark] = {}
     distances_mm: Mapping[str, BothWays] = {}
-    shown: ShownDistances | None = None
-    shown_scan_mm: ShownDistances | None = None
-    shown_dense: ShownDistances | None = None
-    shown_dense_scan_mm: ShownDistances | None = None
     history: tuple[Iteration, ...] = ()
     iterations: Mapping[str, int] = {}
     seconds: Mapping[str, float] = {}
     version: str = ""
+    given_up: str = ""
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether there is a result, doubtful or not."""
+        return self.status not in ("failed", "unreadable")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the file; a failed scan has no keys of a fit, and a fit none that do not apply."""
+        content: dict[str, Any] = to_json(self)
+        for key in ("scan", "model", "landmarks"):
+            if content[key]:
+                file: dict[str, Any] = content[key]
+                content[key] = {k: value for k, value in file.items() if value not in ("", None) or k in _OF_FILES}
+        left_out = _NOT_ALWAYS if self.is_fitted else content.keys() - _OF_FAILED
+        return {key: value for key, value in content.items() if value or key not in left_out}
 
     @staticmethod
     def from_json(content: object, where: str, again: str = FIT_AGAIN) -> FitRecord:
@@ -251,6 +281,12 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         """
         check_format(content, FitRecord, where, again)
         return read(FitRecord, content, where, again)
+
+
+_OF_FILES = frozenset(("name", "hash"))
+_OF_FAILED = frozenset(("reason", "config"))
+_NOT_ALWAYS = frozenset(("metadata", "shown_dense", "shown_dense_scan_mm", "area_mm2", "found_landmarks", "given_up"))
+"""Keys of a fit that are left out where they are empty."""
 
 
 # demo.json

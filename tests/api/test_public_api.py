@@ -33,7 +33,8 @@ def test_the_snapshot_sees_constructors_methods_properties_and_tables() -> None:
     lines = "\n".join(API["lines"]())
     for part in (
         r"^fit_scan\(model: ", r"^Mesh\(vertices: ", r"^FitResult\.save\(self, folder",
-        r"^FitResult\.overlap_distances -> ", r"^ShapeModel\.load\(cls, path", r"^CLASSIFIERS knn, ", r"^ShapeSpace\.transform\(self, X",
+        r"^FitResult\.overlap_distances -> ",
+        r"^ShapeModel\.load\(cls, path", r"^CLASSIFIERS knn, ", r"^ShapeSpace\.transform\(self, X",
     ):  # fmt: skip
         assert re.search(part, lines, re.MULTILINE), part
     assert " at 0x" not in lines and "._" not in lines.replace("...", "")

@@ -85,7 +85,7 @@ def test_workers_that_start_from_nothing_fit_scans_of_any_name(tmp_path: Path, m
     jobs = make_jobs(sorted(folder.glob("*.ply")), folder=out)
     records = fit_files(jobs, model, model_file, out, FitConfig(), executor=Local(workers=2))
     here = fit_files(jobs, model, model_file, tmp_path / "serial", FitConfig())
-    assert [record["b"] for record in records] == [record["b"] for record in here]
+    assert [record.b for record in records] == [record.b for record in here]
     with (out / "coefficients.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert sorted(row["scan"] for row in rows) == sorted(names)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from shapespace.batch.folder import names_for
@@ -25,6 +26,7 @@ from shapespace.errors import FileError, FileFormatError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.io.meshes import read_mesh
+from shapespace.schemas import File
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity
 
@@ -39,7 +41,7 @@ def result() -> FitResult:
 
 
 def test_the_record_has_the_keys_of_the_contract(result: FitResult) -> None:
-    record = fit_record(result, SCAN, MODEL)
+    record = fit_record(result, SCAN, MODEL).to_json()
     assert {
         "scan", "model", "status", "reason", "method", "config", "T_scan_model", "mm_per_scan_unit", "b", "z",
         "b_stddev", "distances_mm", "history", "iterations", "seconds",
@@ -60,9 +62,9 @@ def test_the_record_has_the_keys_of_the_contract(result: FitResult) -> None:
 
 def test_the_pose_in_the_record_maps_the_model_onto_the_scan(result: FitResult, tmp_path: Path) -> None:
     write_record(tmp_path / "r.fit.json", fit_record(result, SCAN, MODEL))
-    T = read_record(tmp_path / "r.fit.json")["T_scan_model"]
+    T = read_record(tmp_path / "r.fit.json").T_scan_model
     model_points = blob_model().reconstruct(result.b)
-    placed = T["scale"] * model_points @ np.array(T["rotation"]).T + T["translation"]
+    placed = T.scale * model_points @ np.array(T.rotation).T + T.translation
     write_fitted_mesh(tmp_path / "r.fitted.ply", result, blob_model())
     fitted = read_mesh(tmp_path / "r.fitted.ply")
     assert np.allclose(fitted.vertices, placed, atol=1e-12)
@@ -78,12 +80,12 @@ def strict(text: str) -> object:
 
 def test_numbers_that_are_not_finite_become_null(tmp_path: Path, result: FitResult) -> None:
     record = fit_record(result, SCAN, MODEL)
-    assert not math.isfinite(record["history"][0]["motion_mm"])
-    write_record(tmp_path / "r.fit.json", record | {"extra": [float("nan"), (1.0, -math.inf)]})
+    assert not math.isfinite(record.history[0].motion_mm)
+    write_record(tmp_path / "r.fit.json", structs.replace(record, config={"extra": [float("nan"), (1.0, -math.inf)]}))
     text = (tmp_path / "r.fit.json").read_text()
-    assert strict(text)["extra"] == [None, [1.0, None]]
+    assert strict(text)["config"]["extra"] == [None, [1.0, None]]
     assert strict(text)["history"][0]["motion_mm"] is None
-    assert np.allclose(read_record(tmp_path / "r.fit.json")["b"], result.b, rtol=0, atol=0)
+    assert np.allclose(read_record(tmp_path / "r.fit.json").b, result.b, rtol=0, atol=0)
 
 
 def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, result: FitResult) -> None:
@@ -110,7 +112,8 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
 def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Path) -> None:
     half = raw_scan(np.array([0.5, -0.5, 1.0, 0.0, 0.3]), similarity(2, 10.0, 1.3), keep=0.0, noise_mm=0.1).scan
     fit = fit_scan(blob_model(), half, FitConfig())
-    record = fit_record(fit, SCAN, MODEL)
+    typed = fit_record(fit, SCAN, MODEL)
+    record = typed.to_json()
     shown, in_scan = record["shown"], record["shown_scan_mm"]
     assert 0.3 < shown["model_seen_share"] < 0.7 and shown["scan_covered_share"] > 0.8
     # Half of the model lies where the scan shows nothing, which is no fault of the fit.
@@ -123,7 +126,7 @@ def test_what_scan_and_model_both_show_is_told_in_both_millimetres(tmp_path: Pat
         for length in SUMMARY - {"count"}:
             assert in_scan[direction][length] == pytest.approx(size * shown[direction][length])
         assert in_scan[direction]["count"] == shown[direction]["count"]
-    row = coefficient_row("one", record)
+    row = coefficient_row("one", typed)
     for direction in ("model_to_scan", "scan_to_model"):
         for measure in ("mean", "median"):
             assert row[f"shown_{direction}_{measure}_mm"] == shown[direction][measure]
@@ -151,9 +154,7 @@ def test_the_table_tells_pose_size_and_where_the_scan_was(result: FitResult, tmp
 
 
 def test_a_record_of_an_earlier_version_still_makes_a_row(result: FitResult) -> None:
-    record = fit_record(result, SCAN, MODEL)
-    for key in ("shown", "shown_scan_mm", "size_mm"):
-        del record[key]
+    record = structs.replace(fit_record(result, SCAN, MODEL), shown=None, shown_scan_mm=None, size_mm=None)
     row = coefficient_row("one", record)
     assert row["b1"] == result.b[0] and "model_seen_share" not in row
 
@@ -189,7 +190,7 @@ def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: Fi
 
 def test_sources_are_told_relative_to_the_results(tmp_path: Path) -> None:
     source = Source.at(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
-    assert source.as_dict() == {"name": "m.h5", "hash": "h", "path": "../models/m.h5"}
+    assert source.to_file() == File(name="m.h5", hash="h", path="../models/m.h5")
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"scan": 1', "[]", '{"format": "other"}', "nonsense"])

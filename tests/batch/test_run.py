@@ -63,7 +63,7 @@ def without_times(record: Mapping[str, Any]) -> dict[str, Any]:
 def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     jobs = make_jobs(with_a_bad_one(scans, tmp_path))
     records = fit_files(jobs, model, Path("blob.h5"), tmp_path / "out", CONFIG)
-    assert [r["status"] == "failed" for r in records] == [False, True, True, False, False]
+    assert [r.status == "failed" for r in records] == [False, True, True, False, False]
     rows = table(tmp_path / "out")
     assert [row["scan"] for row in rows] == ["scan0", "bad", "missing", "scan1", "scan2"]
     assert "bad.ply" in rows[1]["reason"]
@@ -202,7 +202,7 @@ def test_a_scan_given_twice_is_fitted_once(
     calls = count_fits(monkeypatch)
     records = fit_files(make_jobs([scans[0], scans[1], scans[0]]), model, Path("m"), tmp_path, CONFIG)
     assert calls == ["scan0", "scan1"]
-    assert [record["scan"]["name"] for record in records] == ["scan0.ply", "scan1.ply", "scan0.ply"]
+    assert [record.scan.name for record in records] == ["scan0.ply", "scan1.ply", "scan0.ply"]
     assert [row["scan"] for row in table(tmp_path)] == ["scan0", "scan1"]
 
 
@@ -290,7 +290,7 @@ def test_resume_takes_nothing_away_that_still_holds(
     (record,) = fit_files(jobs, model, Path("m"), tmp_path, then[0], stages=then[1], resume=True)
     after = {path.name for path in tmp_path.iterdir()}
     assert bool(calls) == refitted and before <= after
-    assert ("scan0.dense.ply" in after) == record["config"]["dense"] == (first[0].dense or then[0].dense)
+    assert ("scan0.dense.ply" in after) == record.config["dense"] == (first[0].dense or then[0].dense)
     assert ("scan0.stages.npz" in after) == (first[1] or then[1])
     # Of another scan it would be wrong.
     scan = tmp_path / "scan0.ply"
@@ -310,7 +310,7 @@ def test_all_states_are_told_when_fits_run_here(model: ShapeModel, scans: list[P
     (record,) = fit_files(
         make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, on_state=lambda s: told.append(s.phase)
     )
-    assert len(told) == len(record["history"])
+    assert len(told) == len(record.history)
 
 
 def test_a_second_run_into_the_same_folder_is_refused(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
@@ -332,7 +332,7 @@ def test_a_surface_of_another_fit_is_not_kept(model: ShapeModel, scans: list[Pat
     (other / "scan0.fitted.ply").replace(tmp_path / "scan0.fitted.ply")
     (record,) = fit_files(make_jobs(scans[:1]), model, Path("m"), tmp_path, CONFIG, resume=True)
     assert (tmp_path / "scan0.fitted.ply").read_bytes() == good
-    assert record["id"].encode() in good[:300]
+    assert record.id.encode() in good[:300]
 
 
 def test_a_folder_that_goes_away_is_one_sentence(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:

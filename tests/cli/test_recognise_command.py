@@ -15,6 +15,7 @@ from shapespace.errors import InputError
 from shapespace.io.tables import write_rows
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord
 
 pytest.importorskip("sklearn", reason="the extra `recognise` is not installed")
 
@@ -41,8 +42,9 @@ def make_results(folder: Path, people: int, seed: int, model_hash: str = HASH) -
                 "T_scan_model": {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0] * 3},
                 "mm_per_scan_unit": 1.0, "distances_mm": {"final": final},
             }  # fmt: skip
-            write_record(folder / f"{fit}.fit.json", record)
-            rows.append(coefficient_row(fit, record))
+            typed = FitRecord.from_json(record, fit)
+            write_record(folder / f"{fit}.fit.json", typed)
+            rows.append(coefficient_row(fit, typed))
             labels.append((f"{fit}.ply", f"p{person}", name))
     write_coefficients(folder / "coefficients.csv", rows, 4)
     write_rows(folder / "labels.csv", ("file", "subject", "expression"), labels)

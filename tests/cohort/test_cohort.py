@@ -233,9 +233,9 @@ def test_a_folder_of_fits_is_a_cohort_without_doubtful_and_failed_ones(fits: Pat
     with_doubtful = read_cohort(fits, CohortOptions(doubtful=True))
     assert len(with_doubtful) == 9 and "doubtful" not in " ".join(with_doubtful.notes)
     for k, name in enumerate(cohort.names):
-        b = np.array(read_record(fits / f"{name}.fit.json")["b"])
+        b = np.array(read_record(fits / f"{name}.fit.json").b)
         assert np.abs(cohort.vertices(k) - model().reconstruct(b)).max() < 1e-10
-        assert cohort.sizes_mm[k] == read_record(fits / f"{name}.fit.json")["centroid_size_mm"]
+        assert cohort.sizes_mm[k] == read_record(fits / f"{name}.fit.json").centroid_size_mm
     form = read_cohort(fits, CohortOptions(gauge="form"))
     assert np.abs([centroid_size(form.vertices(k)) for k in range(7)] - cohort.sizes_mm).max() < 1e-9
 

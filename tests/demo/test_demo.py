@@ -85,7 +85,7 @@ def test_the_saved_files_agree_with_each_other(demo, summary):
     model = ShapeModel.load(demo / first["model"])
     assert model.content_hash == first["model_hash"]
     record = read_record(demo / first["fits"][1]["json"])
-    assert record["model"]["hash"] == model.content_hash
-    assert len(record["b"]) == model.n_modes
+    assert record.model.hash == model.content_hash
+    assert len(record.b) == model.n_modes
     with np.load(demo / first["fits"][1]["stages"], allow_pickle=False) as stages:
         assert stages["final"].shape == (model.n_vertices, 3)

@@ -540,7 +540,7 @@ def test_the_reference_lists_every_key_of_a_fit_record() -> None:
         fit_scan(model, raw_scan(0.5 * model.stddev / model.stddev).scan), Source("a", ""), Source("b", "")
     )
     written = [key for row in rows(ROOT / "docs" / "cli.md", "NAME.fit.json") for key in code_in(row[0])]
-    assert sorted(written) == sorted(record)
+    assert sorted(written) == sorted(record.to_json())
 
 
 def test_the_reference_lists_every_column_of_the_table(tmp_path: Path) -> None:

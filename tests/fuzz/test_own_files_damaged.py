@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from own_file_fuzz import VALUES, damaged_bytes, damaged_json, fuzzed
 from shapespace.batch.results import (
@@ -45,7 +46,6 @@ from shapespace.schemas import (
     CorrespondenceRecord,
     CorrespondRecord,
     Demo,
-    FitRecord,
     Quality,
     Recognition,
     json_text,
@@ -81,7 +81,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record = fit_record(result, *source)
     write_record(home / "one.fit.json", record)
     write_stages(home / "one.stages.npz", result, model)
-    rows = [coefficient_row(f"scan{k}", record | {"b": [0.1 * k] * 5, "z": [-0.2 * k] * 5}) for k in range(4)]
+    rows = [coefficient_row(f"scan{k}", structs.replace(record, b=(0.1 * k,) * 5, z=(-0.2 * k,) * 5)) for k in range(4)]
     failed = coefficient_row("bad, very", failed_record(*source, 'It has no "points",\nso scan again.', {}))
     write_coefficients(home / "coefficients.csv", [*rows, failed], 5)
     return home
@@ -142,7 +142,7 @@ def as_record(path: Path) -> None:
     for reader in (
         lambda: from_record("one", read_record(path)),
         lambda: Folder(path.parent).json(path.name),
-        lambda: json_text(FitRecord.from_json(read_record(path), "one")),
+        lambda: read_record(path).to_json(),
     ):
         with soon():
             try:

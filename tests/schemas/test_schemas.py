@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from shapespace import schemas
 from shapespace.batch.results import Source, fit_record, read_record, write_record
@@ -19,7 +20,7 @@ from synthetic_shapes import blob_model, raw_scan
 def record() -> dict[str, Any]:
     model = blob_model(300, 4)
     result = fit_scan(model, raw_scan(np.zeros(5), seed=1, vertices=500).scan, FitConfig(max_iterations=3))
-    return schemas.to_json(fit_record(result, Source("a.ply", "ab", "../a.ply"), Source("m.h5", "cd")))
+    return fit_record(result, Source("a.ply", "ab", "../a.ply"), Source("m.h5", "cd")).to_json()
 
 
 def test_a_record_that_was_written_comes_back_as_it_was(record: dict[str, Any]) -> None:
@@ -61,12 +62,12 @@ def test_what_is_wrong_with_a_record_is_said_in_one_sentence(
 
 
 def test_no_record_is_written_that_could_not_be_read(record: dict[str, Any], tmp_path: Any) -> None:
-    path = tmp_path / "a.fit.json"
+    path, typed = tmp_path / "a.fit.json", FitRecord.from_json(record, "a.fit.json")
     with pytest.raises(FileFormatError, match="at b"):
-        write_record(path, {**record, "b": "none"})
+        write_record(path, structs.replace(typed, b="none"))
     assert not path.exists()
-    write_record(path, {**record, "mm_per_scan_unit": math.nan})
-    assert read_record(path)["mm_per_scan_unit"] is None
+    write_record(path, structs.replace(typed, mm_per_scan_unit=math.nan))
+    assert read_record(path).mm_per_scan_unit is None
 
 
 def test_the_parts_of_a_study_are_known_by_their_kind() -> None:

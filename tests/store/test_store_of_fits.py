@@ -21,6 +21,7 @@ from shapespace.commands.export import export
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.meshes import read_mesh
 from shapespace.io.ply import ply_comment, write_ply
+from shapespace.schemas import FitRecord
 from shapespace.store import manifest as manifests
 from shapespace.store.manifest import read_manifest
 from shapespace.store.results import Results, mesh_at
@@ -143,9 +144,11 @@ def test_pandas_reads_the_tables_as_they_stand(store: Path, singles: Path) -> No
     frame = pandas.read_parquet(store / "table").set_index("scan").sort_index()
     record = read_record(singles / "scan002.fit.json")
     assert list(frame.index) == Results(singles).names()
-    assert frame.loc["scan002", "z3"] == record["z"][2]
-    assert frame.loc["scan002", "expected_error_mm"] == record["evidence"]["expected_error_mm"]
-    assert json.loads(frame.loc["scan002", "record"]) == record
+    assert frame.loc["scan002", "z3"] == record.z[2]
+    assert frame.loc["scan002", "expected_error_mm"] == record.evidence["expected_error_mm"]
+    text = frame.loc["scan002", "record"]
+    assert text == (singles / "scan002.fit.json").read_text()
+    assert FitRecord.from_json(json.loads(text), "scan002") == record
     assert frame["status"].value_counts().to_dict() == dict(Results(singles).counts())
 
 

@@ -11,6 +11,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from shapespace.batch.folder import RECORD
 from shapespace.batch.results import (
     Source,
@@ -33,6 +35,7 @@ from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
 from shapespace.io.meshes import read_mesh
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import File, FitRecord, to_json
 from shapespace.store.results import wrote_landmarks
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -98,7 +101,7 @@ def fit_file(
     *,
     stages: bool = False,
     on_state: Callable[[IcpState], None] | None = None,
-) -> dict[str, Any]:
+) -> FitRecord:
     """Fit one scan from its file, write its results into `folder`, and return its record.
 
     A scan that cannot be fitted gives a record with status `failed`. Stopped at any moment, the record that is there
@@ -129,7 +132,7 @@ def fit_file(
     return record
 
 
-def publish(result: FitResult, record: Mapping[str, Any], name: str, folder: Path, *, stages: bool) -> None:
+def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, stages: bool) -> None:
     """Write the record and the surfaces of a fit together, and remove what an earlier one of that name left.
 
     Raises:
@@ -138,18 +141,17 @@ def publish(result: FitResult, record: Mapping[str, Any], name: str, folder: Pat
     files, dense = _Files.of(name, folder), "dense" in result.stages
     writes: dict[Path, Callable[[Path], None]] = {}
     for surface, stage in ((files.fitted, "final"), *([(files.dense, "dense")] if dense else [])):
-        writes[surface] = partial(
-            write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record["id"]
-        )
+        writes[surface] = partial(write_fitted_mesh, result=result, model=result.model, stage=stage, identity=record.id)
     if stages:
         writes[files.stages] = partial(write_stages, result=result, model=result.model)
-    texts = fiducial_texts(record["found_landmarks"]) if "found_landmarks" in record else {}
+    landmarks: Mapping[str, Any] = to_json(record.found_landmarks)
+    texts = fiducial_texts(landmarks) if landmarks else {}
     writes |= {files.landmarks[ending]: partial(write_text, text=text) for ending, text in texts.items()}
     writes[files.record] = partial(write_record, record=record)
     write_together(writes, files.stale(dense=not dense, stages=not stages, landmarks=not texts))
 
 
-def _write_failed(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
+def _write_failed(record: FitRecord, job: Job, folder: Path) -> FitRecord:
     files = _Files.of(job.name, folder)
     # An earlier run's surface would contradict the record.
     stale = [files.fitted, *files.stale(dense=True, stages=True, landmarks=True)]
@@ -220,7 +222,7 @@ class FitWork:
     run: str
     on_state: Callable[[IcpState], None] | None = None
 
-    def do(self, task: FitTask) -> dict[str, Any]:
+    def do(self, task: FitTask) -> FitRecord:
         """Return the record of the fit of one scan, done now, or before a worker was lost.
 
         Raises:
@@ -235,7 +237,7 @@ class FitWork:
             stages=task.stages, on_state=self.on_state,
         )  # fmt: skip
 
-    def give_up(self, task: FitTask, reason: str) -> dict[str, Any]:
+    def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
         model = Source.at(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
@@ -244,7 +246,7 @@ class FitWork:
                 scan = Source.hashed(task.job.scan, self.folder)
         told = f"{task.job.called}: {reason}."
         record = failed_record(scan, model, told, task.config.as_dict(), task.job.metadata)
-        return _write_failed(record | {"given_up": self.run}, task.job, self.folder)
+        return _write_failed(structs.replace(record, given_up=self.run), task.job, self.folder)
 
     @staticmethod
     def of(
@@ -279,7 +281,7 @@ def has_surface(job: Job, folder: Path) -> bool:
     return files.fitted.is_file() and files.record.is_file()
 
 
-def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tuple[FitTask, dict[str, Any] | None]:
+def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tuple[FitTask, FitRecord | None]:
     """Return what is left to do, and the record of an earlier fit if it holds what is asked for, or more.
 
     A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
@@ -292,29 +294,29 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
         record = read_record(files.record)
         if not _is_of(record, task, model_hash, folder):
             return task, None
-        if run and record.get("given_up") == run:
+        if run and record.given_up == run:
             return task, record
-        dense = bool(record["config"]["dense"]) and is_surface_of(files.dense, record)
+        dense = bool(record.config["dense"]) and is_surface_of(files.dense, record)
         staged = files.stages.is_file()
         enough = is_surface_of(files.fitted, record) and dense >= task.config.dense and staged >= task.stages
-        whole = len(record.get("b", ())) == len(record.get("z", ())) == len(record.get("b_stddev", ()))
+        whole = len(record.b) == len(record.z) == len(record.b_stddev)
     except (ShapespaceError, KeyError, TypeError, AttributeError, ValueError):
         return task, None
-    if enough and whole and record["status"] != "failed":
+    if enough and whole and record.is_fitted:
         return task, record
     also = replace(task.config, dense=task.config.dense or dense)
     return replace(task, config=also, stages=task.stages or staged), None
 
 
-def _is_of(record: Mapping[str, Any], task: FitTask, model_hash: str, folder: Path) -> bool:
+def _is_of(record: FitRecord, task: FitTask, model_hash: str, folder: Path) -> bool:
     """Return whether `record` is of the same scan, model, start and settings, with a dense surface or without."""
     job, settings = task.job, _asked(task.config)
-    marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).as_dict() if job.landmarks else None
+    marks = Source(job.landmarks.name, sha256_of_file(job.landmarks)).to_file() if job.landmarks else None
     return bool(
-        record["model"]["hash"] == model_hash
-        and record.get("landmarks") == marks
-        and all(record["config"].get(key) == settings.get(key) for key in {*settings, *OPTIONS})
-        and is_same_scan(record["scan"], job, folder)
+        record.model.hash == model_hash
+        and record.landmarks == marks
+        and all(record.config.get(key) == settings.get(key) for key in {*settings, *OPTIONS})
+        and is_same_scan(record.scan, job, folder)
     )
 
 
@@ -326,13 +328,13 @@ def _asked(config: FitConfig) -> dict[str, Any]:
     return settings | {"version": __version__}
 
 
-def is_same_scan(told: Mapping[str, Any], job: Job, folder: Path) -> bool:
+def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
     """Return whether the scan of `job` is the one that a result in `folder` was made of.
 
     By place, size and time of change if they agree, else by its content; at an address by what is said of its version.
 
     Args:
-        told: of the scan, as in the record of the result.
+        recorded: the scan in the record of the result.
         job: the scan.
         folder: of the result.
 
@@ -340,10 +342,10 @@ def is_same_scan(told: Mapping[str, Any], job: Job, folder: Path) -> bool:
         FileError: it cannot be read or reached.
     """
     if job.address:
-        return bool(told.get("path") == job.address and told.get("remote_version") == version_of(job.address))
+        return recorded.path == job.address and recorded.remote_version == version_of(job.address)
     with contextlib.suppress(OSError):
         there = job.scan.stat()
         now = (there.st_size, there.st_mtime_ns, Source.at(job.scan, "", folder).path)
-        if (told.get("size_bytes"), told.get("modified_ns"), told.get("path")) == now:
+        if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
-    return bool(told["hash"] == sha256_of_file(job.scan))
+    return recorded.hash == sha256_of_file(job.scan)

@@ -18,7 +18,7 @@ from shapespace.errors import FileError, ShapespaceError
 from shapespace.io.files import sha256_of_file
 from shapespace.io.json_files import LARGEST_BYTES, check_file
 from shapespace.io.meshes import stem_of
-from shapespace.schemas import FIT_AGAIN, File
+from shapespace.schemas import FIT_AGAIN, File, FitRecord
 from shapespace.store.results import results_at
 
 COEFFICIENTS = "coefficients.csv"
@@ -27,7 +27,7 @@ _LONGEST_NAME = 200
 _OF_SCANS = ("scan", "scan_name", "path", "scan_hash")
 
 
-def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str, dict[str, Any]]]:
+def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str, FitRecord]]:
     """Yield NAME and record of each NAME.fit.json directly in `folder` that can be read, in order of the names."""
     for file in sorted(folder.glob(f"*{RECORD}")):
         if file.name.removesuffix(RECORD) in without:
@@ -183,10 +183,10 @@ class CoefficientTable:
         for name, record in records_in(folder, without=of_this_run):
             self._add_earlier(name, record)
 
-    def add(self, name: str, record: Mapping[str, Any]) -> None:
+    def add(self, name: str, record: FitRecord) -> None:
         """Put in the row of a record, in place of an earlier one of that name."""
         self._rows[name] = coefficient_row(name, record)
-        self._n_modes = max(self._n_modes, len(record.get("b", ())))
+        self._n_modes = max(self._n_modes, len(record.b))
 
     def catch_up(self, names: Sequence[str]) -> None:
         """Put in the records of `names` that are there: of earlier runs, or written by workers that were stopped."""
@@ -204,8 +204,8 @@ class CoefficientTable:
         rows = [*others, *(self._rows[name] for name in self._names if name in self._rows)]
         write_coefficients(self._folder / COEFFICIENTS, rows, self._n_modes)
 
-    def _add_earlier(self, name: str, record: Mapping[str, Any]) -> None:
+    def _add_earlier(self, name: str, record: FitRecord) -> None:
         try:
             self.add(name, record)
-        except (KeyError, TypeError, AttributeError, ValueError):
+        except ValueError:
             self._rows.pop(name, None)  # damaged; a report names it

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job, is_same_scan
@@ -19,6 +18,7 @@ from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
 from shapespace.io.files import make_folder, sha256_of_file
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import File, FitRecord
 from shapespace.store.results import Results
 
 FROM = 10_000
@@ -32,18 +32,16 @@ _SCAN = {
     "modified_ns": "scan_modified_ns",
     "remote_version": "scan_version",
 }
-"""What a record tells of its scan, by the column of a store that has it."""
+"""Fields of the scan in a record, with the columns of a store that hold them."""
 _COLUMNS = ("scan", "id", "status", "stages", *_SCAN.values())
 
 
 @dataclass(frozen=True)
 class _Stored:
-    """What a store has of one fit; `scan` is as in its record."""
+    """Columns of one fit in a store, as the part of its record that they hold."""
 
-    identity: str
-    status: str
+    record: FitRecord
     stages: bool
-    scan: Mapping[str, Any]
 
 
 def fit_into_store(
@@ -58,7 +56,7 @@ def fit_into_store(
     stages: bool = False,
     first: Collection[str] = (),
     on_plan: Callable[[Plan], None] | None = None,
-    on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
+    on_done: Callable[[Job, FitRecord], None] | None = None,
 ) -> Counter[str]:
     """Fit all `jobs` into the store in `folder`, which is made if absent; return how many have which status.
 
@@ -75,7 +73,7 @@ def fit_into_store(
         stages: also keep the surfaces at each stage.
         first: names of jobs that are done before the others.
         on_plan: called once with what is to be done.
-        on_done: called with each job and its record; of one that was kept only its status and reason.
+        on_done: called with each job and its record; the record of a valid result in the store has no `reason`.
 
     Raises:
         FileError: the results cannot be written, or another run writes into the folder.
@@ -93,11 +91,11 @@ def fit_into_store(
         for job in {job.name: job for job in jobs}.values():
             there = stored.get(job.name)
             if there is not None and _holds(there, job, model, config, folder, stages=stages):
-                counts[there.status] += 1
+                counts[there.record.status] += 1
                 if on_done is not None:
-                    on_done(job, {"status": there.status, "reason": "kept"})
+                    on_done(job, there.record)
                 continue
-            before += there is not None and there.status != "failed"
+            before += there is not None and there.record.is_fitted
             tasks.append(FitTask(job, config, stages, resume=not again))
         del stored
         tasks.sort(key=lambda task: task.job.name not in first)
@@ -108,7 +106,7 @@ def fit_into_store(
         try:
             with closing((executor or Serial()).run(work, tasks)) as ended:
                 for task, record in ended:
-                    counts[record["status"]] += 1
+                    counts[record.status] += 1
                     finished.append(task.job.name)
                     if on_done is not None:
                         on_done(task.job, record)
@@ -123,17 +121,18 @@ def fit_into_store(
 def _stored(folder: Path) -> Iterator[tuple[str, _Stored]]:
     for rows in Results(folder).iter_rows(_COLUMNS):
         for name, identity, status, stages, *scan in zip(*(rows[column] for column in _COLUMNS), strict=True):
-            yield name, _Stored(identity or "", status, bool(stages), dict(zip(_SCAN, scan, strict=True)))
+            known = {key: value for key, value in zip(_SCAN, scan, strict=True) if value is not None}
+            yield name, _Stored(FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
 
 
 def _holds(there: _Stored, job: Job, model: ShapeModel, config: FitConfig, folder: Path, *, stages: bool) -> bool:
     """Return whether a stored fit is what is asked for, or more: a dense surface, or stages."""
-    if there.status == "failed" or not there.identity or (stages and not there.stages):
+    if not there.record.is_fitted or not there.record.id or (stages and not there.stages):
         return False
     asked = [config] if config.dense else [config, replace(config, dense=True)]
     try:
         marks = sha256_of_file(job.landmarks) if job.landmarks else ""
-        identities = {fit_identity(there.scan["hash"] or "", model.content_hash, one.as_dict(), marks) for one in asked}
-        return there.identity in identities and is_same_scan(there.scan, job, folder)
+        identities = {fit_identity(there.record.scan.hash, model.content_hash, one.as_dict(), marks) for one in asked}
+        return there.record.id in identities and is_same_scan(there.record.scan, job, folder)
     except FileError:
         return False  # the fit says why

@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+from msgspec import structs
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, resumed
@@ -18,6 +19,7 @@ from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord
 
 _SAVE_EVERY_S = 5.0
 _SAVES_APART = 20.0
@@ -75,9 +77,9 @@ def fit_files(
     stages: bool = False,
     first: Collection[str] = (),
     on_plan: Callable[[Plan], None] | None = None,
-    on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
+    on_done: Callable[[Job, FitRecord], None] | None = None,
     on_state: Callable[[IcpState], None] | None = None,
-) -> list[dict[str, Any]]:
+) -> list[FitRecord]:
     """Fit all `jobs` and keep coefficients.csv in `folder` current, also when interrupted; return the records.
 
     The table holds all records in the folder: those of earlier runs too, as long as they are there. No other run may
@@ -115,7 +117,7 @@ def fit_files(
                 try:
                     kept.add(job, _with_metadata(earlier, job, folder))
                     continue
-                except (KeyError, TypeError, AttributeError, ValueError):  # damaged
+                except ValueError:  # damaged
                     task = FitTask(job, config, stages, resume=False)
             tasks.append(task)
         tasks.sort(key=lambda task: task.job.name not in first)
@@ -133,10 +135,10 @@ def fit_files(
     return [kept.records[job.name] for job in jobs]
 
 
-def _with_metadata(record: dict[str, Any], job: Job, folder: Path) -> dict[str, Any]:
-    if not job.metadata or record.get("metadata") == job.metadata:
+def _with_metadata(record: FitRecord, job: Job, folder: Path) -> FitRecord:
+    if not job.metadata or record.metadata == job.metadata:
         return record
-    record = record | {"metadata": dict(job.metadata)}
+    record = structs.replace(record, metadata=dict(job.metadata))
     write_record(folder / f"{job.name}{RECORD}", record)
     return record
 
@@ -144,13 +146,13 @@ def _with_metadata(record: dict[str, Any], job: Job, folder: Path) -> dict[str, 
 class _Kept:
     """The records of jobs that ended, and the table of them, which is saved now and then."""
 
-    def __init__(self, table: CoefficientTable, on_done: Callable[[Job, Mapping[str, Any]], None] | None) -> None:
+    def __init__(self, table: CoefficientTable, on_done: Callable[[Job, FitRecord], None] | None) -> None:
         self.table = table
-        self.records: dict[str, dict[str, Any]] = {}
+        self.records: dict[str, FitRecord] = {}
         self._on_done = on_done
         self._next_save = time.monotonic() + _SAVE_EVERY_S
 
-    def add(self, job: Job, record: dict[str, Any]) -> None:
+    def add(self, job: Job, record: FitRecord) -> None:
         # In this order, so that what an interruption keeps out of the table is caught up with.
         self.table.add(job.name, record)
         self.records[job.name] = record

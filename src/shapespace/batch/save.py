@@ -1,4 +1,4 @@
-"""A fit that was made in Python, written as the command line writes one."""
+"""Write a fit made in Python as the command line does."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from shapespace.io.files import make_folder, sha256_of_file
 from shapespace.store.results import Results
 from shapespace.types import Mesh
 
-_NO_FILE = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
-"""What the names of files cannot hold, on one system or another."""
-_TOLD_APART = 12
+_FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
+"""Characters that file names cannot contain on some systems."""
+_HASH_CHARACTERS = 12
 
 
 def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:
-    """Do what `FitResult.save` says."""
-    if name and (_NO_FILE.search(name) or name in (".", "..")):
+    """Implement `FitResult.save`."""
+    if name and (_FORBIDDEN.search(name) or name in (".", "..")):
         raise InputError(f"{name!r} cannot be the name of files; leave out slashes, colons and the like.")
     make_folder(folder)
     with only_writer(folder):
@@ -63,11 +63,11 @@ def _landmarks(result: FitResult) -> Source | None:
 
 
 def _free_name(scan: Source, folder: Path) -> str:
-    """Return NAME of a scan that is in no file: its own, unless another scan has results of that name."""
-    stem = _NO_FILE.sub("_", Path(scan.name).stem).strip(". ") or "scan"
+    """Return NAME for a scan without a file: its own name, unless another scan has results of that name."""
+    stem = _FORBIDDEN.sub("_", Path(scan.name).stem).strip(". ") or "scan"
     results = Results(folder)
     try:
-        free = stem not in results or results.record(stem)["scan"]["hash"] == scan.content_hash
-    except (ShapespaceError, KeyError):
+        free = stem not in results or results.fit(stem).scan.hash == scan.content_hash
+    except ShapespaceError:
         free = False
-    return stem if free else f"{stem}_{scan.content_hash[:_TOLD_APART]}"
+    return stem if free else f"{stem}_{scan.content_hash[:_HASH_CHARACTERS]}"

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -166,7 +166,7 @@ class Store:
                     found = self._read(name, singles[name])
                 except ShapespaceError as error:
                     out.left[name] = str(error)
-                except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
+                except (ValueError, OverflowError):
                     out.left[name] = f"The record of {name} is damaged; fit the scan again."
                 else:
                     groups.setdefault(found.topology, []).append(found)
@@ -197,9 +197,8 @@ class Store:
             raise ShapespaceError(f"{name[:80]!r} is no name that a store can hold; rename the scan.")
         path = self.folder / f"{name}{ENDING}"
         text = path.read_bytes().decode("utf-8")
-        record = cast(dict[str, Any], json.loads(text))
-        FitRecord.from_json(record, str(path))
-        fitted = record["status"] != "failed"
+        record = FitRecord.from_json(json.loads(text), str(path))
+        fitted = record.is_fitted
         if fitted and "fitted" not in there:
             raise ShapespaceError(f"{path} has no surface beside it; fit the scan again.")
         kinds = tuple(kind for kind in ENDINGS if fitted and kind in there)

@@ -12,7 +12,7 @@ from shapespace.cli.printing import arrow, now, say, short, show, show_json, war
 
 if TYPE_CHECKING:
     from shapespace.batch.execution import ExecutionConfig
-    from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, Quality
+    from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, FitRecord, OverlapDistances, Quality
 
 _BY_SCAN = ("set_aside", "unreadable", "to_be_looked_at")
 _LISTED = 10
@@ -396,8 +396,8 @@ def fit(arguments: argparse.Namespace) -> int:
     )
     every = sum(counts.values())
     if arguments.json:
-        told = [{"name": name, **_without_history(record)} for name, record in records.items()]
-        show_json({"folder": str(arguments.output), "scans": every, **counts, "records": told})
+        contents = [{"name": name, **_without_history(record)} for name, record in records.items()]
+        show_json({"folder": str(arguments.output), "scans": every, **counts, "records": contents})
     elif counts["failed"] < every:
         _print_fits(records, counts, arguments.output)
     if counts["failed"] == every:
@@ -584,8 +584,8 @@ def convert(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _print_fits(records: Mapping[str, Mapping[str, Any]], counts: Mapping[str, int], folder: Path) -> None:
-    fitted = {name: record for name, record in records.items() if record["status"] != "failed"}
+def _print_fits(records: Mapping[str, FitRecord], counts: Mapping[str, int], folder: Path) -> None:
+    fitted = {name: record for name, record in records.items() if record.is_fitted}
     for name, record in list(fitted.items())[:_LISTED]:
         _print_fit(name, record)
     if len(fitted) > _LISTED:
@@ -615,29 +615,30 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
     show(f"next: shapespace build {folder} -o model.h5")
 
 
-def _print_fit(name: str, record: Mapping[str, Any]) -> None:
+def _print_fit(name: str, record: FitRecord) -> None:
     from shapespace.io.meshes import stem_of
 
-    file = str(record["scan"]["name"])
+    file = record.scan.name
     # A scan that shares its file's name with others goes by the name of its results.
     called = file if stem_of(file) == name else f"{name} ({file})"
-    distances = _distances(record, "shown")
-    show(f"{called}: {record['status']}" + (f": {distances}" if distances else ""))
-    if distances := _distances(record, "shown_dense", measure="median"):
+    distances = _distances(record.shown, record.shown_scan_mm)
+    show(f"{called}: {record.status}" + (f": {distances}" if distances else ""))
+    if distances := _distances(record.shown_dense, record.shown_dense_scan_mm, measure="median"):
         show(f"  dense surface: {distances}")
-    for note in record["notes"]:
+    for note in record.notes:
         show(f"  {note}")
 
 
-def _distances(record: Mapping[str, Any], key: str, measure: str = "mean") -> str:
+def _distances(overlap: OverlapDistances | None, in_scan: OverlapDistances | None, measure: str = "mean") -> str:
     """Return the overlap distances in millimetres of the scan as text; empty if the record has none."""
-    overlap, in_scan = record.get(key), record.get(f"{key}_scan_mm")
-    if not overlap or not in_scan:
+    if overlap is None or in_scan is None:
         return ""
-    distances = [in_scan[direction][measure] for direction in ("model_to_scan", "scan_to_model")]
+    distances = [getattr(way, measure) for way in (in_scan.model_to_scan, in_scan.scan_to_model)]
     if any(value is None or not math.isfinite(value) for value in distances):
         return "scan and model do not overlap"
-    shares = [f"{100 * overlap[name]:.0f} % overlap" for name in ("model_seen_share", "scan_covered_share")]
+    shares = [
+        f"{100 * (share or 0.0):.0f} % overlap" for share in (overlap.model_seen_share, overlap.scan_covered_share)
+    ]
     to = arrow()
     return (
         f"{measure} distance model{to}scan {distances[0]:.2f} mm ({shares[0]}), "
@@ -645,5 +646,5 @@ def _distances(record: Mapping[str, Any], key: str, measure: str = "mean") -> st
     )
 
 
-def _without_history(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in record.items() if key != "history"}
+def _without_history(record: FitRecord) -> dict[str, Any]:
+    return {key: value for key, value in record.to_json().items() if key != "history"}

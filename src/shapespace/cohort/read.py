@@ -320,8 +320,8 @@ def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
 
 
 def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:
-    source: dict[str, Any] = results.record(fit.name)["model"]
-    path = given or results.folder / str(source.get("path") or source.get("name", ""))
+    source = results.fit(fit.name).model
+    path = given or results.folder / (source.path or source.name)
     if given is None and not path.is_file():
         raise InputError(f"{results.folder}: the model {path.name} is no longer at {path}; give it with --model.")
     found = load_model(path)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
 from shapespace.recognise.scans import NEUTRAL
+from shapespace.schemas import FitRecord
 from shapespace.store.corresponding import surface_files
 from shapespace.store.results import is_result, mesh_at
 from shapespace.types import MM_PER_UNIT, Mesh, SurfaceLandmarks, common_faces
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 _IDENTITY_VARIANCE, _EXPRESSION_VARIANCE = 0.995, 0.99
 _SURFACES = (".dense.ply", ".fitted.ply")
 _NAMED = 3
-_OF_RECORDS = ("status", "model")
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
 """Beyond this the largest extent of an object is likelier told in another unit."""
 
@@ -349,15 +349,15 @@ class _OnDisk:
 
 def _trusted(
     files: Sequence[Path], notes: list[str], *, with_doubtful: bool
-) -> tuple[list[Path], dict[Path, Mapping[str, Any]]]:
+) -> tuple[list[Path], dict[Path, FitRecord]]:
     """Return `files` without surfaces of doubtful fits, and the records of those that are surfaces of fits."""
-    records: dict[Path, Mapping[str, Any]] = {}
+    records: dict[Path, FitRecord] = {}
     for file in files:
         name = next((file.name.removesuffix(ending) for ending in _SURFACES if file.name.endswith(ending)), None)
         if name is not None and is_result(beside := file.with_name(f"{name}{RECORD}")):
             record = read_record(beside)
-            records[file] = {key: record.get(key) for key in _OF_RECORDS}  # all of each would be large
-    doubtful = [file for file in files if file in records and records[file].get("status") == "doubtful"]
+            records[file] = FitRecord(status=record.status, model=record.model)  # all of each would be large
+    doubtful = [file for file in files if file in records and records[file].status == "doubtful"]
     if not doubtful:
         return list(files), records
     named = ", ".join(file.name for file in doubtful[:_NAMED]) + (", ..." if len(doubtful) > _NAMED else "")
@@ -444,7 +444,7 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
 
 def _landmarks(
     files: Sequence[Path],
-    records: Mapping[Path, Mapping[str, Any]],
+    records: Mapping[Path, FitRecord],
     first: Mesh,
     settings: BuildSettings,
     notes: list[str],
@@ -466,23 +466,22 @@ def _landmarks(
 
 
 def _landmarks_of_parent(
-    files: Sequence[Path], records: Mapping[Path, Mapping[str, Any]], first: Mesh, notes: list[str]
+    files: Sequence[Path], records: Mapping[Path, FitRecord], first: Mesh, notes: list[str]
 ) -> SurfaceLandmarks:
     """Return the landmarks of the one model that fitted all `files`: they are on its vertices, in its order."""
-    sources = [record.get("model") for record in records.values()]
-    if len(records) < len(files) or not all(isinstance(source, dict) for source in sources):
+    models = [record.model for record in records.values()]
+    if len(records) < len(files) or not all(model.hash for model in models):
         return SurfaceLandmarks()
-    known = cast(list[dict[str, Any]], sources)
-    if len({source.get("hash") for source in known}) > 1:
+    if len({model.hash for model in models}) > 1:
         notes.append("The model has no landmarks, since the meshes were fitted by different models; give --landmarks.")
         return SurfaceLandmarks()
-    path = files[0].parent / str(known[0].get("path") or known[0].get("name"))
+    path = files[0].parent / (models[0].path or models[0].name)
     try:
         parent = ShapeModel.load(path)
     except ShapespaceError:
         notes.append(f"The model has no landmarks, since the one that fitted these meshes is no longer at {path}.")
         return SurfaceLandmarks()
-    if parent.content_hash != known[0].get("hash") or parent.n_vertices != len(first.vertices):
+    if parent.content_hash != models[0].hash or parent.n_vertices != len(first.vertices):
         notes.append(f"The model has no landmarks, since {path} is not the model that fitted these meshes.")
         return SurfaceLandmarks()
     if parent.landmarks:

@@ -17,6 +17,7 @@ from shapespace.io.fiducials import fiducial_texts
 from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import CHECKSUM, write_checked
+from shapespace.schemas import to_json
 from shapespace.store.results import ENDING, ENDINGS, Results, modes_of
 from shapespace.store.rows import META, coefficient_columns, kind_of
 
@@ -91,10 +92,9 @@ def _write(results: Results, name: str, output: Path) -> None:
             write_bytes(path, results.stages(name))
         else:
             write_mesh(path, results.surface(name, kind))
-    record = results.record(name)
     # No table of a store has the landmarks in columns; the record has them, and their files are made of it again.
-    if found := record.get("found_landmarks"):
-        for ending, text in fiducial_texts(found).items():
+    if found := results.fit(name).found_landmarks:
+        for ending, text in fiducial_texts(to_json(found)).items():
             write_text(output / f"{name}{ending}", text)
     write_bytes(output / f"{name}{ENDING}", results.record_bytes(name))
 

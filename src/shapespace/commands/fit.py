@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from shapespace.io.files import make_folder, remove_file, write_bytes
 from shapespace.io.meshes import probe_mesh, read_mesh
 from shapespace.io.remote import is_address
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord
 from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
@@ -68,7 +69,7 @@ def fit_scans(
     *,
     quiet: bool,
     say: Callable[[str], None],
-) -> tuple[dict[str, int], dict[str, dict[str, Any]]]:
+) -> tuple[dict[str, int], dict[str, FitRecord]]:
     """Fit scans into `folder`; return how many have which status, and NAME -> record of each, in order.
 
     Of a store there are the counts alone.
@@ -120,7 +121,7 @@ def fit_scans(
         if len(work) > 1:
             watch.say_removed()
     for record in records:
-        counts[record["status"]] += 1
+        counts[record.status] += 1
     return counts, {job.name: record for job, record in zip(work, records, strict=True)}
 
 
@@ -149,16 +150,17 @@ class _Watch:
         for sentence in plan.sentences():
             self.say(sentence)
 
-    def done(self, job: Job, record: Mapping[str, Any]) -> None:
+    def done(self, job: Job, record: FitRecord) -> None:
         self.bar.update()
-        if any(NON_FINITE in note for note in record.get("notes", ())):
+        if any(NON_FINITE in note for note in record.notes):
             self.removed.append(job.name)
-        if record["status"] == "converged" or record["reason"] == "kept":
+        # The record of a valid result in a store has no reason: it was printed when the scan was fitted.
+        if record.status == "converged" or not record.reason:
             return
         self.bar.clear()
         # The reason of a failure names the file already.
-        failed = record["status"] == "failed"
-        self.say(record["reason"] if failed else f"{job.called}: {record['status']}: {record['reason']}")
+        failed = record.status == "failed"
+        self.say(record.reason if failed else f"{job.called}: {record.status}: {record.reason}")
 
 
 def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:

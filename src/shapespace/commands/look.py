@@ -80,7 +80,7 @@ def info(path: Path) -> dict[str, Any]:
         return {"kind": "model", **model_facts(model.shape), "additive": parted}
     if path.name.endswith(".json"):
         record = read_record(path)
-        return {"kind": "fit", **{key: value for key, value in record.items() if key != "history"}}
+        return {"kind": "fit", **{key: value for key, value in record.to_json().items() if key != "history"}}
     mesh = mesh_at(path)
     return {"kind": "mesh", "file": str(path), **asdict(examine(mesh))}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -170,12 +170,11 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
     z: list[FloatArray] = []
     for path in (person, expression):
         record = read_record(path)
-        if record.get("status") == "failed":
+        if not record.is_fitted:
             raise InputError(f"{path} is the record of a fit that failed, so there is nothing to transfer.")
-        source = record.get("model")
-        if not isinstance(source, dict) or cast(dict[str, Any], source).get("hash") != additive.shape.content_hash:
+        if record.model.hash != additive.shape.content_hash:
             raise InputError(f"{path} is a fit by another model than {model.name}; fit the scan with this one.")
-        values = np.asarray(record.get("z", []), dtype=np.float64)
+        values = np.asarray(record.z, dtype=np.float64)
         if values.shape != (additive.shape.n_modes,):
             raise InputError(
                 f"{path} holds {len(values)} coefficients of {additive.shape.n_modes}; fit the scan with all modes."

@@ -16,6 +16,7 @@ from shapespace.io.labels import Label
 from shapespace.io.meshes import stem_of
 from shapespace.io.tables import table_rows
 from shapespace.reprs import short_repr
+from shapespace.schemas import FitRecord
 from shapespace.store.results import Results, modes_of
 from shapespace.types import FloatArray, read_only
 
@@ -59,20 +60,16 @@ class ScanCoefficients:
         return self.z is not None and self.status in ("converged", "max_iterations")
 
 
-def from_record(name: str, record: Mapping[str, Any]) -> ScanCoefficients:
-    """Return the scan that a NAME.fit.json tells of.
+def from_record(name: str, record: FitRecord) -> ScanCoefficients:
+    """Return the scan of a NAME.fit.json.
 
     Raises:
         FileFormatError: the record lacks what recognition needs, or it is damaged.
     """
-    try:
-        status = str(record["status"])
-        z = None if status == "failed" else read_only(np.asarray(record["z"], dtype=np.float64))
-        scan = ScanCoefficients(
-            name, status, str(record["reason"]), z, str(record["model"]["hash"]), file=str(record["scan"]["name"])
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.") from error
+    if record.status != "failed" and not record.z:
+        raise FileFormatError(f"The record of {name} is damaged or not whole; fit the scan again.")
+    z = None if record.status == "failed" else read_only(np.asarray(record.z, dtype=np.float64))
+    scan = ScanCoefficients(name, record.status, record.reason, z, record.model.hash, file=record.scan.name)
     return _checked(scan, f"The record of {name}")
 
 

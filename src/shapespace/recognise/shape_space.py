@@ -17,10 +17,11 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.learn import BaseEstimator, TransformerMixin, check_is_fitted
 from shapespace.recognise.scans import from_record
+from shapespace.schemas import FIT_AGAIN, FitRecord, read
 from shapespace.types import FloatArray, IntArray, Mesh
 
-Surface: TypeAlias = Mesh | FitResult | Mapping[str, Any]
-"""A mesh, the outcome of a fit, or the record of one as NAME.fit.json holds it."""
+Surface: TypeAlias = Mesh | FitResult | FitRecord | Mapping[str, Any]
+"""A mesh, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
@@ -127,9 +128,13 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         if isinstance(surface, FitResult):
             self._refuse_other_model(surface.model_hash, surface.scan_name)
             return self._of_fit(surface)
-        if not isinstance(surface, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+        if not isinstance(surface, FitRecord | Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise InputError(f"Number {number} is neither a mesh nor a fit, but {type(surface).__name__}.")
-        scan = from_record(f"number {number}", surface)
+        name = f"number {number}"
+        record = (
+            surface if isinstance(surface, FitRecord) else read(FitRecord, surface, f"The record of {name}", FIT_AGAIN)
+        )
+        scan = from_record(name, record)
         self._refuse_other_model(scan.model_hash, scan.file)
         if scan.z is None:
             return np.full(model.n_modes, np.nan)

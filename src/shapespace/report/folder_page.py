@@ -59,7 +59,6 @@ MOST_ROWS = 2000
 MOST_CURVES = 100
 _MOST_NAMED = 12
 _MOST_WORST = 3
-_VERDICT = "Do not trust this fit: "
 _FEWEST_LEVELS = 2
 _RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
 
@@ -226,7 +225,7 @@ class FolderPage:
         places = self._details | self._cards
         items: list[str | Item] = [
             Item(
-                f"{STATUS_WORDS[fit.status]}. {_without_verdict(fit.reason)}",
+                f"{STATUS_WORDS[fit.status]}. {_all_reasons(fit)}",
                 Cell(fit.name, place=places.get(fit.name)),
             )
             for fit in bad[:_MOST_NAMED]
@@ -501,18 +500,21 @@ def _of_scan(error: ScanNotFoundError) -> str:
     return f"{str(error).removesuffix('.')}; the fitted surface is shown alone."
 
 
-def _without_verdict(reason: str) -> str:
-    """Return a reason without the words that its status says already."""
-    rest = reason.removeprefix(_VERDICT)
-    return rest if rest == reason else rest[:1].upper() + rest[1:]
+def _all_reasons(fit: SavedFit) -> str:
+    """Return the reasons of a fit without its status; the whole reason if the record has no codes."""
+    return _sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
 
 
 def _first_reason(fit: SavedFit) -> str:
-    """Return the first of the reasons of a fit, and how many there are beside it."""
-    if not fit.reason.startswith(_VERDICT):
+    """Return the first of the reasons of a fit, and the number of the others."""
+    if not fit.reason_texts:
         return fit.reason
-    first, *others = _without_verdict(fit.reason).split("; ")
-    return f"{first.removesuffix('.')}, and {counted(len(others), 'more reason')}." if others else first
+    first, *others = fit.reason_texts
+    return _sentence(f"{first}, and {counted(len(others), 'more reason')}" if others else first)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].removesuffix('.')}."
 
 
 def _median(values: Sequence[float]) -> float:

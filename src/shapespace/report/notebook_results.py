@@ -85,8 +85,8 @@ def html_of_results(results: Results) -> str:
     cells: list[list[str]] = []
     for name in results.names()[:MOST_ROWS]:
         try:
-            record = results.record(name)
-            cells.append([name, str(record.get("status", "")), str(record.get("reason", ""))])
+            record = results.fit(name)
+            cells.append([name, record.status, record.reason])
         except ShapespaceError as error:
             cells.append([name, "unreadable", str(error)])
     blocks = _table(["fit", "status", "reason"], cells, "The first fits", len(results))

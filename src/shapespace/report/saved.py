@@ -15,6 +15,7 @@ import numpy.typing as npt
 from msgspec import structs
 
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
+from shapespace.fit.reason_text import text_of
 from shapespace.geometry.doctor import repair
 from shapespace.io.files import sha256_of_file
 from shapespace.io.meshes import read_mesh
@@ -142,9 +143,17 @@ class SavedFit:
         return self.record.reason
 
     @property
+    def reason_texts(self) -> tuple[str, ...]:
+        """Texts of the reasons, the most serious first; empty where their codes are absent or of another version."""
+        try:
+            return tuple(text_of(reason.code, reason.data) for reason in self.record.reasons)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            return ()
+
+    @property
     def fitted(self) -> bool:
-        """Whether there is a result, be it a doubtful one."""
-        return self.status not in ("failed", "unreadable")
+        """Whether there is a result, doubtful or not."""
+        return self.record.is_fitted
 
     @property
     def pictured(self) -> bool:

@@ -233,17 +233,26 @@ class Results:
         return self._store_of(name).record_text(name).encode("utf-8", "surrogatepass")
 
     def record(self, name: str) -> dict[str, Any]:
-        """Return the record of a fit, checked.
+        """Return the content of the record of a fit, checked; `fit` returns it typed.
 
         Raises:
             FileError: it cannot be read.
             FileFormatError: it is damaged.
             InputError: there is no such fit.
         """
-        path = self.folder / f"{name}{ENDING}"
-        record: object = json_of(self.record_bytes(name), path, FIT_AGAIN)
-        FitRecord.from_json(record, str(path))
-        return cast(dict[str, Any], record)
+        content = self._content(name)
+        self._checked(name, content)
+        return cast(dict[str, Any], content)
+
+    def fit(self, name: str) -> FitRecord:
+        """Return the record of a fit; errors as of `record`."""
+        return self._checked(name, self._content(name))
+
+    def _content(self, name: str) -> object:
+        return json_of(self.record_bytes(name), self.folder / f"{name}{ENDING}", FIT_AGAIN)
+
+    def _checked(self, name: str, content: object) -> FitRecord:
+        return FitRecord.from_json(content, str(self.folder / f"{name}{ENDING}"))
 
     def surface(self, name: str, kind: str = "fitted") -> Mesh:
         """Return the `fitted` or `dense` surface of a fit, in the frame and unit of its scan.
@@ -372,11 +381,10 @@ class Results:
 
     def _row(self, name: str) -> dict[str, Any] | None:
         try:
-            record = self.record(name)
-            return store_row(name, record) | {kind: kind in self.singles[name] for kind in FLAGS}
+            return store_row(name, self.fit(name)) | {kind: kind in self.singles[name] for kind in FLAGS}
         except ShapespaceError as error:
             told = str(error)
-        except (KeyError, TypeError, AttributeError, ValueError):
+        except (ValueError, OverflowError):
             told = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
         self._tell(told)
         return None

@@ -1,13 +1,14 @@
-"""Fits as rows: what coefficients.csv holds of each, and what the tables of a store hold beside it."""
+"""Fits as rows of coefficients.csv and of the tables of a store."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from shapespace.io.tables import CHECKSUM
+from shapespace.schemas import Distances, FitRecord, Pose
 
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -15,7 +16,7 @@ _SHARES = ("model_seen_share", "scan_covered_share")
 _EXPECTED = ("expected_error_mm", "beyond_model_mm")
 _AXES = "xyz"
 _SIZES = ("centroid_size_mm", "length_mm", "width_mm", "depth_mm", "area_mm2")
-_TOLD_OF_FITS = (
+_LAST_COLUMNS = (
     *(f"shown_{direction}_{measure}_mm" for direction in _DIRECTIONS for measure in ("mean", "median")),
     *_SHARES,
     *(f"shown_{direction}_mean_scan_mm" for direction in _DIRECTIONS),
@@ -55,37 +56,47 @@ COUNTS = (
 """Columns of whole numbers."""
 
 
-def coefficient_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers."""
-    row: dict[str, Any] = {"scan": name, "status": record["status"], "reason": record["reason"]}
-    row |= {"model_hash": record["model"]["hash"], "path": record["scan"].get("path", "")}
-    known = cast(Mapping[str, Any], record.get("metadata") or {})
-    row |= {f"{META}{key}": "" if value is None else str(value) for key, value in known.items()}
-    if "b" not in record:
+def coefficient_row(name: str, record: FitRecord) -> dict[str, Any]:
+    """Return the row of coefficients.csv for `record`; a failed scan has its reason and path, and no numbers.
+
+    Raises:
+        ValueError: a record of a fit lacks its model, pose, distances or some of its coefficients.
+    """
+    if not record.model.hash:
+        raise ValueError(f"The record of {name} does not name its model.")
+    row: dict[str, Any] = {"scan": name, "status": record.status, "reason": record.reason}
+    row |= {"model_hash": record.model.hash, "path": record.scan.path}
+    row |= {f"{META}{key}": "" if value is None else str(value) for key, value in record.metadata.items()}
+    if not record.b:
         return row
-    for letter in ("b", "z"):
-        row |= {f"{letter}{k}": value for k, value in enumerate(record[letter], 1)}
-    final = record["distances_mm"]["final"]
+    if record.T_scan_model is None or "final" not in record.distances_mm:
+        raise ValueError(f"The record of {name} has coefficients without a pose or without distances.")
+    if not len(record.b) == len(record.z) == len(record.b_stddev):
+        raise ValueError(f"The record of {name} does not have the same number of b, z and b_stddev.")
+    for letter, values in (("b", record.b), ("z", record.z)):
+        row |= {f"{letter}{k}": value for k, value in enumerate(values, 1)}
+    final = record.distances_mm["final"]
     for direction in _DIRECTIONS:
-        row |= {_distance_column(direction, measure): final[direction][measure] for measure in _DISTANCE_COLUMNS}
-    row |= {key: record[key] for key in ("mm_per_scan_unit", "size_mm") if key in record}
-    row |= {key: value for key, value in record.get("evidence", {}).items() if key in _EXPECTED}
+        summary: Distances = getattr(final, direction)
+        row |= {_distance_column(direction, measure): getattr(summary, measure) for measure in _DISTANCE_COLUMNS}
+    row |= {"mm_per_scan_unit": record.mm_per_scan_unit, "size_mm": record.size_mm}
+    row |= {key: value for key, value in record.evidence.items() if key in _EXPECTED}
     row |= _size_cells(record) | _moved_cells(record)
-    row |= {f"b{k}_stddev": value for k, value in enumerate(record["b_stddev"], 1)}
-    return row | _pose_cells(record["T_scan_model"]) | _shown_cells(record)
+    row |= {f"b{k}_stddev": value for k, value in enumerate(record.b_stddev, 1)}
+    return row | _pose_cells(record.T_scan_model) | _overlap_cells(record)
 
 
-def _size_cells(record: Mapping[str, Any]) -> dict[str, Any]:
-    extents = record.get("extents_mm") or (None, None, None)
-    told = record.get("centroid_size_mm"), *extents, record.get("area_mm2")
-    return {key: value for key, value in zip(_SIZES, told, strict=True) if value is not None}
+def _size_cells(record: FitRecord) -> dict[str, Any]:
+    extents_mm = record.extents_mm or (None, None, None)
+    sizes = record.centroid_size_mm, *extents_mm, record.area_mm2
+    return {key: value for key, value in zip(_SIZES, sizes, strict=True) if value is not None}
 
 
-def _moved_cells(record: Mapping[str, Any]) -> dict[str, float]:
+def _moved_cells(record: FitRecord) -> dict[str, float]:
     """Return the RMS by which each mode, and all together, move a vertex from the mean; b is a norm over all."""
-    if not record.get("n_vertices"):
+    if not record.n_vertices:
         return {}
-    moved = np.abs(np.asarray(record["b"], dtype=np.float64)) / np.sqrt(float(record["n_vertices"]))
+    moved = np.abs(np.asarray(record.b, dtype=np.float64)) / np.sqrt(float(record.n_vertices))
     cells = {f"b{k}_rms_mm": float(value) for k, value in enumerate(moved, 1)}
     return cells | {"shape_rms_mm": float(np.linalg.norm(moved))}
 
@@ -94,25 +105,26 @@ def _distance_column(direction: str, measure: str) -> str:
     return f"{direction}_{measure}" + ("" if measure == "count" else "_mm")
 
 
-def _shown_cells(record: Mapping[str, Any]) -> dict[str, Any]:
-    if "shown" not in record:  # of a fit by an earlier version
+def _overlap_cells(record: FitRecord) -> dict[str, Any]:
+    overlap, in_scan = record.shown, record.shown_scan_mm
+    if overlap is None or in_scan is None:  # of a fit by an earlier version
         return {}
-    shown, in_scan = record["shown"], record["shown_scan_mm"]
-    cells = {key: shown[key] for key in _SHARES}
+    cells: dict[str, Any] = {key: getattr(overlap, key) for key in _SHARES}
     for direction in _DIRECTIONS:
-        cells |= {f"shown_{direction}_{measure}_mm": shown[direction][measure] for measure in ("mean", "median")}
-        cells[f"shown_{direction}_mean_scan_mm"] = in_scan[direction]["mean"]
+        summary: Distances = getattr(overlap, direction)
+        cells |= {f"shown_{direction}_{measure}_mm": getattr(summary, measure) for measure in ("mean", "median")}
+        cells[f"shown_{direction}_mean_scan_mm"] = getattr(in_scan, direction).mean
     return cells
 
 
-def _pose_cells(pose: Mapping[str, Any]) -> dict[str, float]:
+def _pose_cells(pose: Pose) -> dict[str, float]:
     """Return scale, rotation vector (its direction the axis, its length the angle in degrees) and translation."""
     from scipy.spatial.transform import Rotation  # a tenth of a second that only those who fit should wait
 
-    turn = Rotation.from_matrix(np.asarray(pose["rotation"], dtype=np.float64)).as_rotvec(degrees=True)
-    cells = {"scale": float(pose["scale"])}
+    turn = Rotation.from_matrix(np.asarray(pose.rotation, dtype=np.float64)).as_rotvec(degrees=True)
+    cells = {"scale": float(pose.scale)}
     cells |= {f"rotation_{axis}_deg": float(angle) for axis, angle in zip(_AXES, turn, strict=True)}
-    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose["translation"], strict=True)}
+    return cells | {f"translation_{axis}": at for axis, at in zip(_AXES, pose.translation, strict=True)}
 
 
 def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
@@ -128,31 +140,28 @@ def coefficient_columns(n_modes: int, known: Sequence[str] = ()) -> list[str]:
         "mm_per_scan_unit",
         *(f"b{k}_stddev" for k in modes),
         *(f"b{k}_rms_mm" for k in modes),
-        *_TOLD_OF_FITS,
+        *_LAST_COLUMNS,
     ]
     return [*columns, *known, CHECKSUM, "model_hash"]
 
 
-def store_row(name: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a store for `record`, without the record itself: flat, its numbers numbers.
+def store_row(name: str, record: FitRecord) -> dict[str, Any]:
+    """Return the row of a store for `record`, without the record itself.
 
     Raises:
-        AttributeError, KeyError, TypeError, ValueError: the record is damaged.
+        ValueError: the record is damaged.
     """
+    scan = record.scan
     row = coefficient_row(name, record)
-    scan, model = cast(Mapping[str, Any], record["scan"]), cast(Mapping[str, Any], record["model"])
-    row |= {"id": str(record.get("id", "")), "scan_name": str(scan.get("name", "")), "scan_hash": scan.get("hash", "")}
-    row |= {"model_name": str(model.get("name", "")), "method": record.get("method"), "version": record.get("version")}
-    row |= {"scan_size_bytes": scan.get("size_bytes"), "scan_modified_ns": scan.get("modified_ns")}
-    row |= {"scan_version": str(scan.get("remote_version", ""))}
-    row |= {"start": record.get("start"), "modes": len(record.get("b", ()))}
-    if "seconds" in record:
-        row["seconds"] = float(sum(record["seconds"].values()))
-        row["iterations"] = int(sum(record["iterations"].values()))
-    evidence = cast(Mapping[str, Any], record.get("evidence", {}))
+    row |= {"id": record.id, "scan_name": scan.name, "scan_hash": scan.hash, "scan_version": scan.remote_version}
+    row |= {"scan_size_bytes": scan.size_bytes, "scan_modified_ns": scan.modified_ns}
+    row |= {"model_name": record.model.name, "method": record.method or None, "version": record.version or None}
+    row |= {"start": record.start, "modes": len(record.b)}
+    if record.seconds:
+        row |= {"seconds": float(sum(record.seconds.values())), "iterations": sum(record.iterations.values())}
     row |= {
         f"{_EVIDENCE}{key}": float(value)
-        for key, value in evidence.items()
+        for key, value in record.evidence.items()
         if isinstance(value, int | float) and key not in _EXPECTED
     }
     return row

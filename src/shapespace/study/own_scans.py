@@ -26,7 +26,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.report.html import require_report_extra, write_report
-from shapespace.schemas import Part, TextPart
+from shapespace.schemas import FitRecord, Part, TextPart
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray
 
@@ -75,7 +75,7 @@ def run_own_study(
     model, additive = (loaded, None) if isinstance(loaded, ShapeModel) else (loaded.shape, loaded)
     with progress(len(found.scans), "fitting", "scan", quiet=quiet) as bar:
 
-        def fitted(job: Job, record: Mapping[str, Any]) -> None:
+        def fitted(job: Job, record: FitRecord) -> None:
             bar.update()
 
         jobs = make_jobs([entry.path for entry in found.scans])
@@ -114,15 +114,15 @@ class OwnFits:
     def of(
         cls,
         scans: Sequence[ScanEntry],
-        records: Sequence[Mapping[str, Any]],
+        records: Sequence[FitRecord],
         model: ShapeModel,
         additive: AdditiveModel | None,
     ) -> OwnFits:
         """Return what the records tell of the scans, in their order."""
         z = np.full((len(scans), model.n_modes), np.nan)
         for row, record in enumerate(records):
-            if record["status"] != "failed":
-                z[row] = np.asarray(record["z"], dtype=np.float64)
+            if record.is_fitted:
+                z[row] = np.asarray(record.z, dtype=np.float64)
         codes: dict[str, FloatArray] = {"all coefficients": z}
         if additive is not None:
             e = np.full((len(z), additive.n_expression), np.nan)
@@ -131,7 +131,7 @@ class OwnFits:
             codes["expression coefficients of the additive model"] = e
         return cls(
             codes,
-            [str(record["status"]) for record in records],
+            [record.status for record in records],
             np.array([entry.expression for entry in scans], dtype=np.str_),
             np.array([entry.subject for entry in scans], dtype=np.str_),
             np.array([entry.intensity for entry in scans], dtype=np.float64),

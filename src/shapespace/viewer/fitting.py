@@ -32,11 +32,11 @@ NAME = "fit"
 LARGEST_SHOWN = 300_000
 """Triangles of a scan that are sent to the page; the fit uses all."""
 _LARGEST_MESSAGE = 2**24
-_TOLD = (
+_SENT = (
     "status", "reason", "shown", "shown_scan_mm", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
     "distances_mm",
 )  # fmt: skip
-"""What the page is told of a record."""
+"""Keys of a record that are sent to the page."""
 _LOOK_EVERY_S = 0.05
 
 DIED = "The fit ended unexpectedly, most likely for lack of memory; thin the scan and try again."
@@ -75,6 +75,8 @@ Message: TypeAlias = Mapping[str, Any]
 def fit_upload(pipe: Connection, upload: Upload) -> None:
     """Fit `upload` and tell of it: the scan, each state of the loop, the verdict; runs in a worker process."""
     _step_back()
+    from msgspec import structs
+
     from shapespace.batch.fit_work import Job, fit_file
     from shapespace.batch.results import write_record
     from shapespace.errors import ShapespaceError
@@ -104,20 +106,24 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
         tell("scan", **_preview(model, upload))
     job, config = Job(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
     record = fit_file(job, model, upload.model, upload.folder, config, stages=True, on_state=on_state)
-    for key, name in (("scan", upload.shown), ("model", upload.model_name)):
-        # Our own names and folders mean nothing to the visitor.
-        record[key] |= {"name": name, "path": ""}
-    record["reason"] = _with_shown_name(str(record["reason"]), upload)
-    record |= {"notes": [_with_shown_name(str(note), upload) for note in record["notes"]]} if "notes" in record else {}
+    # Our own names and folders mean nothing to the visitor.
+    record = structs.replace(
+        record,
+        scan=structs.replace(record.scan, name=upload.shown, path=""),
+        model=structs.replace(record.model, name=upload.model_name, path=""),
+        reason=_with_shown_name(record.reason, upload),
+        notes=tuple(_with_shown_name(note, upload) for note in record.notes),
+    )
     write_record(upload.folder / f"{NAME}.fit.json", record)
     pictured, why = False, ""
-    if record["status"] != "failed":
+    if record.is_fitted:
         try:
             _picture(upload)
             pictured = True
         except ShapespaceError as error:
             why = _with_shown_name(str(error), upload)
-    tell("verdict", pictured=pictured, why_not=why, **{key: record[key] for key in _TOLD if key in record})
+    content = record.to_json()
+    tell("verdict", pictured=pictured, why_not=why, **{key: content[key] for key in _SENT if key in content})
 
 
 def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
