@@ -1,4 +1,4 @@
-"""What the verdict on a fit goes by, in words: the keys of `evidence` in a record, each with what it says."""
+"""The diagnostics of a fit in English: a label and a format for each key of `evidence` in a record."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import MappingProxyType
 from shapespace.report.blocks import Facts
 from shapespace.report.wording import mm, percent, setting, words
 
-_Told = tuple[str, Callable[[float], str]]
+_Entry = tuple[str, Callable[[float], str]]
 
 
 def _size(log_scale: float) -> str:
@@ -20,7 +20,7 @@ def _plain(value: float) -> str:
     return f"{value:.3g}"
 
 
-EVIDENCE: Mapping[str, _Told] = MappingProxyType(
+EVIDENCE: Mapping[str, _Entry] = MappingProxyType(
     {
         "expected_error_mm": ("Expected distance of a vertex from its true place", mm),
         "error_low_mm": ("... 90 % interval from", mm),
@@ -30,22 +30,22 @@ EVIDENCE: Mapping[str, _Told] = MappingProxyType(
         "model_matched_share": ("Share of the model's vertices with a match", percent),
         "model_allowed_share": ("Share of the model's vertices whose matches may count", percent),
         "scan_allowed_share": ("Share of the scan's points whose matches may count", percent),
-        "model_near_share": ("Share of the model with the scan anywhere near", percent),
-        "scan_near_share": ("Share of the scan with the model anywhere near", percent),
-        "spread_mm": ("Spread of the distances between what matches", mm),
-        "model_spread_mm": ("Usual distance of a vertex from the mean, in the model", mm),
-        "model_lack_mm": ("What new shapes usually have outside the model", mm),
-        "beyond_model_mm": ("What this scan has outside the model", mm),
-        "left_out_mm": ("What the modes left out would move a vertex by", mm),
-        "posterior_error_mm": ("What matches and modes left out leave open at a vertex", mm),
+        "model_near_share": ("Share of the model near the scan", percent),
+        "scan_near_share": ("Share of the scan near the model", percent),
+        "spread_mm": ("Robust residual SD", mm),
+        "model_spread_mm": ("RMS distance of a vertex from the mean, over the training shapes", mm),
+        "model_lack_mm": ("Off-model variation of new shapes (RMS)", mm),
+        "beyond_model_mm": ("Off-model variation of this scan (RMS)", mm),
+        "left_out_mm": ("Distance of the fitted surface from the span of the modes (RMS)", mm),
+        "posterior_error_mm": ("Vertex error by the posterior (RMS)", mm),
         "z2": ("Mean squared coefficient, in variances of new shapes (about 1 is usual)", _plain),
         "z2_leading": ("... of the leading modes", _plain),
-        "log_scale": ("Scale of the fit beside the model's", _size),
-        "size_mm": ("Size of the mean: RMS distance from its middle", mm),
-        "start_score_mm": ("Score of the start that was taken (small is good)", mm),
-        "start_runner_up_score_mm": ("... of the best one elsewhere", mm),
-        "layered_share": ("Share of the scan that lies on another layer of it", percent),
-        "layers_apart_mm": ("... and how far apart these layers are", mm),
+        "log_scale": ("Scale of the fit relative to the model", _size),
+        "size_mm": ("Size of the mean: RMS distance from its centroid", mm),
+        "start_score_mm": ("Score of the start (lower is better)", mm),
+        "start_runner_up_score_mm": ("... of the best other start", mm),
+        "layered_share": ("Share of the scan with two layers", percent),
+        "layers_apart_mm": ("... distance of these layers", mm),
         "displaced_share": ("Share of the scan that runs along the surface at a distance from it", percent),
         "displaced_inward_share": ("... inside the surface", percent),
         "displaced_purity": ("... of the unexplained parts of the scan", percent),
@@ -58,11 +58,11 @@ EVIDENCE: Mapping[str, _Told] = MappingProxyType(
         "marks_rms_mm": ("RMS distance from the landmarks given", mm),
     }
 )
-"""Key -> what it is, and how its value is written."""
+"""Key -> its label, and the function that formats its value."""
 
 
 def evidence_facts(values: Mapping[str, object], caption: str) -> Facts:
-    """Return the evidence of a fit in words, in the order of `EVIDENCE`; keys of other versions as they are."""
+    """Return the evidence of a fit with labels, in the order of `EVIDENCE`; keys of other versions unchanged."""
     known = {key: value for key, value in values.items() if key in EVIDENCE and isinstance(value, int | float)}
     rows = [(EVIDENCE[key][0], EVIDENCE[key][1](float(known[key]))) for key in EVIDENCE if key in known]
     rows += [(words(key), setting(value)) for key, value in values.items() if key not in known]
