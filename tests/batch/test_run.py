@@ -20,6 +20,7 @@ from shapespace.fit.fit import FitConfig
 from shapespace.io.files import atomic_path
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import FitRecord
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 CONFIG = FitConfig(max_iterations=5)
@@ -56,8 +57,8 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def without_times(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in record.items() if k != "seconds"}
+def without_times(record: FitRecord) -> dict[str, Any]:
+    return {k: v for k, v in record.to_json().items() if k != "seconds"}
 
 
 def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_an_interruption_loses_nothing_that_was_done(
     again = count_fits(monkeypatch)
     records = fit_files(make_jobs(scans), model, Path("blob.h5"), tmp_path, CONFIG, resume=True)
     assert again == ["scan1", "scan2"]
-    assert [r["scan"]["name"] for r in records] == ["scan0.ply", "scan1.ply", "scan2.ply"]
+    assert [r.scan.name for r in records] == ["scan0.ply", "scan1.ply", "scan2.ply"]
     assert [r["scan"] for r in table(tmp_path)] == ["scan0", "scan1", "scan2"]
 
 
@@ -127,8 +128,8 @@ def test_every_executor_gives_what_one_after_the_other_gives(
     there = fit_files(
         jobs, model, model_path, tmp_path / "there", CONFIG, executor=executor, on_done=lambda j, _: done.append(j.name)
     )
-    told = [{**without_times(r), "model": r["model"]["hash"]} for r in there]
-    assert told == [{**without_times(r), "model": r["model"]["hash"]} for r in here]
+    told = [{**without_times(r), "model": r.model.hash} for r in there]
+    assert told == [{**without_times(r), "model": r.model.hash} for r in here]
     assert sorted(done) == sorted(job.name for job in jobs)
     for name in ("coefficients.csv", "scan0.fitted.ply", "scan2.fitted.ply"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
