@@ -2,7 +2,6 @@ import csv
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -79,7 +78,7 @@ def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: li
 def test_an_interruption_loses_nothing_that_was_done(
     model: ShapeModel, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(job: Job, record: Mapping[str, Any]) -> None:
+    def stop(job: Job, record: FitRecord) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -256,7 +255,7 @@ def test_damaged_records_of_earlier_runs_do_not_stop_a_fit(
 def test_an_interruption_waits_for_what_runs_and_the_table_has_it(
     model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
 ) -> None:
-    def stop(job: Job, record: Mapping[str, Any]) -> None:
+    def stop(job: Job, record: FitRecord) -> None:
         raise KeyboardInterrupt
 
     many = [tmp_path / f"s{k}.ply" for k in range(12)]
