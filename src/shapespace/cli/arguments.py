@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from shapespace.cli.command_table import COMMANDS, GROUPS, Command
-from shapespace.cli.options import Option
+from shapespace.cli.options import Container, Option
 from shapespace.version import __version__
 
 
@@ -43,7 +43,9 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **keywords)
         self._command = command
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, args: Any = None, namespace: Any = None
+    ) -> Any:
         """Parse arguments after adding the options."""
         self._add_options(shown="basic")
         return super().parse_known_args(args, namespace)
@@ -74,9 +76,9 @@ class CommandParser(argparse.ArgumentParser):
 
     def _add(self, options: Sequence[Option], shown: str) -> None:
         advanced = self.add_argument_group("advanced options")
-        exclusive: dict[str, argparse._ActionsContainer] = {}
+        exclusive: dict[str, Container] = {}
         for option in options:
-            group: argparse._ActionsContainer = self if option.basic else advanced
+            group: Container = self if option.basic else advanced
             if option.either:
                 if option.either not in exclusive:
                     exclusive[option.either] = group.add_mutually_exclusive_group(required=option.required)

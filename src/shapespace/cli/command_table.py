@@ -406,7 +406,9 @@ COMMANDS: tuple[Command, ...] = (
                   source=FIT),
             basic("--stages", help="also write NAME.stages.npz, for figures"),
             advanced("--recursive", help="also search subfolders of the given folders"),
-            advanced("--method", "NAME", source=FIT),
+            advanced("--method",
+                     "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
+                     "paper's modified ICP", FIT),
             advanced("--search", source=PAPER, choices=("auto", "vertices", "surface"), default="auto",
                      help="closest points of --method paper: vertices of the scan (auto), as in the paper, or points "
                      "on its triangles; the robust method always uses the triangles"),

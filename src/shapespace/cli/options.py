@@ -14,14 +14,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 from shapespace.cli import values
 from shapespace.cli.printing import warn
 
+Container: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]
+"""A parser, or a group of its options."""
 NO_DEFAULT = argparse.SUPPRESS
 """Default of a field whose value is not a literal: the class or the function itself sets it."""
-_PARSERS: Mapping[str, Callable[[str], Any]] = {
+_PARSERS: dict[str, Callable[[str], Any]] = {
     "int": values.natural,
     "float": values.number,
     "str": str,
@@ -39,7 +41,7 @@ class Field:
         help: its text in the docstring.
         kinds: the types of its annotation, without None.
         choices: the values of a `Literal`, else empty.
-        default: the default if it is a literal, else `NO_DEFAULT`.
+        default: the default if it is a literal, None without one, else `NO_DEFAULT`.
     """
 
     help: str
@@ -153,15 +155,16 @@ class Option:
         """Its help, with the default if the text does not state it."""
         text = self.help or (self._field.help if self._field else "")
         initial = self.initial
-        if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "default" in text or self.required:
+        if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "(default" in text or self.required:
             return text
-        return f"{text} (default: {' '.join(map(str, initial)) if isinstance(initial, (tuple, list)) else initial})"
+        shown = " ".join(map(str, cast(Sequence[Any], initial))) if isinstance(initial, tuple) else initial
+        return f"{text} (default: {shown})"
 
     @property
     def _field(self) -> Field | None:
         return self.source.field(self.field_name) if self.source else None
 
-    def add_to(self, group: argparse._ActionsContainer, *, shown: bool) -> None:
+    def add_to(self, group: Container, *, shown: bool) -> None:
         """Add it to a parser or a group of one; `shown` is whether its help is."""
         if self.formerly:
             group.add_argument(
@@ -208,14 +211,20 @@ class _Renamed(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-def given(arguments: argparse.Namespace, taker: Callable[..., Any]) -> dict[str, Any]:
-    """Return the values of the options that a configuration class or a function takes, by the names of its fields."""
+def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: Any) -> dict[str, Any]:
+    """Return the values of the options that a configuration class or a function takes, by the names of its fields.
+
+    Args:
+        arguments: parsed arguments.
+        taker: the class or the function.
+        instead: values of some fields that the command line computes.
+    """
     chosen: dict[str, Any] = {}
     for option in arguments.command.options:
         if option.source is not None and option.source.name == taker.__name__ and hasattr(arguments, option.attribute):
             value = getattr(arguments, option.attribute)
             chosen[option.field_name] = not value if option.negates else value
-    return chosen
+    return {**chosen, **instead}
 
 
 # Reading of source text
@@ -261,7 +270,7 @@ def _texts(docstring: str) -> dict[str, str]:
 
 def _literal(node: ast.expr | None) -> Any:
     try:
-        return NO_DEFAULT if node is None else ast.literal_eval(node)
+        return None if node is None else ast.literal_eval(node)
     except ValueError:
         return NO_DEFAULT
 

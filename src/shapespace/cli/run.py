@@ -219,12 +219,14 @@ def build(arguments: argparse.Namespace) -> int:
     from shapespace.commands.look import model_facts
 
     modes = arguments.variance if arguments.variance is not None else arguments.modes
-    chosen = {
-        "modes": None if modes == "all" else modes,
-        "out_of_core": arguments.out_of_core or None,
-        "regions": dict(arguments.region),
-    }
-    settings = BuildSettings(**{**given(arguments, BuildSettings), **chosen})
+    chosen = given(
+        arguments,
+        BuildSettings,
+        modes=None if modes == "all" else modes,
+        out_of_core=arguments.out_of_core or None,
+        regions=dict(arguments.region),
+    )
+    settings = BuildSettings(**chosen)
     if settings.streams:
         arguments.goes_on = "; the same command goes on from there"
     model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
@@ -320,8 +322,8 @@ def fit(arguments: argparse.Namespace) -> int:
     from shapespace.fit.methods import method_named
 
     search = {} if arguments.search == "auto" else {"search": arguments.search}
-    chosen = {"method": method_named(arguments.method, **search), "region": _region(arguments.region)}
-    config = FitConfig(**{**given(arguments, FitConfig), **chosen})
+    method = method_named(arguments.method, **search)
+    config = FitConfig(**given(arguments, FitConfig, method=method, region=_region(arguments.region)))
     settings = BatchSettings(
         config,
         arguments.landmarks,
