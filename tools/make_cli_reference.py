@@ -73,7 +73,7 @@ EXIT_CODES = """
 | 0 | done |
 | 1 | done, but some of several scans or volumes failed or, under `--strict`, are doubtful |
 | 2 | the arguments are wrong, or no input could be used; one sentence on standard error, no traceback |
-| 130 | stopped by Ctrl-C; all files are complete, `coefficients.csv` has every finished fit; the same command continues |
+| 130 | stopped by Ctrl-C; files are complete, `coefficients.csv` has every finished fit; the same command continues |
 | 143, 129 | the same by SIGTERM, by SIGHUP |
 
 `build`, `quality` and `info` end with 0 or 2.
