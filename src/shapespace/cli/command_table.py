@@ -163,7 +163,7 @@ def _identity() -> tuple[Option, ...]:
         advanced("--train", "EXPR", source=IDENTITY),
         advanced("--role", "COLUMN", source=IDENTITY),
         advanced("--folds", "N", source=IDENTITY),
-        advanced("--scores", "LIST", source=IDENTITY),
+        advanced("--scores", "LIST", source=IDENTITY, default=None),
         advanced("--modes", "K", source=IDENTITY),
         advanced("--no-uncertainty", help="ignore the uncertainty of the fits", source=IDENTITY),
         advanced("--draws", "N", source=IDENTITY),
