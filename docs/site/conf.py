@@ -22,7 +22,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 
 # The repository is the source, so that links between its files hold here as they do on a forge.
 root_doc = site_text.FIRST
-include_patterns = [f"{page}.md" for page in site_text.documents(ROOT)]
+include_patterns = [*(f"{page}.md" for page in site_text.documents(ROOT)), "docs/cli/*.md"]
 _folders = {page.partition("/")[0] for page in site_text.documents(ROOT)}
 exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _folders]
 myst_heading_anchors = 4

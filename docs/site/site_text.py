@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sphinx.application import Sphinx
     from sphinx.environment import BuildEnvironment
 
-FIRST, REFERENCE = "docs/index", "docs/api"
+FIRST, REFERENCE, COMMANDS = "docs/index", "docs/api", "docs/cli"
 LONGEST = 600
 """Characters of a signature that is shown."""
 NAVIGATION = {
@@ -66,6 +66,7 @@ NAVIGATION = {
     ],
     "Look up": [
         "docs/cli",
+        "docs/fit-results",
         "docs/glossary",
         "docs/api",
         "docs/api-stability",
@@ -157,6 +158,8 @@ def complete(app: Sphinx, name: str, source: list[str]) -> None:
         source[0] += trees(documents(Path(app.srcdir)))
     elif name == REFERENCE:
         source[0] = reference(source[0])
+    elif name == COMMANDS:
+        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n\ncli/*\n```\n"
     source[0] = site_plots.add(name, source[0])
 
 

@@ -102,7 +102,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
 
     Args:
         folder: made if absent; results of an earlier demo in it are replaced.
-        quick: coarser scans and an earlier stop.
+        quick: coarser scans and fewer iterations, under a minute.
         quiet: no progress bar.
         scale: counts and sizes; None goes by `quick`.
 

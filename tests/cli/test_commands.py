@@ -1,4 +1,4 @@
-"""Every command does, prints and writes what `cli.md` promises."""
+"""Every command does, prints and writes what docs/cli.md and docs/fit-results.md promise."""
 
 import argparse
 import csv

@@ -123,10 +123,10 @@ def test_landmarks_that_the_fit_would_overwrite_are_refused(run: Run, world: Wor
 def test_the_standard_deviation_is_told_and_infinity_holds_nothing(run: Run, world: World, tmp_path: Path) -> None:
     write_landmarks(tmp_path / "m.csv", marks_of(world, 0))
     command = ("fit", world.model, world.scan, "-o", tmp_path / "o", "--landmarks", tmp_path / "m.csv", "--quiet")
-    assert run(*command, "--landmark-sd", "1.5").code == 0
+    assert run(*command, "--landmark-std", "1.5").code == 0
     record = record_of(tmp_path / "o", "scan_0")
     assert record["config"]["landmark_stddev_mm"] == record["evidence"]["marks_stddev_mm"] == 1.5
-    assert run(*command, "--landmark-sd", "inf").code == 0
+    assert run(*command, "--landmark-std", "inf").code == 0
     assert "marks_stddev_mm" not in record_of(tmp_path / "o", "scan_0")["evidence"]
-    assert "which is kept" in run(*command, "--landmark-sd", "inf").err
-    assert run(*command, "--landmark-sd", "0").code == 2
+    assert "which is kept" in run(*command, "--landmark-std", "inf").err
+    assert run(*command, "--landmark-std", "0").code == 2

@@ -29,7 +29,7 @@ from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 MOST_FOR_A_BYTE = 100
-"""Bytes of memory for each byte of the file, as docs/cli.md says."""
+"""Bytes of memory for each byte of the file, as docs/mesh-formats.md says."""
 MOST_BESIDES = 2**28
 MOST_STEPS_FOR_A_BYTE = 40
 TO_BEGIN_WITH = 2**18
@@ -333,7 +333,7 @@ def test_twice_the_materials_of_an_obj_take_twice_the_work(tmp_path: Path) -> No
 
 
 def test_the_ceilings_are_those_that_are_documented() -> None:
-    said = " ".join((Path(__file__).parents[2] / "docs" / "cli.md").read_text().split())
+    said = " ".join((Path(__file__).parents[2] / "docs" / "mesh-formats.md").read_text().split())
     for ceiling in (
         f"mesh file up to {limits.LARGEST_MESH_FILE_BYTES >> 30} GiB",
         f"landmark file up to {limits.LARGEST_LANDMARK_FILE_BYTES >> 20} MiB",

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from shapespace.cli.options import given
 from shapespace.cli.printing import arrow, now, say, short, show, show_json, warn
 
 if TYPE_CHECKING:
@@ -84,20 +85,8 @@ def data_faces(arguments: argparse.Namespace) -> int:
     """Write simulated faces."""
     from shapespace.commands.data import write_simulated_faces
 
-    names = [name.strip() for name in arguments.expressions.split(",") if name.strip()]
-    count = write_simulated_faces(
-        arguments.output,
-        source=arguments.source,
-        subjects=arguments.subjects,
-        expressions=names,
-        seed=arguments.seed,
-        area=arguments.area,
-        quiet=arguments.quiet,
-        raw=arguments.raw,
-        wide=arguments.wide,
-        intensities=arguments.intensity,
-        effect_mm=arguments.effect,
-    )
+    options = given(arguments, write_simulated_faces)
+    count = write_simulated_faces(arguments.output, **options, quiet=arguments.quiet)
     return _show_written(arguments, "face", count)
 
 
@@ -105,18 +94,16 @@ def data_organs(arguments: argparse.Namespace) -> int:
     """Write simulated organs."""
     from shapespace.commands.data import write_simulated_organs
 
-    out, count = arguments.output, arguments.count
-    write_simulated_organs(out, count=count, seed=arguments.seed, volumes=arguments.volumes, quiet=arguments.quiet)
-    return _show_written(arguments, "organ", count)
+    write_simulated_organs(arguments.output, **given(arguments, write_simulated_organs), quiet=arguments.quiet)
+    return _show_written(arguments, "organ", arguments.count)
 
 
 def data_bones(arguments: argparse.Namespace) -> int:
     """Write simulated bones of two groups."""
     from shapespace.commands.data import write_simulated_bones
 
-    out, count = arguments.output, arguments.count
-    write_simulated_bones(out, count=count, seed=arguments.seed, effect_mm=arguments.effect, quiet=arguments.quiet)
-    return _show_written(arguments, "bone", count)
+    write_simulated_bones(arguments.output, **given(arguments, write_simulated_bones), quiet=arguments.quiet)
+    return _show_written(arguments, "bone", arguments.count)
 
 
 def _show_written(arguments: argparse.Namespace, what: str, count: int) -> int:
@@ -132,17 +119,8 @@ def surface(arguments: argparse.Namespace) -> int:
     """Surfaces of labels in volumes."""
     from shapespace.commands.surface import write_surfaces
 
-    records = write_surfaces(
-        arguments.volumes,
-        arguments.output,
-        labels=arguments.label,
-        smooth=arguments.smooth,
-        keep_pieces=arguments.keep_pieces,
-        recursive=arguments.recursive,
-        max_memory_bytes=arguments.max_memory,
-        quiet=arguments.quiet,
-        say=warn,
-    )
+    options = given(arguments, write_surfaces)
+    records = write_surfaces(arguments.volumes, arguments.output, **options, quiet=arguments.quiet, say=warn)
     made = [record for record in records if "error" not in record]
     if arguments.json:
         show_json({"folder": str(arguments.output), "volumes": len(records), "surfaces": len(made), "records": records})
@@ -217,13 +195,7 @@ def correspond(arguments: argparse.Namespace) -> int:
     from shapespace.correspondence.rounds import CorrespondSettings
     from shapespace.schemas import to_json
 
-    settings = CorrespondSettings(
-        vertices=arguments.vertices,
-        rounds=arguments.rounds,
-        symmetric=arguments.symmetric,
-        landmark_uncertainty=arguments.landmark_error,
-        seed=arguments.seed,
-    )
+    settings = CorrespondSettings(**given(arguments, CorrespondSettings))
     files = CorrespondFiles(
         arguments.scans,
         arguments.template,
@@ -247,27 +219,14 @@ def build(arguments: argparse.Namespace) -> int:
     from shapespace.commands.look import model_facts
 
     modes = arguments.variance if arguments.variance is not None else arguments.modes
-    settings = BuildSettings(
+    chosen = given(
+        arguments,
+        BuildSettings,
         modes=None if modes == "all" else modes,
-        gauge=arguments.gauge,
-        align=not arguments.no_align,
-        unit=arguments.unit,
-        representation=arguments.representation,
-        control_points=arguments.control_points,
-        min_seen=arguments.min_seen,
-        landmarks=arguments.landmarks,
-        labels=arguments.additive,
-        expression_variance=arguments.expression_variance,
-        provenance=arguments.provenance,
-        licence=arguments.licence,
-        seed=arguments.seed,
         out_of_core=arguments.out_of_core or None,
-        keep_shapes=arguments.keep_shapes,
-        add=arguments.add,
-        recursive=arguments.recursive,
-        with_doubtful=arguments.with_doubtful,
         regions=dict(arguments.region),
     )
+    settings = BuildSettings(**chosen)
     if settings.streams:
         arguments.goes_on = "; the same command goes on from there"
     model, notes = build(arguments.meshes, arguments.output, settings, quiet=arguments.quiet)
@@ -292,16 +251,8 @@ def quality(arguments: argparse.Namespace) -> int:
     from shapespace.model.quality import QualitySettings
     from shapespace.schemas import to_json
 
-    settings = QualitySettings(
-        folds=arguments.folds,
-        modes=arguments.modes,
-        samples=arguments.samples,
-        seed=arguments.seed,
-        gauge=arguments.gauge,
-        align=not arguments.no_align,
-        control_points=arguments.control_points,
-    )
-    options = QualityOptions(settings, arguments.representation, arguments.scans, arguments.unseen)
+    settings = QualitySettings(**given(arguments, QualitySettings))
+    options = QualityOptions(settings, **given(arguments, QualityOptions))
     found, notes = quality(
         arguments.targets, arguments.output, options, _execution_config(arguments), quiet=arguments.quiet
     )
@@ -370,18 +321,9 @@ def fit(arguments: argparse.Namespace) -> int:
     from shapespace.fit.fit import FitConfig
     from shapespace.fit.methods import method_named
 
-    config = FitConfig(
-        method=method_named(arguments.method, **({} if arguments.search == "auto" else {"search": arguments.search})),
-        unit=arguments.unit,
-        scale=arguments.scale,
-        max_iterations=arguments.max_iterations,
-        seed=arguments.seed,
-        dense=arguments.dense,
-        landmark_stddev_mm=arguments.landmark_sd,
-        crop=arguments.crop,
-        region=_region(arguments.region),
-        strict=arguments.strict,
-    )
+    search = {} if arguments.search == "auto" else {"search": arguments.search}
+    method = method_named(arguments.method, **search)
+    config = FitConfig(**given(arguments, FitConfig, method=method, region=_region(arguments.region)))
     settings = BatchSettings(
         config,
         arguments.landmarks,
@@ -416,25 +358,15 @@ def _region(region: str | None) -> str | tuple[int, ...] | None:
 def _execution_config(arguments: argparse.Namespace) -> ExecutionConfig:
     from shapespace.batch.execution import ExecutionConfig
 
-    return ExecutionConfig(arguments.executor, arguments.jobs, arguments.timeout, arguments.dask or "")
+    return ExecutionConfig(**given(arguments, ExecutionConfig))
 
 
 def recognise_train(arguments: argparse.Namespace) -> int:
     """Train a classifier."""
     from shapespace.commands.recognise import recognise_train
 
-    facts, notes = recognise_train(
-        arguments.results,
-        arguments.labels,
-        arguments.output,
-        classifier=arguments.classifier,
-        relative=arguments.relative,
-        neutral=arguments.neutral,
-        confidence=arguments.confidence,
-        modes=arguments.modes,
-        expression_of=arguments.expression_of,
-        seed=arguments.seed,
-    )
+    options = given(arguments, recognise_train)
+    facts, notes = recognise_train(arguments.results, arguments.labels, arguments.output, **options)
     for note in notes:
         say(note)
     if arguments.json:
@@ -524,16 +456,8 @@ def view(arguments: argparse.Namespace) -> int:
     """Show a model, fits, or surfaces in correspondence in the browser."""
     from shapespace.viewer.serve import serve
 
-    serve(
-        arguments.path,
-        model=arguments.model,
-        host=arguments.host,
-        port=arguments.port,
-        open_browser=not arguments.no_open,
-        max_upload_mb=arguments.max_upload_mb,
-        quiet=arguments.quiet,
-        say=now,
-    )
+    options = given(arguments, serve)
+    serve(arguments.path, **options, open_browser=not arguments.no_open, quiet=arguments.quiet, say=now)
     return 0
 
 

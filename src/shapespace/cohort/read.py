@@ -35,12 +35,12 @@ class CohortOptions:
     """Which shapes, and how they are made comparable.
 
     Args:
-        shapes: folder of the results of fits, or of meshes in correspondence; None for that of the table.
-        model: file of the model of the fits; None goes by their records.
-        surfaces: one of `SURFACES`; `auto` takes dense surfaces where all fits have one, else coefficients, and is
-            the kind of the cohort with which these shapes are compared.
-        gauge: `shape` divides size out, `form` keeps it.
-        doubtful: take doubtful fits too.
+        shapes: folder of results of fits, or of meshes in correspondence (default: the folder of the table).
+        model: model file of the fits, if it was moved.
+        surfaces: shapes of fits: `coefficients` of the model, its `fitted` surface, or the `dense` surface on the scan;
+            `auto` uses dense surfaces if all fits have one, otherwise coefficients.
+        gauge: `form` keeps size, `shape` divides size out.
+        doubtful: include doubtful fits (default: excluded, and counted).
         least: shapes that there must be; one will do where it is compared with what is known already.
     """
 

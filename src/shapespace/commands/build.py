@@ -50,26 +50,36 @@ class BuildSettings:
     """What to make of which meshes.
 
     Args:
-        modes: as of `ShapeModel.fit`; with `labels`, those of identity.
-        gauge: `form` or `shape`; None for that of the model added to, or `shape`.
+        modes: number of modes; `auto`: cross-validation on held-out vertices, of a random sample of 2,000 meshes if
+            there are more; `all` (in Python None). With labels, they are modes of identity.
+        gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
+            scale (default: shape, or that of the model added to).
         align: whether to align the meshes.
-        unit: of the meshes.
-        representation: what the modes move.
-        control_points: of a B-spline.
-        min_seen: share of the meshes that must show a vertex of a model of vertices; None for a half.
-        landmarks: a file of vertices or of triangles with barycentric coordinates, or of points on the first mesh;
-            None looks for them.
+        unit: unit of the meshes.
+        representation: what the modes move: `vertices`; `bspline`, control points of a smooth surface;
+            `bspline-detail`, the same with the detail of the mean that the B-spline cannot represent.
+        control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
+        min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks;
+            missing vertices are nan in the files (default: 0.5).
+        landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
+            `landmarks.csv` of correspond (default: landmarks.csv next to the first mesh, otherwise those of the model
+            of fitted surfaces).
         regions: name -> file with its vertices of the meshes, kept in the model for fits that are held to one.
-        labels: a table of subjects and expressions, for a model that parts both; None for a plain one.
-        expression_variance: with `labels`, the share that the modes of expression hold.
-        provenance: what the meshes are.
-        licence: of the meshes.
-        seed: of the cross-validation, and of the first directions of streamed modes.
-        out_of_core: whether to stream the meshes through a file; None where they do not fit into memory.
-        keep_shapes: whether to keep that file beside the model, for shapes to be added later.
-        add: a model that kept its shapes, to which the meshes are added.
-        recursive: whether to take what lies in folders below those given too.
-        with_doubtful: whether to take surfaces of doubtful fits.
+        labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;
+            the number of modes then counts modes of identity (default 0.995 of the variance).
+        expression_variance: for a model of identity and expression: share of the expression variance that its
+            expression modes explain (default 0.99).
+        provenance: description of the meshes, kept in the model file (default: from about.json next to the meshes).
+        licence: licence of the meshes, kept in the model file (default: from about.json next to the meshes).
+        seed: seed of the cross-validation, and of the first directions of streamed modes.
+        out_of_core: stream the meshes through a file next to the model, which is automatic if they would take more than
+            four fifths of the free memory; a build that was stopped is continued by the same command.
+        keep_shapes: keep that file as MODEL.h5.shapes, so that meshes can be added later (4 bytes per coordinate of a
+            mesh).
+        add: add the meshes to this model, which was built with its shapes kept; gauge, alignment and landmarks are
+            those of that model.
+        recursive: also search subfolders of the given folders.
+        with_doubtful: include surfaces of doubtful fits (default: excluded, and counted).
 
     Raises:
         InputError: settings that do not go together.

@@ -29,9 +29,9 @@ def convert(
     Args:
         source: a model in any format that is read.
         output: its name tells the format, where `to` does not.
-        to: a format by its name, or None.
+        to: format to write, by its name, if the extension of the output does not determine it.
         mm: how many mm one unit of `source` is, where its format does not say; None for what the format says, or 1.
-        expressions: a file of blendshapes of eos that belong to `source`, or None.
+        expressions: blendshapes that eos keeps in a file of their own.
         quiet: no progress.
 
     Raises:

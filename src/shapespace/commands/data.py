@@ -32,18 +32,32 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Path:
 def write_simulated_faces(
     folder: Path,
     *,
-    source: str,
-    subjects: int,
-    expressions: Sequence[str],
-    seed: int,
-    area: str | None,
-    quiet: bool,
+    source: str = "bundled",
+    subjects: int = 100,
+    expressions: Sequence[str] = ("neutral",),
+    seed: int = 0,
+    area: str | None = None,
+    quiet: bool = False,
     raw: bool = False,
     wide: bool = False,
     intensities: Sequence[float] = (1.0,),
     effect_mm: float | None = None,
 ) -> int:
     """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them, and return how many.
+
+    Args:
+        folder: output folder.
+        source: `bundled`, or `ict-facekit`, which must be downloaded already.
+        subjects: number of people.
+        expressions: names with commas between them: neutral, anger, disgust, fear, smile, sadness, surprise.
+        seed: random seed; person k of a seed is the same for every number of people.
+        area: part to write (default: face of ict-facekit, face_and_head of bundled).
+        quiet: no progress.
+        raw: raw scans: 20,000 other triangles, any pose, 0.2 mm of noise, two small holes; they are not in
+            correspondence.
+        wide: bundled people who vary as widely as real ones, for models of real scans.
+        intensities: intensities of bundled expressions, such as 0.3,0.6: one is drawn for each face (default: 1).
+        effect_mm: also write a sex and an age into labels.csv, and move the chin of men forward by this length, mm.
 
     Raises:
         InputError: an unknown expression or area, intensities that cannot be, or wide people or an effect of
@@ -83,8 +97,17 @@ def write_simulated_faces(
     return total
 
 
-def write_simulated_bones(folder: Path, *, count: int, seed: int, effect_mm: float, quiet: bool) -> None:
+def write_simulated_bones(
+    folder: Path, *, count: int = 16, seed: int = 0, effect_mm: float = 4.0, quiet: bool = False
+) -> None:
     """Write raw scans of simulated bones of two groups, and their table.
+
+    Args:
+        folder: output folder.
+        count: number of bones; the groups alternate.
+        seed: random seed; bone k of a seed is the same for every count.
+        effect_mm: difference of the snout length between the two groups in mm, at most 10.
+        quiet: no progress.
 
     Raises:
         InputError: a count or an effect out of range.
@@ -102,8 +125,17 @@ def write_simulated_bones(folder: Path, *, count: int, seed: int, effect_mm: flo
     write_about(folder, f"{count} simulated bones of shapespace in two groups, seed {seed}", LICENSE)
 
 
-def write_simulated_organs(folder: Path, *, count: int, seed: int, volumes: bool, quiet: bool) -> None:
+def write_simulated_organs(
+    folder: Path, *, count: int = 40, seed: int = 0, volumes: bool = False, quiet: bool = False
+) -> None:
     """Write raw surfaces, or label volumes, of simulated organs.
+
+    Args:
+        folder: output folder.
+        count: number of organs.
+        seed: random seed; organ k of a seed is the same for every count.
+        volumes: write label volumes (NIfTI) of the same organs instead; needs the extra `volumes`.
+        quiet: no progress.
 
     Raises:
         InputError: too many.

@@ -43,8 +43,8 @@ def export(
         folder: that `shapespace fit` wrote, with a store or without.
         names: of the fits.
         output: folder to write them to.
-        every: all fits instead.
-        table: a file for the coefficients of all fits: CSV, or MATLAB's where its name ends in .mat; None for none.
+        every: export all fits.
+        table: write the coefficients of all fits to this file: FILE.csv, or FILE.mat for MATLAB.
         quiet: no progress.
         say: told of what cannot be read; the rest is written.
 

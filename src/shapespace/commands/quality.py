@@ -37,9 +37,11 @@ class QualityOptions:
 
     Args:
         settings: folds, modes, samples, seed and gauge.
-        representations: one for all targets, or one for each; two for one target compare it with itself.
-        scans: a folder of the scans that surfaces were made from, named as they are; None for the surfaces themselves.
-        unseen: a folder of shapes in correspondence that no model saw.
+        representations: what the modes move, for all targets or one for each; two for one target compare it with
+            itself.
+        scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
+            measured to these.
+        unseen: folder of corresponding shapes that no model was trained on: also measure the error on these.
 
     Raises:
         InputError: representations that there are not.

@@ -61,15 +61,28 @@ def recognise_train(
     labels: Path,
     output: Path,
     *,
-    classifier: str,
-    relative: bool,
-    neutral: str,
-    confidence: float,
-    modes: int | None,
-    expression_of: Path | None,
-    seed: int,
+    classifier: str = "lda",
+    relative: bool = False,
+    neutral: str = "neutral",
+    confidence: float = 0.5,
+    modes: int | None = None,
+    expression_of: Path | None = None,
+    seed: int = 0,
 ) -> tuple[dict[str, Any], list[str]]:
     """Train a classifier on the fits in `results` and save it; return its facts and what the user should know.
+
+    Args:
+        results: a folder that `fit` wrote, or its coefficients.csv.
+        labels: table of scans and their labels, and subjects if known.
+        output: the classifier, FILE.skops.
+        classifier: `mean-direction`, `knn`, `lda`, `qda`, `logistic` or `svm`.
+        relative: compare each scan with its subject's neutral face.
+        neutral: label of neutral faces.
+        confidence: predict `unsure` below this probability.
+        modes: number of leading coefficients to use (default: all).
+        expression_of: use the expression coefficients alone, of this model of `build --additive`, which must be the one
+            that the scans were fitted with.
+        seed: seed of the folds, and of classifiers that draw.
 
     Raises:
         FileError: something cannot be read, or the classifier not written.

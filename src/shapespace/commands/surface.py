@@ -46,12 +46,12 @@ def write_surfaces(
     Args:
         paths: label volumes, and folders of them.
         folder: where surfaces go.
-        labels: as for `surface_of_volume`.
-        smooth: as for `surface_of_volume`.
-        keep_pieces: as for `surface_of_volume`.
-        recursive: take volumes in folders below those given too.
-        max_memory_bytes: a volume that takes more memory, with its surface, is refused before it is read; None for
-            `MAX_MEMORY_BYTES`, or four fifths of the free memory if that is less.
+        labels: labels that form one object, or `all` (default: the only label of the volume).
+        smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
+        keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
+        recursive: also search subfolders of the given folders.
+        max_memory_bytes: memory limit for a volume and its surface; a volume that needs more is refused before it is
+            read (default: `MAX_MEMORY_BYTES`, 4G, or 80 % of the free memory if that is less).
         quiet: no progress.
         say: told what was not taken, and which volumes cannot be used.
 

@@ -52,8 +52,8 @@ class CorrespondSettings:
     """How scans are brought into correspondence; lengths are shares of the object's size (RMS from its middle).
 
     Args:
-        vertices: of the template, about.
-        rounds: at most.
+        vertices: approximate number of vertices of the template, if it is one of the scans.
+        rounds: maximum number of rounds.
         settled: a round that moves vertices by less (RMS over all) is the last.
         first: the registration of round 1,
         next: and of the others, which begin at what the other scans say.
@@ -63,10 +63,11 @@ class CorrespondSettings:
         fewest_covered: and share of a scan that the template must reach.
         strange: shapes whose distance from what the others say of them is beyond this many times the usual are other
             objects.
-        symmetric: whether the object is its own mirror image: the template is then made so, and the others' mirror
-            images tell of a scan too.
-        landmark_uncertainty: standard deviation of landmarks.
-        seed: of all that is drawn.
+        symmetric: the object is its own mirror image: the template is made symmetric, and a scan is also predicted from
+            the mirror images of the other scans.
+        landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
+            its centre).
+        seed: random seed.
     """
 
     vertices: int = 10_000

@@ -57,24 +57,27 @@ class FitConfig:
     """What is common to fits by any method.
 
     Args:
-        method: how the placed model is fitted: an object such as `Robust(...)` or `Paper(...)`, or a name of `METHODS`
-            for its default settings.
+        method: method that fits the placed model: a name of `METHODS` for its default settings, or an object such as
+            `Robust(...)` or `Paper(...)`. `robust`: pose and shape jointly, from distances in both directions; `paper`:
+            the paper's modified ICP.
         modes: how many coefficients to report, from the first; None for all. The robust method fits with all in any
             case; the paper's fits with these alone.
-        unit: of the scan: a name of `MM_PER_UNIT`, or `auto` to find it.
-        scale: `free` fits a similarity, `fixed` a rigid motion; `auto` is `free` for a model with the gauge `shape`.
-        max_iterations: cap of each phase.
-        seed: of the subsample that the start is searched on.
-        landmark_stddev_mm: of landmarks that are given, mm of the scan: how well they are placed. The robust method is
-            held to them by it; infinity takes them for the start alone. None for 3 % of the model's size (RMS distance
-            from its centre).
-        dense: whether the surface is then taken the rest of the way to the scan, as the stage `dense`.
+        unit: unit of the scan; `auto` detects it from its size.
+        scale: `free` estimates the scale, `fixed` keeps it; `auto`: free if the model's gauge is shape, fixed if it is
+            form.
+        max_iterations: maximum number of iterations of each phase.
+        seed: seed of the random subsample of the pose search.
+        landmark_stddev_mm: standard deviation of the landmarks in mm of the scan (default: 3 % of the model's size, the
+            RMS distance from its centre); `inf`: they only initialise the fit. The paper's method uses landmarks for
+            the initialisation alone.
+        dense: also deform the fitted surface further onto the scan, as the stage `dense` (robust method only).
         dense_settings: settings of that.
-        crop: what of the scan is fitted, such as `sphere:0,0,0,90`, see `fit.crop.Crop`; empty for all of it.
+        crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z` (in its frame and unit),
+            or `landmarks:MM`, within this distance in mm of the landmarks; empty for the whole scan.
         region: the part of the model that fit, distances and verdict are held to: a name of `ShapeModel.regions`, or
             vertices; None for all of it.
-        strict: whether a scan with triangles that use vertices with non-finite coordinates is refused; otherwise these
-            triangles are removed, and a note says so.
+        strict: refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them,
+            with a note).
 
     Raises:
         InputError: a name that does not exist, numbers below one, or a dense stage after a method that has none.

@@ -40,7 +40,7 @@ class Paper:
     """The paper's method, as corrected: phase 1 moves the mean, phase 2 alternates matches, pose and projection.
 
     Args:
-        search: `vertices` (its closest points) or `surface` (closest points on the triangles).
+        search: closest points: `vertices` of the scan, as in the paper, or points on its `surface`, the triangles.
         stop_rate: the paper's tau: stop when the RMS changes by at most this share,
         stop_motion_mm: and no vertex moves more than this, mm of the model's frame.
 

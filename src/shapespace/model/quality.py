@@ -186,14 +186,15 @@ class QualitySettings:
     """How quality is measured.
 
     Args:
-        folds: in how many parts shapes are left out, at most one each; None for each by itself.
-        modes: the largest number; None for as many as the folds give.
-        samples: random shapes for the specificity.
-        seed: of folds and samples.
-        gauge: as of `ShapeModel.fit`.
+        folds: number of folds of the cross-validation, at most one per shape; `loo` (in Python None) leaves out one
+            shape at a time.
+        modes: largest number of modes (default: all that the folds allow).
+        samples: number of random shapes for the specificity.
+        seed: seed of folds and random shapes.
+        gauge: `form` keeps size, `shape` divides size out.
         align: whether to align the shapes.
         representation: as of `ShapeModel.fit`.
-        control_points: as of `ShapeModel.fit`.
+        control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
 
     Raises:
         InputError: numbers that cannot be.

@@ -217,13 +217,13 @@ def measure_asymmetry(
 
     Args:
         cohort: the shapes; in the gauge `form` millimetres are those of each object.
-        subject: column that names who a shape is of; None takes `subject` where there is one, else each shape is of
-            another. Shapes of one subject show the measurement error.
+        subject: column of the subjects; several shapes of a subject measure the measurement error (default: `subject`,
+            if the table has it; otherwise each shape is of another subject).
         pairs: of vertices that mirror each other, one on the plane beside itself; None finds them on the mean.
         where: what the pairs are called in messages.
         reference: column and value of the subjects that scores are compared with; None for all.
-        permutations: how many; 0 for no p.
-        seed: of them.
+        permutations: number of permutations for p; 0 for none.
+        seed: seed of the permutations.
         on_step: called with (permutations done, in all).
 
     Raises:

@@ -32,18 +32,18 @@ class ChangeSettings:
     """What is asked.
 
     Args:
-        subject: column of the table that tells whose scan it is.
-        time: column that tells when; None takes `time`, `visit` or `date`. Numbers, dates such as 2026-05-31, or words.
-        order: of times that are words, the earliest first.
-        stable: what did not change, and so carries the alignment: `auto` finds it, `all` is the whole surface; a region
-            of the model by its name; a file of vertices; `landmarks:NAME,NAME,...` and a radius in mm, for what is near
-            these; or the vertices.
+        subject: column of the subjects.
+        time: column of the times: numbers, dates (2026-05-31) or words (default: time, visit or date).
+        order: order of times that are words, the earliest first, such as before,after.
+        stable: the part that did not change, by which visits are aligned: `auto` (detected), `all`, a region of the
+            model, a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these; in Python also the
+            vertices.
         regions: name -> vertices, whose volumes are told beside that of the whole; None takes those of the model.
-        group: column with two groups, whose changes are compared; None compares none.
-        rate: maps over the group are in mm per unit of time, rather than last visit minus first.
-        permutations: of the tests.
-        seed: of these.
-        unequal_variances: compare the groups by Welch's t with sign flips, which allows unequal dispersion.
+        group: column of two groups whose changes are compared.
+        rate: analyse mm per unit of time instead of last minus first visit.
+        permutations: number of permutations.
+        seed: seed of the permutations.
+        unequal_variances: allow groups of unequal dispersion (Welch's t, sign flips).
     """
 
     subject: str = "subject"

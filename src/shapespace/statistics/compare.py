@@ -56,21 +56,23 @@ class CompareOptions:
     """How groups are compared.
 
     Args:
-        anova_type: type of the sums of squares, one of `TYPES`.
-        blocks: column with the subject of each scan; subjects may respond differently to all conditions within
-            subjects. None if all shapes are independent.
-        permutations: arrangements, the observed one among them.
-        seed: of the arrangements.
+        anova_type: type of the sums of squares: `I`, each term after those before it; `II`, each term after all terms
+            that do not contain it; `III`, each term after all others.
+        blocks: column of the subjects, if subjects have several scans: subjects may then respond differently to all
+            conditions within subjects.
+        permutations: number of permutations, including the observed data.
+        seed: seed of the permutations.
         maps: whether to test each vertex.
-        bump_width_mm: also seek, at each vertex, a bump along the normals of this standard deviation, beside how shapes
-            vary anyway; None does not. It is for fits, whose model knows how shapes vary.
-        level: of significance.
-        drop_missing: leave out shapes of which something in the formula is missing, and say so.
-        random: the effects within subjects that differ between subjects, such as `1 + time | subject`, instead of
-            `blocks`; all others are assumed to be the same in all subjects. None for all effects.
-        unequal_variances: test with a variance for each subject and sign flips of residuals, which allows classes whose
-            dispersion differs. F is then the squared effect divided by its variance.
-        effect_size: transformation of F before Z is standardised, one of `EFFECT_SIZES`.
+        bump_width_mm: of fits: also search, at each vertex, for a bump of this width (standard deviation, mm) along the
+            normals, beyond the variation between shapes.
+        level: level of significance.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
+        random: random effects: those within subjects that differ between subjects, such as `1 + time | subject`; all
+            others are assumed to be equal in all subjects (default with blocks: all).
+        unequal_variances: allow classes of unequal dispersion: a variance for each subject, and sign flips of
+            residuals.
+        effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as
+            before.
     """
 
     anova_type: SquaresType = "II"

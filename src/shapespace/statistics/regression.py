@@ -184,14 +184,14 @@ def regress(
 
     Args:
         cohort: the shapes.
-        target: column of the number.
-        subject: column that names who a shape is of; None takes `subject` where there is one, else each shape is of
-            another. No subject stands on both sides of a fold.
-        folds: of the outer cross-validation; the inner one that chooses has five.
-        permutations: for p; 0 for none.
+        target: column of the number to predict.
+        subject: column of the subjects, none of whom is on both sides of a fold (default: `subject`, if the table has
+            it; otherwise each shape is of another subject).
+        folds: number of folds of the outer cross-validation; the inner one has five.
+        permutations: number of permutations for p; 0 for none.
         draws: of subjects, for intervals of figures.
-        level: of all intervals.
-        seed: of all chance.
+        level: coverage of intervals.
+        seed: seed of folds and draws.
         on_step: called with (steps done, in all).
 
     Raises:

@@ -43,13 +43,12 @@ class ScoreOptions:
     """How subjects are measured by a reference.
 
     Args:
-        modes: of the reference, by which distances are measured; None takes those of 95 % of its variance, at most one
-            for five people.
-        subject: column of the subjects in both tables; None if each scan is of another subject.
-        nearest: how many of the reference are named for each subject.
+        modes: number of modes of the reference (default: those of 95 % of its variance, at most one per five subjects).
+        subject: column of the subjects in both tables, if subjects have several scans.
+        nearest: number of nearest subjects of the reference to name.
         draws: of the reference as it would look if it were seen as badly as a subject is.
-        seed: of the draws.
-        drop_missing: leave out scans of which `subject` is missing.
+        seed: seed of the draws of uncertain fits.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 
     modes: int | None = None

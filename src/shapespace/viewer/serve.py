@@ -56,11 +56,11 @@ def serve(
 
     Args:
         path: a model file, or a folder that `shapespace fit` or `shapespace correspond` wrote.
-        model: the model's file, where the records of the folder do not lead to it.
-        host: the address to listen at.
-        port: None takes the first free one from `FIRST_PORT`.
+        model: model file of the fits in the folder (default: the one that their records name).
+        host: address to listen at.
+        port: port (default: the first free one from 7860).
         open_browser: whether to open the page.
-        max_upload_mb: largest scan that may be dropped.
+        max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
         quiet: whether to be silent about code that is being compiled.
         say: told the address, which holds the token that visitors need.
 

@@ -3,24 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
-
-
-def add(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    add_cohort(sub)
-    add_gauge(sub, "form")
-    sub.add_argument("--pairs", type=Path, metavar="PAIRS.csv",
-                     help="two columns of vertices or landmarks that mirror each other, one on the plane beside itself "
-                     "(default: found on the mean)")  # fmt: skip
-    sub.add_argument("--subject", metavar="COLUMN",
-                     help="who a shape is of; shapes of one show the measurement error (default: subject)")  # fmt: skip
-    sub.add_argument("--reference", metavar="COLUMN=VALUE", help="group that scores are compared with (default: all)")
-    sub.add_argument("--permutations", type=int, default=999, metavar="P", help="for p (default 999)")
-    sub.add_argument("--seed", type=int, default=0, metavar="S")
-    sub.set_defaults(run=run)
+from shapespace.cli.answers.common import cohort_of, finish
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,44 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from shapespace.cli.answers.common import add_cohort, cohort_of, finish
+from shapespace.cli.answers.common import cohort_of, finish
 
 if TYPE_CHECKING:
     from shapespace.types import SurfaceLandmarks
-
-
-def add(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    add_cohort(sub)
-    sub.add_argument("--subject", default="subject", metavar="COLUMN",
-                     help="column of the subjects (default: subject)")  # fmt: skip
-    sub.add_argument("--time", metavar="COLUMN",
-                     help="column of the times: numbers, dates (2026-05-31) or words (default: time, visit or "
-                     "date)")  # fmt: skip
-    sub.add_argument("--order", type=_words, metavar="LIST",
-                     help="order of times that are words, such as before,after")  # fmt: skip
-    sub.add_argument("--stable", default="auto", metavar="WHAT",
-                     help="the part that did not change, by which visits are aligned: auto (detected), all, a region "
-                     "of the model, a file of vertices, or landmarks:NAME,NAME and a radius in mm (default: "
-                     "auto)")  # fmt: skip
-    sub.add_argument("--region", type=_named_file, action="append", default=[], metavar="NAME=FILE",
-                     help="a region whose volume is also reported: a CSV file of vertices; can be repeated (default: "
-                     "the regions of the model)")  # fmt: skip
-    sub.add_argument("--landmarks", type=Path, metavar="FILE",
-                     help="CSV of name,vertex, or landmarks.csv of shapespace correspond (default: those of the "
-                     "model)")  # fmt: skip
-    sub.add_argument("--group", metavar="COLUMN",
-                     help="column of two groups whose changes are compared")  # fmt: skip
-    sub.add_argument("--unequal-variances", action="store_true",
-                     help="with --group: allow groups of unequal dispersion (Welch's t, sign flips)")  # fmt: skip
-    sub.add_argument("--rate", action="store_true",
-                     help="analyse mm per unit of time instead of last minus first visit")  # fmt: skip
-    sub.add_argument("--permutations", type=int, default=1000, metavar="N",
-                     help="number of permutations (default 1000)")  # fmt: skip
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the permutations (default 0)")
-    sub.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -89,14 +57,3 @@ def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:
                 "landmarks of these surfaces."
             )
     return found
-
-
-def _named_file(text: str) -> tuple[str, Path]:
-    name, equals, path = text.partition("=")
-    if not (equals and name.strip() and path):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FILE")
-    return name.strip(), Path(path)
-
-
-def _words(text: str) -> Any:
-    return tuple(word.strip() for word in text.split(","))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shapespace.cli.printing import say, show, show_json
@@ -13,31 +12,6 @@ if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.geometry.procrustes import Gauge
     from shapespace.statistics.answer import Answer
-
-
-def add_cohort(sub: argparse.ArgumentParser, surfaces: str = "auto") -> None:
-    """Add the arguments that name a cohort, and where the answer is written; `surfaces` is a default."""
-    sub.add_argument("data", type=Path, metavar="DATA",
-                     help="a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, "
-                     "name or id; or a folder of fits, whose metadata are the table")  # fmt: skip
-    sub.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="output folder")
-    sub.add_argument("--shapes", type=Path, metavar="DIR",
-                     help="results of fits, or meshes in correspondence (default: the folder of DATA)")  # fmt: skip
-    sub.add_argument("--model", type=Path, metavar="MODEL.h5", help="model of the fits, if its file was moved")
-    sub.add_argument("--surfaces", choices=("auto", "coefficients", "fitted", "dense"), default=surfaces,
-                     help="shapes of fits: auto uses dense surfaces if all fits have one, otherwise coefficients "
-                     f"(default: {surfaces})")  # fmt: skip
-    sub.add_argument("--doubtful", action="store_true", help="include doubtful fits (default: excluded)")
-    sub.add_argument("--drop-missing", action="store_true",
-                     help="exclude shapes with missing values in the table (default: an error)")  # fmt: skip
-
-
-def add_gauge(sub: argparse.ArgumentParser, default: str = "shape") -> None:
-    """Add the choice between shapes and forms."""
-    sub.add_argument("--gauge", choices=("form", "shape"), default=default,
-                     help=f"form keeps size, shape divides size out (default {default})")  # fmt: skip
-    sub.add_argument("--no-unit", action="store_true",
-                     help="the coordinates have no unit: lengths are not written in mm")  # fmt: skip
 
 
 def cohort_of(

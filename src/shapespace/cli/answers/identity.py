@@ -6,26 +6,11 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from shapespace.cli.answers.common import add_cohort, cohort_of, finish
+from shapespace.cli.answers.common import cohort_of, finish
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.statistics.identity.rounds import IdentityOptions
-
-
-def add_verify(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of verification."""
-    _add_who(sub)
-    sub.add_argument("--curve", type=_counts, default=(), metavar="K,K,...",
-                     help="also compute the equal error rate for these numbers of modes")  # fmt: skip
-    sub.add_argument("--by", metavar="COLUMN", help="also report results for each value of this column of the probes")
-    sub.set_defaults(run=run_verify)
-
-
-def add_identify(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of identification."""
-    _add_who(sub)
-    sub.set_defaults(run=run_identify, curve=(), by=None)
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
@@ -48,31 +33,6 @@ def run_identify(arguments: argparse.Namespace) -> int:
     with steps(None, "searching", "score", quiet=arguments.quiet) as step:
         found = identify(cohort, options, on_step=step)
     return finish(found.answer(), arguments)
-
-
-def _add_who(sub: argparse.ArgumentParser) -> None:
-    add_cohort(sub, "coefficients")
-    sub.add_argument("--subject", default="subject", metavar="COLUMN",
-                     help="column of the subjects (default: subject)")  # fmt: skip
-    sub.add_argument("--gallery", metavar="EXPR",
-                     help="scans to enrol, such as expression=neutral or session!=2,3 (default: verify compares all "
-                     "scans with all, identify enrols the first scan of each subject)")  # fmt: skip
-    sub.add_argument("--probe", metavar="EXPR", help="scans to compare with the gallery (default: all others)")
-    sub.add_argument("--train", metavar="EXPR", help="training scans (default: the subjects of the other folds)")
-    sub.add_argument("--role", metavar="COLUMN",
-                     help="column with gallery, probe or train for each scan, instead of expressions (default: role, "
-                     "if the table has it)")  # fmt: skip
-    sub.add_argument(
-        "--folds", type=int, metavar="N", help="folds of subjects; the others train the scores (default 4)"
-    )
-    sub.add_argument("--scores", type=_names, metavar="LIST",
-                     help="scores among plda, cosine, mahalanobis and distance; the summary reports the first "
-                     "(default: all)")  # fmt: skip
-    sub.add_argument("--modes", type=int, metavar="K", help="number of leading coefficients to use (default: all)")
-    sub.add_argument("--no-uncertainty", action="store_true", help="ignore the uncertainty of the fits")
-    sub.add_argument("--draws", type=int, default=1000, metavar="N",
-                     help="bootstrap draws of subjects, for intervals (default 1000)")  # fmt: skip
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of folds and draws (default 0)")
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:
@@ -99,14 +59,3 @@ def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:
         **chosen,
     )
     return cohort, options
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(word) for word in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be numbers of modes such as 2,5,10, not {text!r}") from None

@@ -3,32 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from shapespace.cli.answers.common import add_cohort, add_gauge, cohort_of, finish
-
-
-def add(sub: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    add_cohort(sub)
-    add_gauge(sub)
-    what = sub.add_mutually_exclusive_group(required=True)
-    what.add_argument("--target", metavar="COLUMN", help="column of the number to predict")
-    what.add_argument("--predictor", type=Path, metavar="FILE.npz",
-                      help="predict DATA with the predictor.npz of an earlier run")  # fmt: skip
-    sub.add_argument("--predict", type=Path, metavar="NEW",
-                     help="also predict new shapes, of other subjects: a table or a folder")  # fmt: skip
-    sub.add_argument("--new-shapes", type=Path, metavar="DIR",
-                     help="results of fits, or meshes, of NEW (default: its folder)")  # fmt: skip
-    sub.add_argument("--subject", metavar="COLUMN", help="column of the subjects (default: subject)")
-    sub.add_argument("--folds", type=int, default=10, metavar="K",
-                     help="folds of the outer cross-validation (default 10)")  # fmt: skip
-    sub.add_argument("--permutations", type=int, default=199, metavar="P",
-                     help="number of permutations for p (default 199)")  # fmt: skip
-    sub.add_argument("--level", type=float, default=0.9, metavar="L",
-                     help="coverage of prediction intervals (default 0.9)")  # fmt: skip
-    sub.add_argument("--seed", type=int, default=0, metavar="S", help="seed of folds and draws (default 0)")
-    sub.set_defaults(run=run)
+from shapespace.cli.answers.common import cohort_of, finish
 
 
 def run(arguments: argparse.Namespace) -> int:

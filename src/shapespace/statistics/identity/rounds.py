@@ -27,22 +27,23 @@ class IdentityOptions:
     """Who is compared with whom, and how.
 
     Args:
-        subject: the column that says whom a scan shows.
-        gallery: who is enrolled, as `column=value,value` or `column!=value`; None for no gallery, all against all.
-        probe: who is searched for, in the same way; None for all who are neither enrolled nor learned from.
-        train: who is learned from; None parts the people into `folds`.
-        role: the column that says it all: gallery, probe or train. None takes the column `role` if there is one and
-            none of the three above is given.
-        folds: in how many parts people are tested while the others are learned from; None for 4, or fewer where there
-            are fewer than 8 people.
-        scores: names of `SCORES`; the first is the one that the figures are told of.
-        modes: leading coefficients of identity that are used; None for all.
-        curve: numbers of modes for which the equal error rate is found as well.
-        by: a column of which each value has its own figures.
+        subject: column of the subjects.
+        gallery: scans to enrol, such as `expression=neutral` or `session!=2,3` (default: verify compares all scans with
+            all, identify enrols the first scan of each subject).
+        probe: scans to compare with the gallery (default: all that are neither enrolled nor used for training).
+        train: training scans (default: the subjects of the other folds).
+        role: column with `gallery`, `probe` or `train` for each scan, instead of the expressions (default: role, if the
+            table has it).
+        folds: folds of subjects; the other folds train the scores (default: 4, fewer for fewer than 8 subjects).
+        scores: scores among `plda`, `cosine`, `mahalanobis` and `distance`; the summary reports the first (default:
+            all).
+        modes: number of leading coefficients of identity to use (default: all).
+        curve: also compute the equal error rate for these numbers of modes.
+        by: also report results for each value of this column of the probes.
         uncertainty: whether the PLDA score uses the estimated error of each fit.
-        draws: of people, for intervals.
-        seed: of folds and draws.
-        drop_missing: leave out scans of which a column that is used says nothing.
+        draws: number of bootstrap samples of subjects, from which intervals are computed.
+        seed: seed of folds and bootstrap samples.
+        drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 
     subject: str = "subject"

@@ -1,0 +1,688 @@
+"""All commands: their examples, their options, and the functions that run them.
+
+An option with a source takes its help, type, choices and default from the field of that class or function.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from shapespace.cli import run, values
+from shapespace.cli.answers import asymmetry, change, compare, identity, regress, score
+from shapespace.cli.options import Option, Source, advanced, basic
+
+# The classes and functions that options are read from.
+COHORT = Source("cohort.read", "CohortOptions")
+EXECUTION = Source("batch.execution", "ExecutionConfig")
+CORRESPOND = Source("correspondence.rounds", "CorrespondSettings")
+BUILD = Source("commands.build", "BuildSettings")
+QUALITY = Source("model.quality", "QualitySettings")
+QUALITY_TARGETS = Source("commands.quality", "QualityOptions")
+FIT = Source("fit.fit", "FitConfig")
+PAPER = Source("fit.paper_method", "Paper")
+IDENTITY = Source("statistics.identity.rounds", "IdentityOptions")
+COMPARE = Source("statistics.compare", "CompareOptions")
+CHANGE = Source("statistics.change_found", "ChangeSettings")
+ASYMMETRY = Source("statistics.asymmetry", "measure_asymmetry")
+REGRESS = Source("statistics.regression", "regress")
+SCORE = Source("statistics.score", "ScoreOptions")
+DEMO = Source("demo", "run_demo")
+FACES = Source("commands.data", "write_simulated_faces")
+ORGANS = Source("commands.data", "write_simulated_organs")
+BONES = Source("commands.data", "write_simulated_bones")
+SURFACE = Source("commands.surface", "write_surfaces")
+TRAIN = Source("commands.recognise", "recognise_train")
+STUDY = Source("commands.recognise", "recognise_study")
+VIEW = Source("viewer.serve", "serve")
+EXPORT = Source("commands.export", "export")
+CONVERT = Source("commands.convert", "convert")
+
+_UNITS = ("um", "mm", "cm", "inch", "m")
+_REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
+_GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there"}
+
+GROUPS: Mapping[str, str] = {
+    "data": "open data sets, simulated faces, organs and bones",
+    "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
+}
+"""Commands that have commands."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Args:
+        name: its words after `shapespace`.
+        summary: what it does, without a capital and a full stop.
+        examples: command lines.
+        run: takes the parsed arguments, and returns the exit code.
+        options: its arguments in the order of the help.
+        details: paragraphs on what it reads and writes, for `--help-all` and the reference.
+        json: whether it prints facts, with `--json`.
+        defaults: further attributes of the parsed arguments.
+    """
+
+    name: str
+    summary: str
+    examples: tuple[str, ...]
+    run: Callable[[argparse.Namespace], int]
+    arguments: tuple[Option, ...] = ()
+    details: tuple[str, ...] = ()
+    json: bool = True
+    defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def options(self) -> tuple[Option, ...]:
+        """All arguments, those included that every command has."""
+        return (*self.arguments, *((_JSON,) if self.json else ()), _QUIET)
+
+    @property
+    def usage(self) -> str:
+        """The command line, with what must be given."""
+        endings = {"+": "...", "*": "...]"}
+        words = ["shapespace", self.name]
+        for option in self.options:
+            if option.is_positional:
+                words.append(f"{'[' * (option.nargs == '*')}{option.metavar}{endings.get(option.nargs or '', '')}")
+        needed: dict[str, list[str]] = {}
+        for option in self.options:
+            if option.required:
+                needed.setdefault(option.either or option.names, []).append(f"{option.spellings[0]} {option.metavar}")
+        words += [f"({' | '.join(either)})" if len(either) > 1 else either[0] for either in needed.values()]
+        return " ".join([*words, "[options]"])
+
+
+_QUIET = basic("--quiet", help="do not show progress")
+_JSON = basic("--json", help="print the results as JSON")
+_OUTPUT = basic("-o --output", "DIR", "output folder", parse=Path, required=True)
+_RECURSIVE = advanced("--recursive", help="also search subfolders of the given folders")
+_STRICT_HELP = (
+    "refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them, with a note)"
+)
+_NO_OPEN = advanced("--no-open", help="do not open the report in a browser")
+_SEED = advanced("--seed", "S", "random seed", parse=values.natural, default=0)
+_MODEL_OF_FITS = advanced("--model", "MODEL.h5", "model file of the fits, if it was moved", parse=Path)
+_RESULTS = basic("results", "RESULTS", "a folder that fit wrote, or its coefficients.csv", parse=Path)
+_IDENTITY_RULES = (
+    "Scans are compared by the coefficients of their fits. DATA is a table or a folder of fits, as of compare, change, "
+    "asymmetry, regress and score."
+)
+_TARGET = "target"
+_MODES = "modes"
+
+
+def _execution(what: str) -> tuple[Option, ...]:
+    """Return the options of parallel and distributed runs; `what` is run."""
+    return (
+        basic("--jobs", "N", f"{what} in parallel (default: one per core)", EXECUTION),
+        advanced("--executor",
+                 help="local: processes on this machine; serial: one after the other in this process; dask: "
+                 "a Dask cluster", source=EXECUTION, field="kind", choices=("local", "serial", "dask")),
+        advanced("--dask", "ADDRESS", "address of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file "
+                 "(.json); without it --executor dask starts a cluster on this machine", EXECUTION),
+        advanced("--timeout", "S", f"skip any of the {what} that takes longer than S seconds (default: no limit)",
+                 EXECUTION, "timeout_s", parse=values.seconds),
+    )  # fmt: skip
+
+
+def _cohort(surfaces: str = "auto") -> tuple[Option, ...]:
+    """Return the options that name a cohort; `surfaces` is a default."""
+    return (
+        basic("data",
+              "DATA", "a table (CSV or .xlsx) with one row per shape, named in the column file, scan, specimen, "
+              "name or id; or a folder of fits, whose metadata are the table", parse=Path),
+        _OUTPUT,
+        basic("--shapes", "DIR", source=COHORT),
+        advanced("--model", "MODEL.h5", source=COHORT),
+        advanced("--surfaces", source=COHORT, default=surfaces),
+        advanced("--doubtful", source=COHORT),
+    )  # fmt: skip
+
+
+def _gauge(default: str = "shape") -> tuple[Option, ...]:
+    return (
+        advanced("--gauge", source=COHORT, default=default),
+        advanced("--no-unit",
+                 help="the coordinates have no unit, as those of digitised landmarks: lengths are not written "
+                 "in mm"),
+    )  # fmt: skip
+
+
+def _identity() -> tuple[Option, ...]:
+    """Return the options that verification and identification share."""
+    return (
+        *_cohort("coefficients"),
+        basic("--subject", "COLUMN", source=IDENTITY),
+        basic("--gallery", "EXPR", source=IDENTITY),
+        basic("--probe", "EXPR", source=IDENTITY),
+        advanced("--train", "EXPR", source=IDENTITY),
+        advanced("--role", "COLUMN", source=IDENTITY),
+        advanced("--folds", "N", source=IDENTITY),
+        advanced("--scores", "LIST", source=IDENTITY, default=None),
+        advanced("--modes", "K", source=IDENTITY),
+        advanced("--no-uncertainty", help="ignore the uncertainty of the fits", source=IDENTITY),
+        advanced("--draws", "N", source=IDENTITY),
+        advanced("--drop-missing", source=IDENTITY),
+        advanced("--seed", "S", source=IDENTITY),
+    )
+
+
+COMMANDS: tuple[Command, ...] = (
+    Command(
+        "demo",
+        "run both experiments of the paper on simulated faces, ending in a report", ("shapespace demo --quick",),
+        run.demo,
+        (
+            basic("-o --output --out", "DIR", "output folder; results of an earlier demo in it are replaced",
+                  default=Path("shapespace-demo"), parse=Path, dest="out"),
+            basic("--quick", source=DEMO),
+            basic("--no-open", help="do not open the report in a browser"),
+        ),
+        (
+            "Writes report.html and demo.json (settings, versions, times, the table of the paper's and the measured "
+            "values); in experiment1 and experiment2 the models, the scans, and the results of their fits as fit "
+            "--stages writes them. The scan of James is used if the data set is present. Needs the extra report.",
+        ),
+    ),
+    Command("data list",
+            "list the open data sets: licence, citation, source, size, hash", ("shapespace data list",), run.data_list),
+    Command(
+        "data get", "download, verify and convert an open data set", ("shapespace data get ict-facekit",), run.data_get,
+        (
+            basic("name", "NAME", "name of the data set, as data list prints it"),
+            basic("--to", "DIR", "also copy it to DIR/NAME", parse=Path),
+        ),
+    ),
+    Command(
+        "data faces", "write simulated corresponding faces (PLY) with labels.csv",
+        ("shapespace data faces -o faces --subjects 100 --expressions neutral",), run.data_faces,
+        (
+            _OUTPUT,
+            basic("--subjects", "N", source=FACES, parse=values.positive),
+            basic("--expressions", "LIST", source=FACES, parse=values.words),
+            basic("--raw", source=FACES),
+            basic("--seed", "S", source=FACES),
+            advanced("--source", source=FACES, choices=("bundled", "ict-facekit")),
+            advanced("--area", source=FACES, choices=("face", "face_and_head")),
+            advanced("--wide", source=FACES),
+            advanced("--intensity", "LIST", source=FACES, field="intensities", parse=values.shares),
+            advanced("--effect", "MM", source=FACES, field="effect_mm"),
+        ),
+        (
+            "Writes one PLY per subject and expression, labels.csv, landmarks.csv, and about.json with provenance and "
+            "licence, which build reads.",
+        ),
+    ),
+    Command(
+        "data organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
+        ("shapespace data organs -o organs --count 40",), run.data_organs,
+        (
+            _OUTPUT,
+            basic("--count", "N", source=ORGANS, parse=values.positive),
+            basic("--volumes", source=ORGANS),
+            basic("--seed", "S", source=ORGANS),
+        ),
+        ("Each organ is closed, in mm, with its own triangles and pose; the surfaces are not in correspondence.",),
+    ),
+    Command(
+        "data bones", "write simulated bones of two groups: raw scans (PLY), and their table bones.csv",
+        ("shapespace data bones -o bones --count 16",), run.data_bones,
+        (
+            _OUTPUT,
+            basic("--count", "N", source=BONES, parse=values.positive),
+            basic("--effect", "MM", source=BONES, field="effect_mm"),
+            basic("--seed", "S", source=BONES),
+        ),
+        (
+            "The bones are small skulls, in mm, each with its own triangles and pose; every third scan has a hole. "
+            "bones.csv has the columns file and group.",
+        ),
+    ),
+    Command(
+        "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in RAS mm",
+        ("shapespace surface masks -o surfaces --label 1", "shapespace fit model.h5 surfaces -o out --unit mm"),
+        run.surface,
+        (
+            basic("volumes", "MASK", "label volumes, or folders of them", nargs="+", parse=Path),
+            basic("-o --output", "DIR", "output folder; each surface is NAME.ply", parse=Path, required=True),
+            basic("--label", "N|N,N|all", source=SURFACE, field="labels", parse=values.labels),
+            basic("--smooth", "S", source=SURFACE, parse=values.smoothing),
+            advanced("--recursive", source=SURFACE),
+            advanced("--keep-pieces", source=SURFACE),
+            advanced("--max-memory", "SIZE", source=SURFACE, field="max_memory_bytes", parse=values.memory_bytes),
+        ),
+        (
+            "NAME is the name of the volume without its ending, with as much of the path as distinguishes volumes of "
+            "the same name. A volume that cannot be used is reported, a surface of that NAME from an earlier run is "
+            "removed, and the others are processed. Needs the extra volumes.",
+        ),
+    ),
+    Command(
+        "check",
+        "check meshes: contents, defects, and their repair before a fit", ("shapespace check scan.obj",), run.check,
+        (
+            basic("files", "FILE", "mesh files, or folders of them", nargs="+", parse=Path),
+            basic("--recursive", help="also search subfolders of the given folders"),
+            basic("--strict", help=_STRICT_HELP),
+        ),
+        (
+            "A finding is fixed (fitting repairs it), a note, or refused. The exit code is 0 if all files can be "
+            "used, 1 if some can, 2 if none can.",
+        ),
+    ),
+    Command(
+        "correspond", "bring raw scans into dense correspondence; no model is needed",
+        ("shapespace correspond scans -o same", "shapespace build same -o model.h5"), run.correspond,
+        (
+            basic("scans", "SCAN", "scans of one kind of object: files, folders, patterns, addresses or lists (.csv)",
+                  nargs="+"),
+            _OUTPUT,
+            basic("--template",
+                  "FILE", "template mesh, used unchanged (default: the scan closest to all others, meshed "
+                  "evenly)", parse=Path),
+            basic("--landmarks", "DIR", "landmarks of all or some scans: files with the names of the scans and another "
+                  "ending, in any landmark format", parse=Path),
+            basic("--symmetric", source=CORRESPOND),
+            basic("--vertices", "N", source=CORRESPOND, parse=values.positive),
+            advanced("--model",
+                     "MODEL.h5", "shape model of such objects: its mean is the template, and its fit to a scan "
+                     "initialises the first round", parse=Path),
+            advanced("--landmark-std", "SHARE", source=CORRESPOND, field="landmark_uncertainty", parse=values.share,
+                     formerly="--landmark-error"),
+            advanced("--rounds", "N", source=CORRESPOND, parse=values.positive),
+            _RECURSIVE,
+            advanced("--strict", help="exclude scans with coordinates that are NaN or infinite (default: remove the "
+                     "triangles that use them, with a note)"),
+            *_execution("scans"),
+            advanced("--seed", "S", source=CORRESPOND),
+        ),
+        (
+            "Writes NAME.corresponding.ply and NAME.correspond.json for each scan, and correspondence.json and "
+            "template/mean.ply for the run; landmarks.csv, which build reads, if scans have landmarks. Excluded scans "
+            "have a record with the reason, and the exit code is then 1. After Ctrl-C the same command continues the "
+            "run.",
+        ),
+        defaults=_GOES_ON,
+    ),
+    Command(
+        "build", "build a shape model from corresponding meshes: Procrustes and PCA",
+        ("shapespace build faces/*.ply -o model.h5 --modes auto",), run.build,
+        (
+            basic("meshes", "MESH", "mesh files, or folders of them", nargs="+", parse=Path),
+            basic("-o --output", "MODEL.h5", "the model", parse=Path, required=True),
+            basic("--modes", "K|auto|all", source=BUILD, parse=values.modes, either=_MODES),
+            basic("--variance", "SHARE", "as many modes as explain this share of the variance, such as 0.98",
+                  parse=values.share, either=_MODES),
+            basic("--gauge", source=BUILD),
+            basic("--landmarks", "FILE", source=BUILD),
+            basic("--unit", source=BUILD, choices=_UNITS),
+            basic("--provenance", "TEXT", source=BUILD),
+            basic("--licence", "TEXT", source=BUILD),
+            advanced("--recursive", source=BUILD),
+            advanced("--with-doubtful", source=BUILD),
+            advanced("--no-align", help="use the meshes in their pose, without alignment", source=BUILD),
+            advanced("--region", "NAME=FILE", "region of the surface for fit --region: a CSV file of vertices; can be "
+                     "repeated", parse=values.named_file, repeat=True),
+            advanced("--min-seen", "SHARE", source=BUILD, parse=values.share),
+            advanced("--representation", source=BUILD, choices=_REPRESENTATIONS),
+            advanced("--control-points", "MxN", source=BUILD, parse=values.control_points),
+            advanced("--additive", "LABELS.csv", source=BUILD, field="labels"),
+            advanced("--expression-variance", "SHARE", source=BUILD, parse=values.share),
+            advanced("--out-of-core", source=BUILD),
+            advanced("--keep-shapes", source=BUILD),
+            advanced("--add", "OLD.h5", source=BUILD),
+            advanced("--seed", "S", source=BUILD),
+        ),
+        (
+            "The meshes have the same vertices and triangles. Of a folder that correspond wrote, the surfaces in "
+            "correspondence are used; a folder of an unfinished run is refused. Surfaces whose unit differs from the "
+            "majority are converted to the unit of the majority, which --unit sets; with --gauge form or --no-align "
+            "they are refused. With fewer than four meshes, --modes auto keeps all modes. Modes that result from "
+            "alignment or rounding alone are always left out, and counted.",
+        ),
+    ),
+    Command(
+        "quality", "measure a shape model: compactness, generalisation, specificity",
+        ("shapespace quality faces -o quality",
+         "shapespace quality registered_a registered_b --scans scans -o quality"), run.quality,
+        (
+            basic("targets", "TARGET", "a folder of meshes in correspondence or a model; two are compared", nargs="+",
+                  parse=Path),
+            _OUTPUT,
+            basic("--scans", "FOLDER", source=QUALITY_TARGETS),
+            basic("--unseen", "FOLDER", source=QUALITY_TARGETS),
+            basic("--folds", "N|loo", source=QUALITY, parse=values.folds),
+            basic("--modes", "K", source=QUALITY, parse=values.positive),
+            basic("--samples", "N", source=QUALITY, parse=values.positive),
+            advanced("--gauge", source=QUALITY),
+            advanced("--no-align", help="use the meshes in their pose, without alignment", source=QUALITY),
+            advanced("--representation", source=QUALITY_TARGETS, field="representations", nargs="+",
+                     choices=_REPRESENTATIONS, default=("vertices",)),
+            advanced("--control-points", "MxN", source=QUALITY, parse=values.control_points),
+            advanced("--seed", "S", source=QUALITY),
+            *_execution("folds"),
+        ),
+        (
+            "Writes quality.json, and quality.png and quality.svg, which need the extra report. Of a folder with "
+            "fitted surfaces, those of fit --dense are used; of a folder that correspond wrote, its surfaces with "
+            "missing vertices. The numbers do not depend on the executor. Fewer than 200,000 vertices in all are "
+            "processed by one process.",
+        ),
+    ),
+    Command(
+        "info",
+        "print facts of a model, a mesh, a fit, a store or a folder of correspond", ("shapespace info model.h5",),
+        run.info,
+        (basic("file",
+               "FILE|DIR", "a model, a mesh, a record, a store, or a folder that correspond wrote", parse=Path),),
+        (
+            "Of a folder that correspond wrote: the number of scans in correspondence, excluded and conspicuous scans "
+            "with reasons, distances (medians, as shares of the size), missing vertices, folds, movement, CPU time. "
+            "Of a store: fits by status, shards, bytes, and damaged files.",
+        ),
+    ),
+    Command(
+        "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
+        ("shapespace fit model.h5 scan.obj -o out", "shapespace fit model.h5 scans -o out --dense",
+         "shapespace build out/*.dense.ply -o new.h5"), run.fit,
+        (
+            basic("model", "MODEL.h5", "the shape model", parse=Path),
+            basic("scans", "SCAN", "scans, folders, patterns, addresses such as s3://bucket/x, or lists of these",
+                  nargs="+"),
+            basic("-o --output", "DIR", "output folder; existing valid results are reused", parse=Path, required=True),
+            basic("--landmarks", "FILE|DIR", "landmarks that initialise and constrain the fit, with the names of the "
+                  "model's landmarks (at least three): a file for one scan, or a folder with a file for each scan, "
+                  "named after it; a list of scans may have a column landmarks instead", parse=Path),
+            basic("--unit", source=FIT, choices=("auto", *_UNITS)),
+            basic("--region",
+                  "NAME|FILE.csv", "restrict the fit, its distances and its status to a region of the model: "
+                  "its name, or a CSV file of vertices"),
+            basic("--dense", help="also write NAME.dense.ply, the fitted surface deformed further onto the scan",
+                  source=FIT),
+            basic("--stages", help="also write NAME.stages.npz, for figures"),
+            advanced("--recursive", help="also search subfolders of the given folders"),
+            advanced("--method",
+                     "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
+                     "paper's modified ICP", FIT),
+            advanced("--search", source=PAPER, choices=("auto", "vertices", "surface"), default="auto",
+                     help="closest points of --method paper: vertices of the scan (auto), as in the paper, or points "
+                     "on its triangles; the robust method always uses the triangles"),
+            advanced("--scale", source=FIT),
+            advanced("--max-iterations", "N", source=FIT, parse=values.positive),
+            advanced("--landmark-std", "MM", source=FIT, field="landmark_stddev_mm", parse=values.std_mm,
+                     formerly="--landmark-sd"),
+            advanced("--crop", "KIND:NUMBERS", source=FIT),
+            *_execution("scans"),
+            advanced("--again", help="fit all scans again, also those with valid results", either="results"),
+            # It has no effect; to be removed after the next release.
+            advanced("--resume", either="results", hidden=True),
+            advanced("--store",
+                     help="write the results to few files (the default from 10,000 scans on, and in a folder "
+                     "with such files); then only counts are printed"),
+            advanced("--strict", help=f"{_STRICT_HELP}; exit with 1 when a fit is doubtful", source=FIT),
+            advanced("--seed", "S", source=FIT),
+        ),
+        (
+            "Writes coefficients.csv, and for each scan NAME.fitted.ply and NAME.fit.json. A bad scan among several "
+            "becomes a row with the status failed and its reason. The same command again computes only what is "
+            "missing: a result is valid as long as scan, model, landmarks, settings and version are those that it was "
+            "computed from, and its files are complete. Surfaces that earlier runs wrote are not used as scans. One "
+            "run at a time writes into a folder.",
+        ),
+        defaults=_GOES_ON,
+    ),
+    Command(
+        "report", "write one HTML report of the fits, correspondence or study in a folder",
+        ("shapespace fit model.h5 scans -o out --stages", "shapespace report out"), run.report,
+        (
+            basic("folder", "DIR", "written by shapespace fit, correspond, recognise study or demo", parse=Path),
+            basic("-o --output", "FILE.html", "the report (default: DIR/report.html)", parse=Path),
+            basic("--labels", "FILE", "table of scans and labels (default: labels.csv in DIR or next to the scans)",
+                  parse=Path),
+            basic("--no-open", help="do not open the report in a browser"),
+            _MODEL_OF_FITS,
+        ),
+        ("Runs no fit. The report is one file that needs no network. Needs the extra report.",),
+    ),
+    Command(
+        "view", "view a shape model, fits or surfaces in correspondence in the browser", ("shapespace view model.h5",),
+        run.view,
+        (
+            basic("path", "MODEL.h5|DIR", "a model, or a folder that fit or correspond wrote", parse=Path),
+            basic("--model", "MODEL.h5", source=VIEW),
+            basic("--no-open", help="do not open a browser"),
+            basic("--port", "N", source=VIEW),
+            advanced("--host", "H", source=VIEW),
+            advanced("--max-upload-mb", "N", source=VIEW, parse=values.positive),
+        ),
+        (
+            "A scan that is dropped onto the page is fitted. The address that is printed contains a token, without "
+            "which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
+        ),
+        json=False,
+    ),
+    Command(
+        "recognise train", "train a classifier on fitted scans with labels",
+        ("shapespace recognise train out --labels labels.csv -o expressions.skops",
+         "shapespace recognise train out --labels labels.csv -o expressions.skops --relative --classifier "
+         "mean-direction"),
+        run.recognise_train,
+        (
+            _RESULTS,
+            basic("--labels", "FILE", "table of scans and their labels (column label or expression), with the column "
+                  "subject if known; scans of the same name are named by folder and name", parse=Path, required=True),
+            basic("-o --output", "FILE.skops", "the classifier", parse=Path, required=True),
+            basic("--classifier", "NAME", source=TRAIN),
+            basic("--relative", source=TRAIN),
+            basic("--neutral", "LABEL", source=TRAIN),
+            advanced("--confidence", "P", source=TRAIN, parse=values.probability),
+            advanced("--modes", "K", source=TRAIN, parse=values.positive),
+            advanced("--expression-of", "MODEL.h5", source=TRAIN),
+            advanced("--seed", "S", source=TRAIN),
+        ),
+        (
+            "Failed and doubtful fits and scans without a label are left out, and counted. The macro accuracy by "
+            "cross-validation over subjects is printed. Needs the extra recognise.",
+        ),
+    ),
+    Command(
+        "recognise predict", "classify fitted scans by a trained classifier, as a CSV table",
+        ("shapespace recognise predict expressions.skops out -o predictions.csv",), run.recognise_predict,
+        (
+            basic("classifier", "FILE.skops", "the classifier", parse=Path),
+            _RESULTS,
+            basic("--labels", "FILE", "CSV of file, label and subject: the neutral faces and their subjects, for a "
+                  "classifier trained with --relative", parse=Path),
+            basic("-o --output", "FILE.csv", "the predictions", parse=Path, required=True),
+            basic("--strict", help="exit with 1 when a fit is doubtful or a prediction unsure"),
+        ),
+        (
+            "The table has one row per scan: scan, status, prediction, the probability of each class as p_CLASS, "
+            "reason. Fits of another model than the classifier's are refused. The exit code is 1 if a scan has no "
+            "prediction, because its fit failed or its subject has no neutral face, and 2 if no scan has one.",
+        ),
+    ),
+    Command(
+        "recognise transfer", "transfer the expression of one person to another, from fits by an additive model",
+        ("shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply",),
+        run.recognise_transfer,
+        (
+            basic("model", "MODEL.h5", "made by build --additive LABELS.csv", parse=Path),
+            basic("person", "PERSON.fit.json", "fit of the person", parse=Path),
+            basic("expression", "EXPRESSION.fit.json", "fit of the expression", parse=Path),
+            basic("-o --output", "FILE.ply", "the mesh", parse=Path, required=True),
+        ),
+        ("Both fits must be by that model, with all its modes.",),
+    ),
+    Command(
+        "recognise study", "measure recognition on unseen subjects, ending in a report",
+        ("shapespace recognise study --data BU-3DFE --model model.h5 -o study",), run.recognise_study,
+        (
+            basic("-o --output", "DIR", "output folder; an interrupted study is continued", parse=Path,
+                  default=Path("shapespace-study")),
+            basic("--data", "DIR", "labelled scans: BU-3DFE, Bosphorus, or a folder with labels.csv", parse=Path),
+            basic("--model", "MODEL.h5", "shape model that is fitted to them", parse=Path),
+            basic("--folds", "N", "folds of subjects, fewer for fewer subjects", STUDY, default=10,
+                  parse=values.positive),
+            _SEED,
+            *_execution("fits"),
+            _NO_OPEN,
+        ),
+        (
+            "The study on simulated people is a script of the source, studies/recognition.py. Needs the extras report "
+            "and recognise.",
+        ),
+        defaults=_GOES_ON,
+    ),
+    Command(
+        "recognise verify", "test whether two scans are of one subject: error rates, likelihood ratios",
+        ("shapespace recognise verify scans.csv -o verified --gallery session=1",), identity.run_verify,
+        (
+            *_identity(),
+            advanced("--curve", "K,K,...", source=IDENTITY, parse=values.mode_counts),
+            advanced("--by", "COLUMN", source=IDENTITY),
+        ),
+        (
+            "Computes ROC and DET curves, the equal error rate, the rates of true accepts at given false accepts with "
+            "intervals over subjects, and calibrated likelihood ratios.", _IDENTITY_RULES,
+        ),
+    ),
+    Command(
+        "recognise identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
+        ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",), identity.run_identify,
+        _identity(),
+        (
+            "Computes ranks (CMC), and the rate of misses if subjects who are not enrolled are searched for too.",
+            _IDENTITY_RULES,
+        ),
+        defaults={"curve": (), "by": None},
+    ),
+    Command(
+        "compare", "test effects of groups and covariates on shape by linear models",
+        ("shapespace compare people.csv --formula '~ sex + age' -o sex-and-age",), compare.run,
+        (
+            *_cohort(),
+            basic("--formula",
+                  "FORMULA", "linear model of shape, such as '~ sex + age'; size and log_size are available "
+                  "too", required=True),
+            basic("--blocks", "COLUMN", source=COMPARE),
+            basic("--permutations", "N", source=COMPARE, parse=values.whole),
+            advanced("--random", "TERMS", source=COMPARE),
+            advanced("--type", source=COMPARE, field="anova_type", dest="anova_type"),
+            advanced("--level", "P", source=COMPARE),
+            advanced("--unequal-variances", source=COMPARE),
+            advanced("--effect-size", source=COMPARE),
+            advanced("--no-maps", help="skip the tests of each vertex", source=COMPARE),
+            advanced("--bumps", "MM", source=COMPARE, field="bump_width_mm"),
+            advanced("--drop-missing", source=COMPARE),
+            advanced("--seed", "S", source=COMPARE, parse=values.whole),
+            *_gauge(),
+        ),
+    ),
+    Command(
+        "change", "measure change between visits of the same subjects, in mm, and its noise",
+        ("shapespace change visits.csv -o change --order before,after",), change.run,
+        (
+            *_cohort(),
+            basic("--subject", "COLUMN", source=CHANGE),
+            basic("--time", "COLUMN", source=CHANGE),
+            basic("--order", "LIST", source=CHANGE),
+            basic("--group", "COLUMN", source=CHANGE),
+            basic("--stable", "WHAT", source=CHANGE),
+            advanced("--region", "NAME=FILE", "region whose volume is also reported: a CSV file of vertices; can be "
+                     "repeated (default: the regions of the model)", parse=values.named_file, repeat=True),
+            advanced("--landmarks", "FILE", "CSV of name,vertex, or landmarks.csv of correspond (default: those of the "
+                     "model)", parse=Path),
+            advanced("--unequal-variances", source=CHANGE),
+            advanced("--rate", source=CHANGE),
+            advanced("--permutations", "N", source=CHANGE, parse=values.whole),
+            advanced("--drop-missing", help="exclude shapes with missing values in the table (default: an error)"),
+            advanced("--seed", "S", source=CHANGE, parse=values.whole),
+        ),
+    ),
+    Command(
+        "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
+        ("shapespace asymmetry skulls.csv --surfaces dense -o asymmetry",), asymmetry.run,
+        (
+            *_cohort(),
+            basic("--subject", "COLUMN", source=ASYMMETRY),
+            basic("--reference", "COLUMN=VALUE", "group that scores are compared with (default: all)"),
+            basic("--pairs",
+                  "PAIRS.csv", "two columns of vertices or landmarks that mirror each other; one on the plane is "
+                  "paired with itself (default: found on the mean)", parse=Path),
+            advanced("--permutations", "P", source=ASYMMETRY, parse=values.whole),
+            advanced("--drop-missing", help="exclude shapes with missing values in the table (default: an error)"),
+            advanced("--seed", "S", source=ASYMMETRY, parse=values.whole),
+            *_gauge("form"),
+        ),
+    ),
+    Command(
+        "regress", "predict a number, such as age, from shape, with its cross-validated accuracy",
+        ("shapespace regress people.csv --target age -o age --predict new.csv",), regress.run,
+        (
+            *_cohort(),
+            basic("--target", "COLUMN", source=REGRESS, either=_TARGET, required=True),
+            basic("--predictor", "FILE.npz", "predict DATA with the predictor.npz of an earlier run", parse=Path,
+                  either=_TARGET, required=True),
+            basic("--predict", "NEW", "also predict new shapes, of other subjects: a table or a folder", parse=Path),
+            basic("--new-shapes", "DIR", "results of fits, or meshes, of NEW (default: its folder)", parse=Path),
+            basic("--subject", "COLUMN", source=REGRESS),
+            advanced("--folds", "K", source=REGRESS, parse=values.whole),
+            advanced("--permutations", "P", source=REGRESS, parse=values.whole),
+            advanced("--level", "L", source=REGRESS),
+            advanced("--drop-missing", help="exclude shapes with missing values in the table (default: an error)"),
+            advanced("--seed", "S", source=REGRESS, parse=values.whole),
+            *_gauge(),
+        ),
+    ),
+    Command(
+        "score", "score new subjects against a reference population: distance, percentile, z-map",
+        ("shapespace score patients -o scored --reference controls.csv",), score.run,
+        (
+            *_cohort("coefficients"),
+            basic("--reference", "DATA", "the population: a table or a folder of fits; its doubtful fits are excluded",
+                  parse=Path, required=True),
+            basic("--reference-shapes", "DIR", "its results of fits, or meshes (default: the folder of the reference)",
+                  parse=Path),
+            basic("--subject", "COLUMN", source=SCORE),
+            basic("--modes", "N", source=SCORE, parse=values.whole),
+            basic("--nearest", "N", source=SCORE, parse=values.whole),
+            advanced("--drop-missing", source=SCORE),
+            advanced("--seed", "S", source=SCORE, parse=values.whole),
+            *_gauge(),
+        ),
+    ),
+    Command(
+        "export", "export the fits of a store as single files, or as one table",
+        ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv"), run.export,
+        (
+            basic("store", "STORE", "a folder that shapespace fit wrote", parse=Path),
+            basic("names", "NAME", "names of the fits", nargs="*"),
+            basic("-o --output", "DIR", "output folder", parse=Path, default=Path("exported")),
+            basic("--all", help="export all fits"),
+            basic("--table", "FILE", source=EXPORT),
+        ),
+        (
+            "NAME.fit.json is that of fit to the byte, surfaces are exact to 6e-8 of their half extent. The table has "
+            "the columns of coefficients.csv, the rows of each shard in turn; in MATLAB it is a struct fits with b, "
+            "z, b_stddev, scan and so on. The exit code is 1 if some of the fits cannot be read, 2 if none can.",
+        ),
+    ),
+    Command(
+        "convert", "convert a shape model from or to the format of another tool",
+        ("shapespace convert femur.h5.json femur.h5", "shapespace convert model.h5 model.bin --to eos"), run.convert,
+        (
+            basic("source", "IN", "a model in any format that can be read", parse=Path),
+            basic("output", "OUT", "its extension sets the format; .h5 is the format of shapespace", parse=Path),
+            basic("--to", "FORMAT", source=CONVERT),
+            basic("--unit", "UNIT", "unit of IN, if its format does not contain it (default: mm)", choices=_UNITS),
+            advanced("--expressions", "FILE.bin", source=CONVERT),
+        ),
+        ("Prints what was kept, changed and left out.",),
+    ),
+)  # fmt: skip

@@ -1,0 +1,302 @@
+"""Options of commands, generated from the configuration classes and functions that the Python interface uses.
+
+A field's help, type, choices and default are read from the source text of its class, not from the class itself: to
+import the modules of the configuration classes takes seconds, and `--help` must take a fraction of one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import pkgutil
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+from shapespace.cli import values
+from shapespace.cli.printing import warn
+
+Container: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]
+"""A parser, or a group of its options."""
+NO_DEFAULT = argparse.SUPPRESS
+"""Default of a field whose value is not a literal: the class or the function itself sets it."""
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    "int": values.natural,
+    "float": values.number,
+    "str": str,
+    "Path": Path,
+    "tuple[str, ...]": values.words,
+}
+"""Annotation -> parser of its values."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a configuration class, or a parameter of a function.
+
+    Args:
+        help: its text in the docstring.
+        kinds: the types of its annotation, without None.
+        choices: the values of a `Literal`, else empty.
+        default: the default if it is a literal, None without one, else `NO_DEFAULT`.
+    """
+
+    help: str
+    kinds: tuple[str, ...]
+    choices: tuple[str, ...]
+    default: Any
+
+
+@dataclass(frozen=True)
+class Source:
+    """A configuration class or a function whose fields or parameters are options.
+
+    Args:
+        module: its module, without `shapespace.`.
+        name: its name there.
+    """
+
+    module: str
+    name: str
+
+    def field(self, name: str) -> Field:
+        """Return a field by its name."""
+        return _fields(self)[name]
+
+
+@dataclass(frozen=True)
+class Option:
+    """An argument of a command: positional, an option with a value, or a flag.
+
+    Args:
+        names: the spellings, such as `-o --output`; one word without dashes is a positional argument.
+        metavar: the name of its value; empty for a flag, or for a choice.
+        help: empty for the text of the field.
+        source: the class or function that takes the value; None for an option of the command line alone.
+        field: the field of `source`; empty for the long spelling in the form of a field.
+        basic: whether `--help` lists it.
+        parse: parser of the value; None for the one of the field's type.
+        choices: accepted values; empty for those of the field.
+        default: `NO_DEFAULT` for that of the field.
+        required: whether it must be given.
+        nargs: as of argparse.
+        repeat: whether it can be given several times.
+        dest: attribute of the parsed arguments; empty for the long spelling.
+        formerly: an earlier spelling, which still works in this release, with a message.
+        either: name of a group of options of which only one can be given; one must, if they are `required`.
+        hidden: whether no help lists it.
+    """
+
+    names: str
+    metavar: str = ""
+    help: str = ""
+    source: Source | None = None
+    field: str = ""
+    basic: bool = True
+    parse: Callable[[str], Any] | None = None
+    choices: tuple[str, ...] = ()
+    default: Any = NO_DEFAULT
+    required: bool = False
+    nargs: str | None = None
+    repeat: bool = False
+    dest: str = ""
+    formerly: str = ""
+    either: str = ""
+    hidden: bool = False
+
+    @property
+    def spellings(self) -> list[str]:
+        """All spellings, the short one first."""
+        return self.names.split()
+
+    @property
+    def is_positional(self) -> bool:
+        """Whether it is given without a name."""
+        return not self.names.startswith("-")
+
+    @property
+    def attribute(self) -> str:
+        """The attribute of the parsed arguments that contains its value."""
+        long = next((name for name in self.spellings if name.startswith("--")), self.names)
+        return self.dest or long.lstrip("-").replace("-", "_")
+
+    @property
+    def field_name(self) -> str:
+        """The name of the field that takes the value."""
+        return self.field or self.attribute.removeprefix("no_")
+
+    @property
+    def negates(self) -> bool:
+        """Whether it is a flag that makes a field false."""
+        return self.attribute.startswith("no_") and self.source is not None
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it takes no value."""
+        return not (self.is_positional or self.metavar or self.accepted)
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        """The values that it accepts; empty for all that can be parsed."""
+        return self.choices or (self._field.choices if self._field and not self.parse and not self.metavar else ())
+
+    @property
+    def initial(self) -> Any:
+        """Its value if it is not given, or `NO_DEFAULT`."""
+        if self.is_flag or self.default is not NO_DEFAULT:
+            return False if self.is_flag else self.default
+        return self._field.default if self._field else ([] if self.repeat else None)
+
+    @property
+    def text(self) -> str:
+        """Its help, with the default if the text does not state it."""
+        text = self.help or (self._field.help if self._field else "")
+        initial = self.initial
+        if self.is_flag or initial in (NO_DEFAULT, None, "", (), []) or "(default" in text or self.required:
+            return text
+        shown = " ".join(map(str, cast(Sequence[Any], initial))) if isinstance(initial, tuple) else initial
+        return f"{text} (default: {shown})"
+
+    @property
+    def _field(self) -> Field | None:
+        return self.source.field(self.field_name) if self.source else None
+
+    def add_to(self, group: Container, *, shown: bool) -> None:
+        """Add it to a parser or a group of one; `shown` is whether its help is."""
+        if self.formerly:
+            group.add_argument(
+                self.formerly, dest=self.attribute, type=self.parse or self._parser(), action=_Renamed, new=self.names,
+                default=NO_DEFAULT, help=argparse.SUPPRESS,
+            )  # fmt: skip
+        text = self.text.replace("%", "%%").replace("`", "")
+        keywords: dict[str, Any] = {"help": text if shown else argparse.SUPPRESS}
+        if self.is_flag:
+            group.add_argument(*self.spellings, action="store_true", dest=self.attribute, **keywords)
+            return
+        if not self.is_positional:
+            keywords |= {"required": self.required and not self.either, "dest": self.attribute}
+        if self.repeat:
+            keywords["action"] = "append"
+        if self.nargs:
+            keywords["nargs"] = self.nargs
+        if self.accepted:
+            keywords["choices"] = self.accepted
+        keywords |= {"type": self.parse or self._parser(), "default": self.initial}
+        group.add_argument(*self.spellings, metavar=self.metavar or None, **keywords)
+
+    def _parser(self) -> Callable[[str], Any]:
+        kinds = self._field.kinds if self._field else ()
+        return next((_PARSERS[kind] for kind in kinds if kind in _PARSERS), str)
+
+
+basic = Option
+"""An option that `--help` lists."""
+advanced = partial(Option, basic=False)
+"""An option that only `--help-all` lists."""
+
+
+class _Renamed(argparse.Action):
+    """An earlier spelling of an option that takes a value."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, *, new: str, **keywords: Any) -> None:
+        super().__init__(option_strings, dest, **keywords)
+        self.new = new
+
+    def __call__(self, _: object, namespace: argparse.Namespace, values: Any, option_string: str | None = None) -> None:
+        """Set the value, and print the new spelling."""
+        warn(f"{option_string} is now called {self.new}; the old name works in this release only.")
+        setattr(namespace, self.dest, values)
+
+
+def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: Any) -> dict[str, Any]:
+    """Return the values of the options that a configuration class or a function takes, by the names of its fields.
+
+    Args:
+        arguments: parsed arguments.
+        taker: the class or the function.
+        instead: values of some fields that the command line computes.
+    """
+    chosen: dict[str, Any] = {}
+    for option in arguments.command.options:
+        if option.source is not None and option.source.name == taker.__name__ and hasattr(arguments, option.attribute):
+            value = getattr(arguments, option.attribute)
+            chosen[option.field_name] = not value if option.negates else value
+    return {**chosen, **instead}
+
+
+# Reading of source text
+
+
+@cache
+def _tree(module: str) -> ast.Module:
+    source = pkgutil.get_data("shapespace", f"{module.replace('.', '/')}.py")
+    assert source is not None, module
+    return ast.parse(source)
+
+
+@cache
+def _fields(source: Source) -> Mapping[str, Field]:
+    """Return the fields of a class, or the parameters of a function, by name."""
+    [node] = [
+        node
+        for node in _tree(source.module).body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == source.name
+    ]
+    texts = _texts(ast.get_docstring(node) or "")
+    found: dict[str, tuple[ast.expr | None, ast.expr | None]] = {}
+    if isinstance(node, ast.ClassDef):
+        for part in node.body:
+            if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
+                found[part.target.id] = part.annotation, part.value
+    else:
+        plain, keyword = node.args.args, node.args.kwonlyargs
+        defaults = [*[None] * (len(plain) - len(node.args.defaults)), *node.args.defaults, *node.args.kw_defaults]
+        found = {one.arg: (one.annotation, default) for one, default in zip([*plain, *keyword], defaults, strict=True)}
+    return {
+        name: Field(texts.get(name, ""), *_kinds(source.module, annotation), _literal(default))
+        for name, (annotation, default) in found.items()
+    }
+
+
+def _texts(docstring: str) -> dict[str, str]:
+    """Return the texts of a docstring's section Args by name."""
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, re.MULTILINE | re.DOTALL)
+    entries = re.findall(r"^    (\w+): (.*?)(?=^    \w|\Z)", section[1] if section else "", re.MULTILINE | re.DOTALL)
+    return {name: " ".join(text.split()).removesuffix(".") for name, text in entries}
+
+
+def _literal(node: ast.expr | None) -> Any:
+    try:
+        return None if node is None else ast.literal_eval(node)
+    except ValueError:
+        return NO_DEFAULT
+
+
+def _kinds(module: str, annotation: ast.expr | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the types of an annotation, and the values of a `Literal` in it."""
+    parts = [annotation]
+    while isinstance(parts[0], ast.BinOp):
+        parts[:1] = [parts[0].left, parts[0].right]
+    kinds = [ast.unparse(part) for part in parts if part is not None]
+    choices: tuple[str, ...] = ()
+    for part in parts:
+        literal = _alias(module, part.id) if isinstance(part, ast.Name) else part
+        if isinstance(literal, ast.Subscript) and ast.unparse(literal.value) == "Literal":
+            value = ast.literal_eval(literal.slice)
+            choices += value if isinstance(value, tuple) else (value,)
+    return tuple(kind for kind in kinds if kind != "None"), choices
+
+
+@cache
+def _alias(module: str, name: str) -> ast.expr | None:
+    """Return what a name stands for in a module, followed through its imports from this package."""
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id == name:
+            return node.value
+        if isinstance(node, ast.ImportFrom) and name in [imported.name for imported in node.names]:
+            package, _, home = (node.module or "").partition(".")
+            return _alias(home, name) if package == "shapespace" else None
+    return None

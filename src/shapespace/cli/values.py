@@ -1,0 +1,159 @@
+"""Parsers of the values of options: each returns the value, or raises an error that says what is accepted."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+
+def whole(text: str) -> int:
+    """Return a whole number of any sign."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+
+
+def natural(text: str) -> int:
+    """Return a whole number of 0 or more."""
+    value = whole(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def positive(text: str) -> int:
+    """Return a whole number of 1 or more."""
+    value = natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def number(text: str) -> float:
+    """Return a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def probability(text: str) -> float:
+    """Return a number from 0 to 1."""
+    value = number(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError("must lie from 0 to 1")
+    return value
+
+
+def share(text: str) -> float:
+    """Return a number above 0 and at most 1."""
+    value = probability(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must lie above 0 and at most at 1")
+    return value
+
+
+def seconds(text: str) -> float:
+    """Return a time in seconds above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be seconds above 0, not {text!r}")
+    return value
+
+
+def std_mm(text: str) -> float:
+    """Return a standard deviation in mm; infinity is accepted."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"must be a number of millimetres above 0, or inf, not {text!r}")
+    return value
+
+
+def smoothing(text: str) -> float:
+    """Return a standard deviation in voxels, from 0 to 10."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 10:
+        raise argparse.ArgumentTypeError(f"must be a number from 0 to 10, not {text!r}")
+    return value
+
+
+def memory_bytes(text: str) -> int:
+    """Return a size such as 8G as bytes."""
+    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)([KMGT])(?:i?B)?", text, re.IGNORECASE | re.ASCII)
+    value = float(found[1]) * 1024 ** (1 + "KMGT".index(found[2].upper())) if found else 0.0
+    if not value:
+        raise argparse.ArgumentTypeError(f"must be a size such as 8G or 500M, not {text!r}")
+    return int(value)
+
+
+def folds(text: str) -> int | None:
+    """Return a number of folds; None for `loo`, leave-one-out."""
+    if text == "loo":
+        return None
+    value = natural(text)
+    if value < 2:
+        raise argparse.ArgumentTypeError("must be at least 2, or loo")
+    return value
+
+
+def modes(text: str) -> int | str:
+    """Return a number of modes, `auto` or `all`."""
+    return text if text in ("auto", "all") else positive(text)
+
+
+def control_points(text: str) -> tuple[int, int]:
+    """Return the counts of MxN."""
+    counts = text.lower().split("x")
+    if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
+        raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
+    return int(counts[0]), int(counts[1])
+
+
+def words(text: str) -> tuple[str, ...]:
+    """Return words separated by commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def shares(text: str) -> tuple[float, ...]:
+    """Return numbers above 0 and at most 1, separated by commas."""
+    return tuple(share(part) for part in text.split(","))
+
+
+def mode_counts(text: str) -> tuple[int, ...]:
+    """Return numbers of modes separated by commas."""
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be numbers of modes such as 2,5,10, not {text!r}") from None
+
+
+def labels(text: str) -> str | tuple[int, ...]:
+    """Return the labels of a volume, or `all`."""
+    if text == "all":
+        return text
+    try:
+        found = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        found = (0,)
+    if 0 in found:
+        raise argparse.ArgumentTypeError(f"must be all, or whole numbers other than 0 such as 1 or 1,2, not {text!r}")
+    return found
+
+
+def named_file(text: str) -> tuple[str, Path]:
+    """Return the name and the path of NAME=FILE."""
+    name, equals, file = text.partition("=")
+    if not (name.strip() and equals and file):
+        raise argparse.ArgumentTypeError(f"must be NAME=FILE, not {text!r}")
+    return name.strip(), Path(file)

@@ -1,0 +1,105 @@
+"""Options are those of the classes and functions that take them, and help lists the basic ones first."""
+
+import argparse
+import contextlib
+import dataclasses
+import importlib
+import inspect
+import io
+import time
+from typing import Any
+
+import pytest
+
+from conftest import Run
+from shapespace import cli
+from shapespace.cli import command_table
+from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.options import NO_DEFAULT, Option, Source
+
+SOURCES = [value for value in vars(command_table).values() if isinstance(value, Source)]
+MOST_BASIC = 10
+
+
+def printed(*arguments: str) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    assert ended.value.code == 0
+    return out.getvalue()
+
+
+def listed(help_text: str) -> set[str]:
+    """Return the long spellings that a help lists."""
+    rows = [line for line in help_text.splitlines() if line.startswith("  -")]
+    return {word.rstrip(",") for row in rows for word in row.strip().split("  ")[0].split() if word.startswith("--")}
+
+
+def long_names(options: list[Option]) -> set[str]:
+    return {name for option in options for name in option.spellings if name.startswith("--")}
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.name)
+def test_fields_read_from_source_text_are_those_of_the_imported_class_or_function(source: Source) -> None:
+    taker: Any = getattr(importlib.import_module(f"shapespace.{source.module}"), source.name)
+    defaults = {name: one.default for name, one in inspect.signature(taker).parameters.items()}
+    used = [o for command in COMMANDS for o in command.options if o.source == source]
+    assert used, "no option uses this source"
+    for option in used:
+        field = source.field(option.field_name)
+        assert option.field_name in defaults
+        if field.default is not NO_DEFAULT:
+            default = defaults[option.field_name]
+            assert field.default == (None if default is inspect.Parameter.empty else default)
+        if dataclasses.is_dataclass(taker):
+            assert option.field_name in {one.name for one in dataclasses.fields(taker)}
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command) -> None:
+    basic = [o for o in command.options if o.basic and not o.is_positional]
+    every = [o for o in command.options if not o.is_positional and not o.hidden]
+    assert len(basic) <= MOST_BASIC
+    help_options = {"--help", "--help-all"}
+    text = printed(*command.name.split(), "--help")
+    assert listed(text) == long_names(basic) | help_options
+    assert (f"shapespace {command.name} --help-all" in text) == (len(every) > len(basic))
+    assert listed(printed(*command.name.split(), "--help-all")) == long_names(every) | help_options
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_option_has_a_help_text(command: Command) -> None:
+    assert all(option.text for option in command.options if not option.hidden)
+
+
+@pytest.mark.parametrize(("old", "new", "words"), [
+    ("--landmark-sd", "--landmark-std", ["fit", "m.h5", "scan.ply", "-o", "out"]),
+    ("--landmark-error", "--landmark-std", ["correspond", "scans", "-o", "out"]),
+])  # fmt: skip
+def test_a_renamed_option_works_and_prints_its_new_name(
+    old: str, new: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    parsed: argparse.Namespace = cli.parser().parse_args([*words, old, "0.5"])
+    assert parsed.landmark_std == 0.5
+    assert (
+        capsys.readouterr().err == f"shapespace: {old} is now called {new}; the old name works in this release only.\n"
+    )
+    assert cli.parser().parse_args([*words, new, "0.5"]).landmark_std == 0.5
+    assert capsys.readouterr().err == ""
+
+
+def test_the_folder_of_the_demo_has_the_spelling_of_all_commands_and_its_earlier_one() -> None:
+    for name in ("-o", "--output", "--out"):
+        assert str(cli.parser().parse_args(["demo", name, "there"]).out) == "there"
+
+
+def test_an_option_of_no_command_is_refused_with_the_usage_of_the_command(run: Run) -> None:
+    outcome = run("fit", "model.h5", "scan.ply", "-o", "out", "--nonsense")
+    assert outcome.code == 2 and outcome.err.startswith("usage: ") and "--nonsense" in outcome.err
+
+
+def test_help_of_all_commands_takes_less_than_a_second_each() -> None:
+    for command in COMMANDS:
+        start = time.process_time()
+        printed(*command.name.split(), "--help-all")
+        assert time.process_time() - start < 1.0, command.name

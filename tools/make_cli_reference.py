@@ -1,0 +1,147 @@
+"""Write docs/cli.md and docs/cli/COMMAND.md: the reference of the command line, from the table of commands.
+
+A test compares the committed pages with the table, and asks for this command:
+
+    python tools/make_cli_reference.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.options import Option
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+GENERATED = "<!-- Written by tools/make_cli_reference.py; edit src/shapespace/cli/command_table.py. -->\n\n"
+PAGES = {
+    "data faces": ["data.md"],
+    "data get": ["data.md"],
+    "data list": ["data.md"],
+    "data organs": ["data.md"],
+    "data bones": ["data.md", "tutorial-bones.md"],
+    "surface": ["volumes.md", "tutorial-volumes.md"],
+    "check": ["mesh-formats.md"],
+    "correspond": ["correspondence.md", "landmarks.md"],
+    "build": ["model-file.md", "build-at-scale.md", "bspline.md", "missing.md", "recognise.md"],
+    "quality": ["quality.md"],
+    "info": ["stores.md"],
+    "fit": ["fit-results.md", "scale.md", "landmarks.md", "dense.md", "stores.md", "uncertainty.md"],
+    "report": ["report.md"],
+    "view": ["viewer.md"],
+    "recognise train": ["recognise.md", "statistics.md"],
+    "recognise predict": ["recognise.md"],
+    "recognise transfer": ["recognise.md"],
+    "recognise study": ["real-sets.md"],
+    "recognise verify": ["identity.md", "statistics.md"],
+    "recognise identify": ["identity.md", "statistics.md"],
+    "compare": ["compare.md", "statistics.md"],
+    "change": ["change.md", "statistics.md"],
+    "asymmetry": ["asymmetry.md", "statistics.md"],
+    "regress": ["regress.md", "statistics.md"],
+    "score": ["score.md", "statistics.md"],
+    "export": ["stores.md", "interop.md"],
+    "convert": ["model-formats.md"],
+    "demo": ["data.md", "report.md"],
+}
+"""Command -> pages that explain its topic."""
+INTRODUCTION = """# The command line
+
+Every command has `--help` with an example and its basic options, `--help-all` with all options, `--quiet` (no
+progress) and, where it prints facts, `--json` (on standard output). Progress and messages go to standard error.
+Without a terminal there is no progress bar: a step that takes longer than five seconds writes a line to the log, with
+the number done so far, and further lines at intervals that double up to one minute. One line reports that code is
+being compiled, which happens once on a machine and takes about half a minute.
+
+Where several meshes are expected, a folder stands for all meshes in it, in the order of their names. With
+`--recursive` it also stands for those in its subfolders, except links to folders and the folder of the results.
+Skipped folders and broken links are named on standard error; names that begin with a dot and files of other kinds are
+not.
+
+A renamed option works under its old name for one release, and prints the new name.
+
+## Commands
+
+| command | does |
+|---|---|
+"""
+EXIT_CODES = """
+## Exit codes
+
+| code | means |
+|---|---|
+| 0 | done |
+| 1 | done, but some of several scans or volumes failed or, under `--strict`, are doubtful |
+| 2 | the arguments are wrong, or no input could be used; one sentence on standard error, no traceback |
+| 130 | stopped by Ctrl-C; files are complete, `coefficients.csv` has every finished fit; the same command continues |
+| 143, 129 | the same by SIGTERM, by SIGHUP |
+
+`build`, `quality` and `info` end with 0 or 2.
+
+## A session
+
+```console
+$ shapespace data faces -o faces --subjects 12
+$ shapespace build faces -o model.h5 --modes 5 --provenance "12 simulated people" --licence CC0-1.0
+$ shapespace info model.h5
+$ shapespace data faces -o scans --subjects 1 --seed 7
+$ shapespace check scans
+$ shapespace fit model.h5 scans -o out
+$ shapespace info out/subject_000_neutral.fit.json
+$ shapespace fit model.h5 scans -o out --json
+```
+"""
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each page by its path in docs."""
+    index = "".join(f"| [`{command.name}`](cli/{file_name(command)}) | {command.summary} |\n" for command in COMMANDS)
+    return {
+        "cli.md": GENERATED + INTRODUCTION + index + EXIT_CODES,
+        **{f"cli/{file_name(command)}": GENERATED + page(command) for command in COMMANDS},
+    }
+
+
+def file_name(command: Command) -> str:
+    return f"{command.name.replace(' ', '-')}.md"
+
+
+def page(command: Command) -> str:
+    """Return the page of a command."""
+    text = f"# shapespace {command.name}\n\n{command.summary[0].upper()}{command.summary[1:]}.\n\n"
+    text += f"```text\n{command.usage}\n```\n\n"
+    text += "".join(f"{paragraph}\n\n" for paragraph in command.details)
+    text += "Example:\n\n```text\n" + "\n".join(command.examples) + "\n```\n"
+    shown = [option for option in command.options if not option.hidden]
+    for title, some in (
+        ("Arguments", [option for option in shown if option.is_positional]),
+        ("Options", [option for option in shown if option.basic and not option.is_positional]),
+        ("Advanced options", [option for option in shown if not option.basic]),
+    ):
+        if some:
+            text += f"\n## {title}\n\n| option | does |\n|---|---|\n" + "".join(map(row, some))
+    links = ", ".join(f"[{name.removesuffix('.md')}](../{name})" for name in PAGES[command.name])
+    return f"{text}\nSee also: {links}, [all commands](../cli.md).\n"
+
+
+def row(option: Option) -> str:
+    """Return the row of an option in the table of its command."""
+    value = option.metavar or "|".join(option.accepted)
+    names = [option.metavar] if option.is_positional else [f"{name} {value}".strip() for name in option.spellings]
+    text = option.text + (f" (formerly `{option.formerly}`)" if option.formerly else "")
+    cells = [", ".join(f"`{name}`" for name in names), text]
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+
+
+def main() -> None:
+    (DOCS / "cli").mkdir(exist_ok=True)
+    wanted = pages()
+    for old in (DOCS / "cli").glob("*.md"):
+        if f"cli/{old.name}" not in wanted:
+            old.unlink()
+    for name, text in wanted.items():
+        (DOCS / name).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
