@@ -25,7 +25,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.lazy import lazy_import
-from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
@@ -219,7 +219,7 @@ class QualitySettings:
         """Return the shape space of `meshes`, of the vertices that at least two of them show."""
         kept = np.ones(len(meshes[0].vertices), dtype=np.bool_)
         if not representation_named(self.representation, self.control_points).takes_holes:
-            kept = Kept.of(meshes, _ANY).vertices
+            kept = ObservedMeshes.of(meshes, _ANY).vertices
         model = ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
@@ -474,7 +474,7 @@ def measure_quality(
     if isinstance(target, ShapeModel):
         return _of_model(target, new, settings, on_step)
     whole = representation_named(settings.representation, settings.control_points).takes_holes
-    kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
+    kept = np.ones(vertices, dtype=np.bool_) if whole else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not kept.all():
         meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
     shapes = Shapes(meshes, scans, settings)

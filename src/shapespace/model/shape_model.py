@@ -26,7 +26,7 @@ from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.holes import fill_holes
-from shapespace.model.missing import MIN_SEEN, Kept, complete
+from shapespace.model.missing import MIN_SEEN, ObservedMeshes, complete
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
@@ -240,7 +240,7 @@ class ShapeModel:
         meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
         faces = common_faces(meshes)
         if not kind.takes_holes and len(meshes) > 1:
-            kept = Kept.of(meshes, min_seen)
+            kept = ObservedMeshes.of(meshes, min_seen)
             meshes, landmarks = kept.meshes, kept.landmarks(landmarks or {})
             faces, alignment_vertices = meshes[0].faces, kept.indices(alignment_vertices)
         shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]

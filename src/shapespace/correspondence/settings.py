@@ -1,0 +1,49 @@
+"""Settings of a correspondence, and the unit of its lengths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from shapespace.correspondence.register import ElasticSettings
+
+SIZE = 100.0
+"""The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
+FEWEST = 2
+"""Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
+
+
+@dataclass(frozen=True)
+class CorrespondSettings:
+    """How scans are brought into correspondence; lengths are shares of the object's size (RMS from its centroid).
+
+    Args:
+        vertices: of the template, about.
+        rounds: at most.
+        settled: a round that moves vertices by less (RMS over all) is the last.
+        first: the registration of round 1,
+        next: and of the later rounds, which begin at the leave-one-out predictions.
+        guided: whether later rounds begin at the leave-one-out predictions, or at the mean.
+        noise_share: noise variance of a prediction, as a share of a mode's mean variance.
+        fewest_seen: share of the template that a scan must observe,
+        fewest_covered: and share of a scan that the template must cover.
+        outlier_threshold: scans whose distance from their leave-one-out prediction is beyond this many times the median
+            are excluded as other objects.
+        symmetric: whether the object is its own mirror image: the mean is then made so, and the mirror images of the
+            other scans are training shapes too.
+        landmark_uncertainty: standard deviation of landmarks.
+        seed: of all random draws.
+    """
+
+    vertices: int = 10_000
+    rounds: int = 3
+    settled: float = 0.002
+    first: ElasticSettings = field(default_factory=ElasticSettings)
+    next: ElasticSettings = field(default_factory=ElasticSettings)
+    guided: bool = True
+    noise_share: float = 1.0
+    fewest_seen: float = 0.4
+    fewest_covered: float = 0.6
+    outlier_threshold: float = 3.0
+    symmetric: bool = False
+    landmark_uncertainty: float = 0.02
+    seed: int = 0
