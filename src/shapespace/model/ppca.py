@@ -155,8 +155,8 @@ def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
     values, vectors = np.linalg.eigh(flat @ flat.T)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     noise = max(float(values[modes:].sum()), _FIRST_NOISE * float(values.sum())) / (n * (flat.shape[1] - modes))
-    kept = np.maximum(values[:modes], 2 * n * noise)
-    W = (flat.T @ vectors[:, :modes]) * np.sqrt((kept / n - noise) / kept)
+    floored = np.maximum(values[:modes], 2 * n * noise)
+    W = (flat.T @ vectors[:, :modes]) * np.sqrt((floored / n - noise) / floored)
     return np.column_stack([W, np.zeros(len(W))]).reshape(vertices, 3, modes + 1), noise
 
 
