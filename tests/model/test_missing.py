@@ -228,7 +228,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match=r"blob_2\.ply"):
         ShapeModel.fit(holed(meshes, np.where(np.arange(4)[:, None] == 2, np.arange(200) < 2, True)))
     thirds = np.stack([np.arange(200) % 4 == i for i in range(4)])
-    with pytest.raises(InputError, match="No vertex is shown by 50 % of the meshes"):
+    with pytest.raises(InputError, match="No vertex is observed by 50 % of the meshes"):
         ShapeModel.fit(holed(meshes, thirds))
     with pytest.raises(InputError, match="share of meshes"):
         ObservedMeshes.of(meshes, 0.0)

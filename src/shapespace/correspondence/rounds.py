@@ -298,8 +298,8 @@ def _exclude_outliers(problem: _Problem, state: RegistrationState, order: Sequen
     rms = np.sqrt((observed * squares).sum(axis=1) / np.maximum(observed.sum(axis=1), 1))  # C14
     median = float(np.median(rms))
     outliers = {
-        i: f"another object, or wrongly placed: {distance / median:.1f} times as far as usual from what the other "
-        f"scans say of it{_wrong_names(state.registrations[i])}"
+        i: f"another object, or wrongly placed: {distance / median:.1f} times as far as usual from its leave-one-out "
+        f"prediction{_wrong_names(state.registrations[i])}"
         for i, distance in zip(order, rms, strict=True)
         if distance > settings.outlier_threshold * median  # C14
     }

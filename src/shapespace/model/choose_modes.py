@@ -117,7 +117,7 @@ def _errors_of_hidden(
         centred: (N, 3, V) all shapes less their mean.
         gram: (N, N) their products over all coordinates.
         held_out: (H,) indices of the shapes that the model does not know.
-        shown: (V,) True where a vertex is shown.
+        observed: (V,) True for the vertices that coefficients are computed from.
         candidates: (C,) numbers of modes.
         counted: (N, V) False where a vertex is no evidence; None for all.
     """

@@ -269,7 +269,7 @@ class _Target:
         return _Target(shape, seen, surface, engine, scan is not None)
 
     def cut_to(self, used: BoolArray) -> _Target:
-        """Return the same of the vertices `kept` (V,) alone."""
+        """Return the same with the vertices `used` (V,) only."""
         if used.all():
             return self
         shape = part_of(self.shape, used)
