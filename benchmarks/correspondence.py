@@ -29,7 +29,9 @@ from reliability import Femora
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.rounds import KeptRounds
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
+from shapespace.correspondence.result import Correspondence
+from shapespace.correspondence.rounds import correspond, run_here
+from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
@@ -220,10 +222,10 @@ def templates(of: Set, run: Callable[[list[Mesh], Mesh | None], Correspondence],
 
     A point of each scan is carried to another one by both; its two places there are compared, mm.
     """
-    from shapespace.correspondence.template import clean, resampled
+    from shapespace.correspondence.template import clean_scan, resample
 
     scans = [one.scan for one in of.known]
-    made = [run(scans, resampled(clean(scans[k]), vertices)) for k in (0, 1)]
+    made = [run(scans, resample(clean_scan(scans[k]), vertices)) for k in (0, 1)]
     rng, apart = np.random.default_rng(0), []
     for i in range(len(scans)):
         j = (i + 1) % len(scans)

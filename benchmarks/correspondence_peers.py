@@ -29,8 +29,8 @@ import peers
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.commands.correspond import CorrespondFiles, correspond_files
 from shapespace.commands.surface import write_surfaces
-from shapespace.correspondence.rounds import CorrespondSettings
-from shapespace.correspondence.template import choose, clean, resampled
+from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.template import choose_template, clean_scan, resample
 from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
@@ -250,8 +250,8 @@ def main() -> None:
     def template() -> Mesh:
         # The one that shapespace chooses, of the same turned scans by the same seed, in the pose it was given in.
         turned = [repair(scan.with_vertices(turns[name].apply(scan.vertices)))[0] for name, scan in scans.items()]
-        chosen = list(scans.values())[choose(turned, settings.seed).index]
-        return resampled(clean(chosen), arguments.vertices)
+        chosen = list(scans.values())[choose_template(turned, settings.seed).index]
+        return resample(clean_scan(chosen), arguments.vertices)
 
     ways: dict[str, Way] = {}
     even: Mesh | None = None

@@ -28,7 +28,7 @@ from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.surface import face_areas, vertex_normals
 from shapespace.io.files import make_folder, read_bytes, write_text
 from shapespace.model.floor import floor_mm
-from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import BSplineSurface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
@@ -272,7 +272,7 @@ def _trained_on(
         model = compared.model(damaged, kind, align=False)
     except InputError:
         return None
-    kept = Kept.of(damaged, MIN_SEEN).vertices
+    kept = ObservedMeshes.of(damaged, MIN_SEEN).vertices
     shown = kept if model.n_vertices == kept.sum() else np.ones(len(kept), dtype=np.bool_)
     return float(np.mean([floor_mm(model, mesh.vertices[shown]) for mesh in others]))
 

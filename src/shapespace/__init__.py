@@ -8,7 +8,8 @@ from shapespace.version import __version__
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.cohort.read import CohortOptions, read_cohort
-    from shapespace.correspondence.rounds import CorrespondSettings, correspond
+    from shapespace.correspondence.rounds import correspond
+    from shapespace.correspondence.settings import CorrespondSettings
     from shapespace.datasets.faces import load_faces
     from shapespace.datasets.simulated_scan import simulate_scan
     from shapespace.errors import ShapespaceError
@@ -108,7 +109,7 @@ _HOMES = {
     "CohortOptions": "cohort.read",
     "CompareOptions": "statistics.compare",
     "Comparison": "statistics.compare",
-    "CorrespondSettings": "correspondence.rounds",
+    "CorrespondSettings": "correspondence.settings",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
     "IdentityOptions": "statistics.identity.rounds",

@@ -11,10 +11,11 @@ from raw_blobs import marked, raw_blob
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.rounds import KeptRounds
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import CorrespondSettings, correspond
-from shapespace.correspondence.template import Glance, resampled
+from shapespace.correspondence.rounds import correspond
+from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.template import PoseModel, resample
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
@@ -32,13 +33,13 @@ def scans() -> list[Mesh]:
 def placed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The scans that were worked on, in order."""
     done: list[int] = []
-    place: Callable[[Workbench, PlaceTask], Placed] = Workbench.place
+    register: Callable[[RoundContext, RegistrationTask], ScanRegistration] = RoundContext.register
 
-    def counted(self: Workbench, task: PlaceTask) -> Placed:
+    def counted(self: RoundContext, task: RegistrationTask) -> ScanRegistration:
         done.append(task.index)
-        return place(self, task)
+        return register(self, task)
 
-    monkeypatch.setattr(Workbench, "place", counted)
+    monkeypatch.setattr(RoundContext, "register", counted)
     return done
 
 
@@ -92,11 +93,11 @@ def test_processes_give_what_one_process_gives(scans: list[Mesh], tmp_path: Path
 
 
 def test_what_poses_are_found_with_is_part_of_a_task(scans: list[Mesh], placed: list[int], tmp_path: Path) -> None:
-    mesh = resampled(scans[0], 400)
-    harmonics, task = Harmonics.of(mesh, 60), PlaceTask(0, scans[1], None, None, QUICK)
-    alone, taught = Glance.of(mesh), Glance.of(mesh, np.stack([mesh.vertices, 1.1 * mesh.vertices**2 / 100.0]))
-    for glance in (alone, taught, alone):
-        list(kept(tmp_path)(Workbench(mesh, harmonics, (glance,), 0), [task]))
+    mesh = resample(scans[0], 400)
+    harmonics, task = Harmonics.of(mesh, 60), RegistrationTask(0, scans[1], None, None, QUICK)
+    alone, taught = PoseModel.of(mesh), PoseModel.of(mesh, np.stack([mesh.vertices, 1.1 * mesh.vertices**2 / 100.0]))
+    for pose_model in (alone, taught, alone):
+        list(kept(tmp_path)(RoundContext(mesh, harmonics, (pose_model,), 0), [task]))
     assert placed == [0, 0]
 
 

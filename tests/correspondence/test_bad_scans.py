@@ -12,9 +12,10 @@ import shapespace as ss
 from raw_blobs import dispersion_mm, raw_blob, without_ball
 from shapespace.cli import main
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import Correspondence, CorrespondSettings
+from shapespace.correspondence.result import Correspondence
 from shapespace.correspondence.scans import copies, unit_ratios
-from shapespace.correspondence.template import clean, resampled
+from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.template import clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.remesh import is_sheet
@@ -101,7 +102,7 @@ def touching(mesh: Mesh) -> Mesh:
 
 @pytest.mark.parametrize("spoil", [finned, touching])
 def test_a_scan_that_is_no_clean_sheet_can_be_the_template(spoil: Callable[[Mesh], Mesh]) -> None:
-    template = resampled(clean(spoil(SCANS[0])), 500)
+    template = resample(clean_scan(spoil(SCANS[0])), 500)
     assert is_sheet(faces_of(template)) and 450 < len(template.vertices) < 600
     made = ss.correspond([spoil(scan) for scan in SCANS[:3]], ONE_ROUND)
     assert all(not scan.reason and scan.covered > 0.95 for scan in made.scans)

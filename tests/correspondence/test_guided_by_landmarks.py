@@ -9,13 +9,15 @@ from scipy.spatial.transform import Rotation
 
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
+from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks, agreed, astray
-from shapespace.correspondence.mirror import Mirror
-from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.landmarks import ScanLandmarks, consensus_landmarks, stray_landmarks
+from shapespace.correspondence.mirror import MirrorMap
+from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import CorrespondSettings, correspond, first_template
-from shapespace.correspondence.template import Glance, choose
+from shapespace.correspondence.rounds import correspond
+from shapespace.correspondence.settings import CorrespondSettings
+from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.landmarks import place_landmarks
@@ -88,8 +90,8 @@ def test_the_pull_is_the_posterior_mean_of_a_gaussian_process() -> None:
     harmonics, where, rng = Harmonics.of(mesh, 60), np.array([3, 80, 200]), np.random.default_rng(0)
     points = mesh.vertices[where] + rng.standard_normal((3, 3))
     places = place_landmarks(mesh, {str(k): mesh.vertices[k] for k in where})
-    moved = Marks(places, points, 0.02).pull(mesh.vertices, harmonics, 20.0, 80.0)
-    kernel = harmonics.functions @ np.diag(harmonics.kept(20.0)) @ harmonics.functions.T
+    moved = ScanLandmarks(places, points, 0.02).correction(mesh.vertices, harmonics, 20.0, 80.0)
+    kernel = harmonics.functions @ np.diag(harmonics.attenuation(20.0)) @ harmonics.functions.T
     noise = (0.02 * 80.0 / 10.0) ** 2 * kernel[where, where].mean()
     inverse = np.linalg.inv(kernel[np.ix_(where, where)] + noise * np.eye(3))
     np.testing.assert_allclose(moved, kernel[:, where] @ inverse @ (points - mesh.vertices[where]), atol=1e-9)
@@ -101,15 +103,15 @@ def test_landmarks_tell_the_pose_or_why_they_cannot() -> None:
     points = {str(k): mesh.vertices[k] for k in (5, 60, 150, 290)}
     places = place_landmarks(mesh, points)
     T = Similarity(0.4, Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), np.array([5.0, 0.0, -3.0]))
-    pose = Marks(places, T.apply(np.stack(list(points.values()))), 0.02).pose(mesh.vertices)
+    pose = ScanLandmarks(places, T.apply(np.stack(list(points.values()))), 0.02).pose(mesh.vertices)
     np.testing.assert_allclose(pose.apply(mesh.vertices), T.apply(mesh.vertices), atol=1e-6)
     image = T.apply(np.stack(list(points.values())) * FLIP)
     with pytest.raises(InputError, match="mirrored"):
-        Marks(places, image, 0.02).pose(mesh.vertices)
+        ScanLandmarks(places, image, 0.02).pose(mesh.vertices)
     with pytest.raises(InputError, match="check their names"):
-        Marks(places, image[[2, 0, 3, 1]] * [3.0, 1.0, 1.0], 0.02).pose(mesh.vertices)
+        ScanLandmarks(places, image[[2, 0, 3, 1]] * [3.0, 1.0, 1.0], 0.02).pose(mesh.vertices)
     two = places.select(["5", "60"])
-    assert Marks(two, two.interpolate(mesh.vertices), 0.02).pose(mesh.vertices) is None
+    assert ScanLandmarks(two, two.interpolate(mesh.vertices), 0.02).pose(mesh.vertices) is None
 
 
 def test_landmarks_as_good_as_on_a_line_tell_no_pose() -> None:
@@ -120,17 +122,17 @@ def test_landmarks_as_good_as_on_a_line_tell_no_pose() -> None:
     middle = ends.mean(axis=0) + np.array([0.5, 0.0, 0.0])
     corners = np.array([[poles[0]] * 3, [poles[1]] * 3, [*poles, 0]])
     line = SurfaceLandmarks(("a", "b", "c"), corners, np.array([[1.0, 0, 0], [1.0, 0, 0], [0.495, 0.495, 0.01]]))
-    assert Marks(line, np.stack([*ends, middle]), 0.02).pose(mesh.vertices) is None
-    assert Marks(line, np.stack([*ends, middle]), 1e-6).pose(mesh.vertices) is not None
+    assert ScanLandmarks(line, np.stack([*ends, middle]), 0.02).pose(mesh.vertices) is None
+    assert ScanLandmarks(line, np.stack([*ends, middle]), 1e-6).pose(mesh.vertices) is not None
 
 
 def test_landmarks_in_another_unit_or_far_off_are_left_out(blobs: list[RawBlob]) -> None:
     scan = marked(blobs[0])
-    assert astray(scan) == {}
+    assert stray_landmarks(scan) == {}
     metres = replace(scan, landmarks={name: point / 1000 + 500 for name, point in scan.landmarks.items()})
-    assert set(astray(metres)) == set(LANDMARKS)
+    assert set(stray_landmarks(metres)) == set(LANDMARKS)
     far = replace(scan, landmarks={**scan.landmarks, "nose": scan.landmarks["nose"] + [400, 0, 0]})
-    assert set(astray(far)) == {"nose"} and astray(far)["nose"] > 1
+    assert set(stray_landmarks(far)) == {"nose"} and stray_landmarks(far)["nose"] > 1
     made = correspond([metres, marked(blobs[1]), far], SETTINGS)
     assert not any(scan.reason for scan in made.scans)
     assert [bool(np.isfinite(scan.landmarks)) for scan in made.scans] == [False, True, True]
@@ -142,35 +144,34 @@ def test_a_template_whose_landmarks_have_wrong_names_does_not_set_the_others_asi
     wrong = dict(zip(points, [points[name] for name in ("back", "nose", "low", "left", "top")], strict=True))
     scans[0] = replace(scans[0], landmarks=wrong)
     first = first_template(scans, scans[0], SETTINGS)
-    assert not first.mesh.landmarks and "contradict those of most scans" in first.why
+    assert not first.mesh.landmarks and "contradict those of most scans" in first.origin
     made = correspond(scans, replace(SETTINGS, rounds=2), first=first)
     assert ["check their names" in scan.reason for scan in made.scans] == [True, False, False, False]
     assert first_template(scans, marked(blobs[4]), SETTINGS).mesh.landmarks
 
 
-def _bench(template: Mesh) -> tuple[Workbench, SurfaceLandmarks]:
+def _context(template: Mesh) -> tuple[RoundContext, SurfaceLandmarks]:
     harmonics = Harmonics.of(template, QUICK.harmonics)
     names = {name: template.vertices[(template.vertices @ np.array(at)).argmax()] for name, at in LANDMARKS.items()}
-    return Workbench(template, harmonics, (Glance.of(template),), 0), place_landmarks(template, names)
+    return RoundContext(template, harmonics, (PoseModel.of(template),), 0), place_landmarks(template, names)
 
 
 def test_landmarks_correct_a_pose_that_was_found_without_them() -> None:
     directions, faces = sphere(900)
     mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
-    bench, places = _bench(mesh)
+    context, places = _context(mesh)
     over = Similarity(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    marks = Marks(places, places.interpolate(mesh.vertices), 0.1)
-    placed = bench.place(PlaceTask(0, mesh, over, mesh.vertices, SHORT, marks=marks))
+    landmarks = ScanLandmarks(places, places.interpolate(mesh.vertices), 0.1)
+    placed = context.register(RegistrationTask(0, mesh, over, mesh.vertices, SHORT, landmarks=landmarks))
     assert np.trace(placed.T_scan_template.rotation) > 2.9
 
 
 def test_landmarks_of_another_size_than_their_scan_are_named() -> None:
     directions, faces = sphere(900)
     mesh = Mesh(directions * [100.0, 30.0, 45.0], faces)
-    bench, places = _bench(mesh)
-    placed = bench.place(
-        PlaceTask(0, mesh, None, None, QUICK, marks=Marks(places, places.interpolate(mesh.vertices) / 1000, 0.02))
-    )
+    context, places = _context(mesh)
+    landmarks = ScanLandmarks(places, places.interpolate(mesh.vertices) / 1000, 0.02)
+    placed = context.register(RegistrationTask(0, mesh, None, None, QUICK, landmarks=landmarks))
     assert "look at their unit" in placed.reason
 
 
@@ -191,7 +192,7 @@ def test_a_landmark_lies_on_the_mean_where_most_have_it() -> None:
     shapes = [blob(directions, z) for z in np.eye(5)]
     mean = Mesh(np.mean(shapes, axis=0), faces)
     told = [(x, {"a": x[7], "b": x[90]} if k else {"a": x[40]}) for k, x in enumerate(shapes)]
-    places = agreed(mean, told)
+    places = consensus_landmarks(mean, told)
     np.testing.assert_allclose(places.select(["a", "b"]).interpolate(mean.vertices), mean.vertices[[7, 90]], atol=1e-6)
 
 
@@ -199,10 +200,12 @@ def test_landmarks_in_one_place_that_are_quite_sure_pull_as_one(blobs: list[RawB
     directions, faces = sphere(300)
     mesh = Mesh(blob(directions, np.zeros(5)), faces)
     harmonics, at = Harmonics.of(mesh, 60), mesh.vertices[5]
-    twice = Marks(place_landmarks(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
-    once = Marks(place_landmarks(mesh, {"a": at}), at[None] + 1.0, 1e-300)
+    twice = ScanLandmarks(place_landmarks(mesh, {"a": at, "b": at}), np.stack([at, at]) + 1.0, 1e-300)
+    once = ScanLandmarks(place_landmarks(mesh, {"a": at}), at[None] + 1.0, 1e-300)
     x = mesh.vertices
-    np.testing.assert_allclose(twice.pull(x, harmonics, 20.0, 80.0), once.pull(x, harmonics, 20.0, 80.0), atol=1e-3)
+    np.testing.assert_allclose(
+        twice.correction(x, harmonics, 20.0, 80.0), once.correction(x, harmonics, 20.0, 80.0), atol=1e-3
+    )
     for uncertainty in (0.0, np.nan, -1.0):
         with pytest.raises(InputError, match="above 0"):
             correspond([blobs[0].scan, blobs[1].scan], replace(SETTINGS, landmark_uncertainty=uncertainty))
@@ -215,7 +218,7 @@ def test_shapes_that_are_wrongly_placed_do_not_move_landmarks() -> None:
     right, wrong = {"a": 7, "b": 150}, [{"a": 290, "b": 20}, {"a": 60, "b": 250}]
     marks = [*wrong, right, right, {"c": 30}]
     told = [(x, {name: x[k] for name, k in one.items()}) for x, one in zip(shapes, marks, strict=True)]
-    places = agreed(mean, told)
+    places = consensus_landmarks(mean, told)
     found = places.select(["a", "b", "c"]).interpolate(mean.vertices)
     np.testing.assert_allclose(found, mean.vertices[[7, 150, 30]], atol=1e-6)
 
@@ -257,8 +260,8 @@ def test_no_scan_of_a_symmetric_object_is_mirrored() -> None:
     mesh = Mesh(even(directions), faces, name="even")
     scans = [Mesh(mesh.vertices * (1 + 0.1 * k), np.roll(faces, k, axis=1), name=str(k)) for k in range(2)]
 
-    def run(bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
-        return [replace(bench.place(task), mirrored=0.5) for task in tasks]
+    def run(context: RoundContext, tasks: Sequence[RegistrationTask]) -> list[ScanRegistration]:
+        return [replace(context.register(task), mirror_ratio=0.5) for task in tasks]
 
     made = correspond(scans, replace(SETTINGS, symmetric=True), template=mesh, run=run)
     assert not any(scan.reason for scan in made.scans)
@@ -269,7 +272,7 @@ def test_no_scan_of_a_symmetric_object_is_mirrored() -> None:
 def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
     directions, faces = sphere(900)
     mesh = Mesh(even(directions), faces)
-    mirror = Mirror.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
+    mirror = MirrorMap.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
     assert np.linalg.norm(mirror.image(mesh.vertices) - mesh.vertices, axis=1).mean() < 1.0
     other = mesh.vertices + 15 * np.exp(-(((directions - [0.8, 0.6, 0]) / 0.5) ** 2).sum(axis=1))[:, None] * directions
     flipped = Mesh(other * FLIP, faces[:, ::-1])
@@ -280,9 +283,9 @@ def test_the_mirror_image_of_a_shape_is_its_surface_turned_over() -> None:
 def test_what_a_scan_lacks_its_mirror_image_lacks_on_the_other_side() -> None:
     directions, faces = sphere(900)
     mesh = Mesh(even(directions), faces)
-    mirror = Mirror.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
+    mirror = MirrorMap.of(mesh, Harmonics.of(mesh, 150), QUICK, 0)
     seen = (directions[:, 0] < 0.3).astype(np.float64)
-    shown = mirror.shown(seen[None])[0]
+    shown = mirror.observed(seen[None])[0]
     assert shown[directions[:, 0] > -0.1].all() and not shown[directions[:, 0] < -0.5].any()
 
 
@@ -298,7 +301,7 @@ def test_an_object_that_is_not_symmetric_is_refused_as_such() -> None:
 
 def test_a_scan_that_lacks_a_part_is_no_template(blobs: list[RawBlob]) -> None:
     scans = [cut(one, 0.3) if k % 2 else one.scan for k, one in enumerate(blobs)]
-    assert choose(scans, 0).index % 2 == 0
+    assert choose_template(scans, 0).index % 2 == 0
 
 
 def test_a_scan_that_lacks_a_part_takes_its_size_from_the_others() -> None:

@@ -77,7 +77,7 @@ def test_they_hold_the_variance_of_the_whole_covariance() -> None:
 
 def test_the_strongest_products_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
     model = blob_model(400)
-    monkeypatch.setattr(residual, "_MOST_PRODUCTS", 45)
+    monkeypatch.setattr(residual, "MOST_PRODUCTS", 45)
     made = residual._make(model, SETTINGS)
     assert share_held(made, covariance(model, SETTINGS, mirrored=False)) > 0.97
 

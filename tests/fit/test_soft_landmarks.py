@@ -9,7 +9,7 @@ from shapespace.datasets.organs import Organ
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.errors import InputError
 from shapespace.fit.fit import FitConfig, FitResult, fit_scan
-from shapespace.fit.marks import Marks
+from shapespace.fit.marks import LandmarkConstraint
 from shapespace.fit.moving_model import LinearShape, prepare
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
@@ -128,7 +128,7 @@ def test_the_term_of_landmarks_between_vertices_has_the_jacobian_of_their_places
         return T.apply(model.landmarks.interpolate(model.reconstruct(b)))
 
     aim = points_at(b) + rng.normal(0, 2.0, (6, 3))
-    marks = Marks.of(model, dict(zip(model.landmarks, aim, strict=True)), 2.0)
+    marks = LandmarkConstraint.of(model, dict(zip(model.landmarks, aim, strict=True)), 2.0)
     assert marks is not None
     np.testing.assert_allclose(marks.off_mm(surface, T), np.linalg.norm(points_at(b) - aim, axis=1), atol=1e-3)
     hessian, gradient = marks.equations(surface, T, model.n_modes)

@@ -11,7 +11,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
-from shapespace.model.missing import Kept, with_estimates
+from shapespace.model.missing import ObservedMeshes, with_estimates
 from shapespace.model.pca import principal_components
 from shapespace.model.ppca import ppca
 from shapespace.model.quality import QualitySettings, measure_quality
@@ -107,7 +107,7 @@ def test_missing_vertices_of_shapes_of_few_modes_are_found_again() -> None:
     meshes = noisy()
     shapes, shown = np.stack([m.vertices for m in meshes]), patches(meshes)
     found = ppca(filled_by_the_mean(shapes, shown), shown, 20)
-    off = [np.linalg.norm(found.place(i) - shapes[i][~shown[i]], axis=1) for i in range(len(shapes))]
+    off = [np.linalg.norm(found.estimate(i) - shapes[i][~shown[i]], axis=1) for i in range(len(shapes))]
     by_mean = np.linalg.norm(filled_by_the_mean(shapes, shown) - shapes, axis=2)[~shown]
     assert np.concatenate(off).mean() < 0.3 < by_mean.mean() / 4
     # Five modes made them; the width of the others is that of noise.
@@ -228,10 +228,10 @@ def test_what_cannot_be_used_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match=r"blob_2\.ply"):
         ShapeModel.fit(holed(meshes, np.where(np.arange(4)[:, None] == 2, np.arange(200) < 2, True)))
     thirds = np.stack([np.arange(200) % 4 == i for i in range(4)])
-    with pytest.raises(InputError, match="No vertex is shown by 50 % of the meshes"):
+    with pytest.raises(InputError, match="No vertex is observed by 50 % of the meshes"):
         ShapeModel.fit(holed(meshes, thirds))
     with pytest.raises(InputError, match="share of meshes"):
-        Kept.of(meshes, 0.0)
+        ObservedMeshes.of(meshes, 0.0)
     with pytest.raises(InputError, match="20 % of the meshes and two of them"):
         ShapeModel.fit(holed(meshes, thirds), min_seen=0.2)
     apart = np.stack([np.arange(200) < 120, np.arange(200) < 120, np.arange(200) > 117, np.arange(200) > 117])

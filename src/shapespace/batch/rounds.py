@@ -14,10 +14,10 @@ import numpy.typing as npt
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks
-from shapespace.correspondence.place import Placed, PlaceTask, Workbench
+from shapespace.correspondence.landmarks import ScanLandmarks
+from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.template import Glance
+from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
@@ -46,7 +46,7 @@ class KeptRounds:
     quiet: bool
     on_done: Callable[[], None]
 
-    def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> Iterator[Placed]:
+    def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterator[ScanRegistration]:
         """Yield what came of each task as it ends.
 
         Raises:
@@ -54,10 +54,10 @@ class KeptRounds:
             FitError: there are no workers, or none any more.
         """
         make_folder(self.folder)
-        shared = [_shared_hash(bench, glance) for glance in bench.glances]
+        shared = [_shared_hash(context, pose_model) for pose_model in context.pose_models]
         left: list[_KeptTask] = []
         for task in tasks:
-            kept = _KeptTask.of(task, self.folder / f"{_key(task, shared[task.glance])}.npz")
+            kept = _KeptTask.of(task, self.folder / f"{_key(task, shared[task.pose_model])}.npz")
             placed = _read(kept.file, task.index)
             if placed is None:
                 left.append(kept)
@@ -67,17 +67,17 @@ class KeptRounds:
         if not left:
             return
         executor = self.execution.executor(len(left), quiet=self.quiet)
-        work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.bench.npz", bench.seed)
-        work.remember(bench)
+        work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.context.npz", context.seed)
+        work.remember(context)
         if executor is not None:
-            work.save(bench)
+            work.save(context)
         with contextlib.closing((executor or Serial()).run(work, left)) as ended:
             for task, _ in ended:
                 self.on_done()
                 yield _read_again(task)
 
 
-def _read_again(task: _KeptTask) -> Placed:
+def _read_again(task: _KeptTask) -> ScanRegistration:
     placed = _read(task.file, task.index)
     if placed is None:
         raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
@@ -91,27 +91,35 @@ class _KeptTask:
     file: Path
     arrays: Arrays
     index: int
-    glance: int
+    pose_model: int
     settings: ElasticSettings
 
     @staticmethod
-    def of(task: PlaceTask, file: Path) -> _KeptTask:
-        return _KeptTask(file, _task_arrays(task), task.index, task.glance, task.settings)
+    def of(task: RegistrationTask, file: Path) -> _KeptTask:
+        return _KeptTask(file, _task_arrays(task), task.index, task.pose_model, task.settings)
 
-    def task(self) -> PlaceTask:
+    def task(self) -> RegistrationTask:
         arrays = self.arrays
         T = _pose_of(arrays) if "scale" in arrays else None
         scan = Mesh(arrays["vertices"], arrays.get("faces"), name=str(arrays["name"]))
-        return PlaceTask(self.index, scan, T, arrays.get("expected"), self.settings, self.glance, _marks_of(arrays))
+        return RegistrationTask(
+            index=self.index,
+            scan=scan,
+            T_scan_template=T,
+            expected=arrays.get("expected"),
+            settings=self.settings,
+            pose_model=self.pose_model,
+            landmarks=_landmarks_of(arrays),
+        )
 
 
 @dataclass(frozen=True)
 class RoundWork:
-    """Places scans by one workbench, for an executor.
+    """Places scans in one round context, for an executor.
 
     Args:
-        file: of the workbench, which each worker reads once.
-        seed: of the workbench.
+        file: of the round context, which each worker reads once.
+        seed: of the round context.
     """
 
     file: Path
@@ -124,7 +132,7 @@ class RoundWork:
             FileError: it cannot be written.
         """
         if _read(task.file, task.index) is None:
-            _write(task.file, self._bench().place(task.task()))
+            _write(task.file, self._context().register(task.task()))
 
     def give_up(self, task: _KeptTask, reason: str) -> None:
         """Keep in its file what sets a scan aside whose workers were lost.
@@ -132,47 +140,47 @@ class RoundWork:
         Raises:
             FileError: it cannot be written.
         """
-        _write(task.file, self._bench().nothing(task.index, reason))
+        _write(task.file, self._context().failed(task.index, reason))
 
-    def remember(self, bench: Workbench) -> None:
-        """Keep the workbench for tasks in this process."""
-        _benches.clear()
-        _benches[self.file] = bench
+    def remember(self, context: RoundContext) -> None:
+        """Keep the round context for tasks in this process."""
+        _contexts.clear()
+        _contexts[self.file] = context
 
-    def save(self, bench: Workbench) -> None:
-        """Write the workbench for other processes, if an earlier run has not.
+    def save(self, context: RoundContext) -> None:
+        """Write the round context for other processes, if an earlier run has not.
 
         Raises:
             FileError: it cannot be written.
         """
         if self.file.is_file():
             return
-        models = {f"glance_{number}": glance.model for number, glance in enumerate(bench.glances)}
-        models |= {} if bench.guide is None else {"guide": bench.guide}
-        parts = {"bench": _bench_arrays(bench)} | {name: _model_arrays(model) for name, model in models.items()}
+        models = {f"pose_model_{number}": one.model for number, one in enumerate(context.pose_models)}
+        models |= {} if context.guide is None else {"guide": context.guide}
+        parts = {"context": _context_arrays(context)} | {name: _model_arrays(model) for name, model in models.items()}
         arrays = {f"{part}.{name}": array for part, told in parts.items() for name, array in told.items()}
         write_arrays(self.file, arrays)
 
-    def _bench(self) -> Workbench:
-        if self.file not in _benches:
+    def _context(self) -> RoundContext:
+        if self.file not in _contexts:
             self.remember(self._load())
-        return _benches[self.file]
+        return _contexts[self.file]
 
-    def _load(self) -> Workbench:
+    def _load(self) -> RoundContext:
         parts: dict[str, Arrays] = {}
         for key, array in read_arrays(self.file, "remove it and run again").items():
             part, _, name = key.partition(".")
             parts.setdefault(part, {})[name] = array
-        arrays = parts.pop("bench")
+        arrays = parts.pop("context")
         guide = parts.pop("guide", None)
         mesh = Mesh(arrays["vertices"], arrays["faces"])
         harmonics = Harmonics(arrays["functions"], arrays["squared_frequency"], arrays["area"])
-        glances = tuple(Glance(_model_of(parts[f"glance_{number}"])) for number in range(len(parts)))
-        return Workbench(mesh, harmonics, glances, self.seed, None if guide is None else _model_of(guide))
+        pose_models = tuple(PoseModel(_model_of(parts[f"pose_model_{number}"])) for number in range(len(parts)))
+        return RoundContext(mesh, harmonics, pose_models, self.seed, None if guide is None else _model_of(guide))
 
 
-_benches: dict[Path, Workbench] = {}
-"""The workbench of this process, by its file."""
+_contexts: dict[Path, RoundContext] = {}
+"""The round context of this process, by its file."""
 
 
 def _model_arrays(m: ShapeModel) -> Arrays:
@@ -189,15 +197,15 @@ def _model_of(arrays: Arrays) -> ShapeModel:
     )
 
 
-def _bench_arrays(bench: Workbench) -> Arrays:
-    h = bench.harmonics
+def _context_arrays(context: RoundContext) -> Arrays:
+    h = context.harmonics
     return {
-        "vertices": np.array(bench.mesh.vertices), "faces": np.array(bench.mesh.faces), "functions": h.functions,
+        "vertices": np.array(context.mesh.vertices), "faces": np.array(context.mesh.faces), "functions": h.functions,
         "squared_frequency": h.squared_frequency, "area": h.area,
     }  # fmt: skip
 
 
-def _task_arrays(task: PlaceTask) -> Arrays:
+def _task_arrays(task: RegistrationTask) -> Arrays:
     arrays: Arrays = {"vertices": np.array(task.scan.vertices), "name": np.array(task.scan.name)}
     if task.scan.faces is not None:
         arrays["faces"] = np.array(task.scan.faces)
@@ -205,19 +213,22 @@ def _task_arrays(task: PlaceTask) -> Arrays:
         arrays |= _pose_arrays(task.T_scan_template)
     if task.expected is not None:
         arrays["expected"] = task.expected
-    if (marks := task.marks) is not None:
+    if (landmarks := task.landmarks) is not None:
         arrays |= {
-            "marks": marks.points, "mark_names": np.array(marks.places.names), "mark_corners": marks.places.corners,
-            "mark_weights": marks.places.barycentric, "mark_uncertainty": np.array(marks.uncertainty),
+            "landmarks": landmarks.points, "landmark_names": np.array(landmarks.places.names),
+            "landmark_corners": landmarks.places.corners, "landmark_weights": landmarks.places.barycentric,
+            "landmark_uncertainty": np.array(landmarks.uncertainty),
         }  # fmt: skip
     return arrays
 
 
-def _marks_of(arrays: Arrays) -> Marks | None:
-    if "marks" not in arrays:
+def _landmarks_of(arrays: Arrays) -> ScanLandmarks | None:
+    if "landmarks" not in arrays:
         return None
-    places = SurfaceLandmarks(tuple(map(str, arrays["mark_names"])), arrays["mark_corners"], arrays["mark_weights"])
-    return Marks(places, arrays["marks"], float(arrays["mark_uncertainty"]))
+    places = SurfaceLandmarks(
+        tuple(map(str, arrays["landmark_names"])), arrays["landmark_corners"], arrays["landmark_weights"]
+    )
+    return ScanLandmarks(places, arrays["landmarks"], float(arrays["landmark_uncertainty"]))
 
 
 def _pose_arrays(T: Similarity) -> Arrays:
@@ -228,49 +239,49 @@ def _pose_of(arrays: Mapping[str, npt.NDArray[Any]]) -> Similarity:
     return Similarity(float(arrays["scale"]), arrays["rotation"], arrays["translation"])
 
 
-def _shared_hash(bench: Workbench, glance: Glance) -> str:
-    """Return the hash of what the tasks that look through `glance` share."""
-    template = {"template": np.array(bench.mesh.vertices), "triangles": np.array(bench.mesh.faces)}
-    guide = "" if bench.guide is None else bench.guide.content_hash
-    return content_hash(_model_arrays(glance.model) | template, {"seed": bench.seed, "guide": guide})
+def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
+    """Return the hash of what the tasks that use `pose_model` share."""
+    template = {"template": np.array(context.mesh.vertices), "triangles": np.array(context.mesh.faces)}
+    guide = "" if context.guide is None else context.guide.content_hash
+    return content_hash(_model_arrays(pose_model.model) | template, {"seed": context.seed, "guide": guide})
 
 
-def _key(task: PlaceTask, shared: str) -> str:
+def _key(task: RegistrationTask, shared: str) -> str:
     return content_hash(_task_arrays(task), {"shared": shared, "settings": str(task.settings), "version": __version__})
 
 
-def _write(file: Path, placed: Placed) -> None:
+def _write(file: Path, placed: ScanRegistration) -> None:
     arrays: Arrays = {}
-    for number, one in enumerate((placed, *placed.rivals)):
+    for number, one in enumerate((placed, *placed.alternatives)):
         told: Arrays = {
-            "vertices": one.vertices, "seen": one.seen, "covered": np.array(one.covered),
-            "distance": np.array(one.distance), "seconds": np.array(one.seconds), "reason": np.array(one.reason),
-            "mirrored": np.array(one.mirrored), "by_landmarks": np.array(one.by_landmarks),
+            "vertices": one.vertices, "observed": one.observed, "covered": np.array(one.covered),
+            "distance": np.array(one.distance), "cpu_s": np.array(one.cpu_s), "reason": np.array(one.reason),
+            "mirror_ratio": np.array(one.mirror_ratio), "posed_by_landmarks": np.array(one.posed_by_landmarks),
             **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
         arrays |= {f"{name}_{number}": array for name, array in told.items()}
     write_arrays(file, arrays)
 
 
-def _read(file: Path, index: int) -> Placed | None:
+def _read(file: Path, index: int) -> ScanRegistration | None:
     """Return what was kept, or None where nothing is or it is damaged."""
     try:
         kept = read_arrays(file, "run again")
         count = sum(name.startswith("vertices_") for name in kept)
-        first, *rivals = [_kept_one(kept, number, index) for number in range(count)]
+        first, *alternatives = [_kept_one(kept, number, index) for number in range(count)]
     except (FileError, ValueError, KeyError):
         return None
-    return replace(first, rivals=tuple(rivals))
+    return replace(first, alternatives=tuple(alternatives))
 
 
-def _kept_one(kept: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> Placed:
+def _kept_one(kept: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> ScanRegistration:
     def of(name: str) -> npt.NDArray[Any]:
         return kept[f"{name}_{number}"]
 
     T = Similarity(float(of("scale")), of("rotation"), of("translation"))
     mean, p95, p99, largest = (float(length) for length in of("distance"))
-    return Placed(
-        index, np.asarray(of("vertices"), dtype=np.float64), T, np.asarray(of("seen"), dtype=np.bool_),
-        float(of("covered")), (mean, p95, p99, largest), float(of("seconds")), str(of("reason")),
-        mirrored=float(of("mirrored")), by_landmarks=bool(of("by_landmarks")),
+    return ScanRegistration(
+        index, np.asarray(of("vertices"), dtype=np.float64), T, np.asarray(of("observed"), dtype=np.bool_),
+        float(of("covered")), (mean, p95, p99, largest), float(of("cpu_s")), str(of("reason")),
+        mirror_ratio=float(of("mirror_ratio")), posed_by_landmarks=bool(of("posed_by_landmarks")),
     )  # fmt: skip

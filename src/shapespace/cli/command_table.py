@@ -18,7 +18,7 @@ from shapespace.cli.options import Option, Source, advanced, basic
 # The classes and functions that options are read from.
 COHORT = Source("cohort.read", "CohortOptions")
 EXECUTION = Source("batch.execution", "ExecutionConfig")
-CORRESPOND = Source("correspondence.rounds", "CorrespondSettings")
+CORRESPOND = Source("correspondence.settings", "CorrespondSettings")
 BUILD = Source("commands.build", "BuildSettings")
 QUALITY = Source("model.quality", "QualitySettings")
 QUALITY_TARGETS = Source("commands.quality", "QualityOptions")

@@ -192,7 +192,7 @@ def correspond(arguments: argparse.Namespace) -> int:
 
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.correspond import CorrespondFiles, correspond_files
-    from shapespace.correspondence.rounds import CorrespondSettings
+    from shapespace.correspondence.settings import CorrespondSettings
     from shapespace.schemas import to_json
 
     settings = CorrespondSettings(**given(arguments, CorrespondSettings))

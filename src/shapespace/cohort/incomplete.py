@@ -80,7 +80,7 @@ def completed_shapes(
     # Poses of the original shapes, which determine size and other vertices, do not depend on estimates.
     poses = [
         fit_similarity(own[there], aligned[there], with_scale=align and gauge == "shape") if align else None
-        for own, aligned, there in zip(masked, found.shapes, found.shown, strict=True)
+        for own, aligned, there in zip(masked, found.shapes, found.observed, strict=True)
     ]
     scales = np.array([1.0 if T is None else T.scale for T in poses])
     sizes = np.array([centroid_size(shape) for shape in found.shapes]) / scales

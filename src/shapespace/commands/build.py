@@ -24,7 +24,7 @@ from shapespace.io.labels import label_of, read_labels
 from shapespace.io.landmarks import is_of_vertices, read_landmarks, read_surface_landmarks
 from shapespace.io.regions import read_region
 from shapespace.model.choose_modes import MOST_SHAPES
-from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.model.streamed import Scratch, bytes_in_memory, too_large
@@ -220,7 +220,7 @@ def build(
             seed=settings.seed,
         )
         if regions:
-            kept = Kept.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
+            kept = ObservedMeshes.of(loaded, _min_seen(settings)) if settings.representation == "vertices" else None
             model = replace(model, regions=regions if kept is None else kept.regions(regions))
         model.save(output)
     return model, notes + _told(model, settings)
@@ -437,7 +437,7 @@ def _missing(meshes: Sequence[Mesh], landmarks: SurfaceLandmarks, settings: Buil
     told = [f"{missing} of {every} vertices are missing ({share:.1f} %), in {where} of {len(meshes)} meshes."]
     if settings.representation != "vertices":
         return told
-    kept = Kept.of(meshes, _min_seen(settings))
+    kept = ObservedMeshes.of(meshes, _min_seen(settings))
     if out := int((~kept.vertices).sum()):
         what = "1 vertex is" if out == 1 else f"{out} vertices are"
         told.append(

@@ -22,17 +22,13 @@ from shapespace.batch.results import Source
 from shapespace.batch.rounds import KeptRounds
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
-from shapespace.correspondence.landmarks import astray, without_astray
-from shapespace.correspondence.place import Placed, PlaceTask, Workbench
-from shapespace.correspondence.rounds import (
-    ENOUGH_TO_JUDGE,
-    Correspondence,
-    Corresponding,
-    CorrespondSettings,
-    correspond,
-    first_template,
-)
+from shapespace.correspondence.first_template import first_template
+from shapespace.correspondence.landmarks import stray_landmarks, without_stray_landmarks
+from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.result import Correspondence, Corresponding
+from shapespace.correspondence.rounds import ENOUGH_TO_JUDGE, correspond
 from shapespace.correspondence.scans import copies, unit_ratios
+from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import NON_FINITE, repair
@@ -239,14 +235,14 @@ class _Rounds:
     def __init__(self, folder: Path, execution: ExecutionConfig, *, quiet: bool) -> None:
         self._folder, self._execution_config, self._quiet, self._number = folder, execution, quiet, 0
 
-    def __call__(self, bench: Workbench, tasks: Sequence[PlaceTask]) -> list[Placed]:
+    def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> list[ScanRegistration]:
         self._number += 1
         with progress(len(tasks), f"round {self._number}: registering", "scan", quiet=self._quiet) as bar:
 
             def one_more() -> None:
                 bar.update()
 
-            return list(KeptRounds(self._folder, self._execution_config, self._quiet, one_more)(bench, tasks))
+            return list(KeptRounds(self._folder, self._execution_config, self._quiet, one_more)(context, tasks))
 
 
 @dataclass(frozen=True)
@@ -298,7 +294,7 @@ def _looked_at(scan: Mesh, *, strict: bool) -> tuple[Mesh, list[str]]:
     """
     mesh, findings = repair(scan, strict=strict)
     notes = [f"{one.what} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.what]
-    return without_astray(mesh), [*notes, *_told_astray(mesh)]
+    return without_stray_landmarks(mesh), [*notes, *_told_astray(mesh)]
 
 
 def _far_notes(scan: Mesh, placed: SurfaceLandmarks) -> list[str]:
@@ -338,7 +334,7 @@ def _report_landmarks(records: Sequence[CorrespondRecord], read: _Read, say: _Sa
 
 def _told_astray(scan: Mesh) -> list[str]:
     """Return a sentence on landmarks that are none of `scan`, where it has such."""
-    off = astray(scan)
+    off = stray_landmarks(scan)
     if not off:
         return []
     if len(off) == len(scan.landmarks):

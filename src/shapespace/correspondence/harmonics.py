@@ -1,4 +1,4 @@
-"""Smooth functions on a surface: the eigenfunctions of its Laplacian, and diffusion of heat in them."""
+"""Smooth functions on a surface: the eigenfunctions of its Laplacian, and diffusion of heat in them (C1)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SHIFT = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """The slowest functions phi_k on a surface: -Laplacian phi_k = frequency_k^2 phi_k (Vallet and Levy 2008).
+    """The smoothest functions phi_k on a surface: -Laplacian phi_k = frequency_k^2 phi_k (Vallet and Levy 2008).
 
     Args:
         functions: (V, K) float64, orthonormal by area: functions^T diag(area) functions = I.
@@ -32,7 +32,7 @@ class Harmonics:
 
     @staticmethod
     def of(mesh: Mesh, count: int) -> Harmonics:
-        """Return the `count` slowest functions on `mesh`, which must have triangles; as many as it has vertices less 1.
+        """Return the `count` functions of lowest frequency on `mesh`, which must have triangles; at most V - 2.
 
         The sign of each function is such that its largest value is positive, so that the same mesh gives the same ones.
         """
@@ -42,8 +42,8 @@ class Harmonics:
         shift = _SHIFT * 4 * np.pi * count / float(area.sum())
         # Without a start of its own ARPACK draws one at random.
         start = np.ones(len(area)) + 0.1 * np.cos(np.arange(len(area)))
-        found = cast(Any, eigsh)(laplacian.tocsc(), k=count, M=mass, sigma=-shift, v0=start)
-        squared, functions = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.float64)
+        squared, functions = cast(Any, eigsh)(laplacian.tocsc(), k=count, M=mass, sigma=-shift, v0=start)
+        squared, functions = np.asarray(squared, dtype=np.float64), np.asarray(functions, dtype=np.float64)
         largest = functions[np.abs(functions).argmax(axis=0), np.arange(functions.shape[1])]
         functions = np.ascontiguousarray(functions * np.sign(largest))
         return Harmonics(functions, np.maximum(squared, 0.0), area)
@@ -56,10 +56,10 @@ class Harmonics:
         """Return (K, C) of the functions in `field` (V, C)."""
         return self.functions.T @ (self.area[:, None] * field)
 
-    def kept(self, range_mm: float) -> FloatArray:
-        """Return (K,) what is left of each function after heat has spread by `range_mm`."""
-        return np.exp(-0.5 * self.squared_frequency * range_mm**2)
+    def attenuation(self, range_mm: float) -> FloatArray:
+        """Return (K,) the factor of each function after heat has diffused by `range_mm`."""
+        return np.exp(-0.5 * self.squared_frequency * range_mm**2)  # C1
 
     def diffused(self, field: FloatArray, range_mm: float) -> FloatArray:
-        """Return `field` (V, C) after heat has spread by `range_mm`, the standard deviation of a peak."""
-        return self.functions @ (self.kept(range_mm)[:, None] * self.coefficients(field))
+        """Return `field` (V, C) after heat has diffused by `range_mm`, the standard deviation of a peak."""
+        return self.functions @ (self.attenuation(range_mm)[:, None] * self.coefficients(field))  # C1

@@ -1,12 +1,7 @@
-"""Landmarks in a correspondence: where on the template each named point lies, and how it pulls a registration.
+"""Landmarks in a correspondence: the place of each named point on the template, and its pull on a registration.
 
-A landmark is a soft constraint. After each step of (1) in `register`, what is left between the landmarks y of a scan
-and their places x on the surface is spread over the surface as a Gaussian process would, whose covariance is the heat
-kernel H_r of the range r, and whose observations have the landmarks' own uncertainty:
-
-    d <- d + H_r(., x) (H_r(x, x) + (s / a)^2 h I)^-1 (y - x)                         (2)
-
-h is the mean of the kernel's diagonal, s the uncertainty, a = r / 2 how far a surface is thought off at that range.
+A landmark is a soft constraint. After each step of `register`, the offset between the landmarks of a scan and their
+places on the surface is spread over the surface as a Gaussian process predicts it (C8 of docs/correspondence.md).
 """
 
 from __future__ import annotations
@@ -26,21 +21,21 @@ from shapespace.geometry.surface import faces_of, rms_size
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 FEWEST = 3
-"""So many give a pose."""
+"""Landmarks: fewer do not determine a pose."""
 _OFF_SHARE = 0.5
 _AGREE = 0.2
 """Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
 _MIRROR_SHARE = 0.5
 _FIRMEST = 1e-3
-"""Two landmarks in one place leave (2) without a solution where s / a is 0."""
+"""Two landmarks in one place leave (C8) without a solution where s / a is 0."""
 _SURE = 3.0
-"""Landmarks on a line, but for less than this many times their uncertainty, do not tell how a shape is turned."""
-_ASTRAY = 0.25
-"""A landmark that lies farther than this share of a scan's size off its surface is none of it."""
+"""Landmarks on a line, but for less than this many times their uncertainty, do not determine its rotation."""
+_STRAY = 0.25
+"""A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Marks:
+class ScanLandmarks:
     """The landmarks of one scan that the template has too.
 
     Args:
@@ -54,22 +49,22 @@ class Marks:
     uncertainty: float
 
     @staticmethod
-    def shared(places: SurfaceLandmarks, scan: Mesh, uncertainty: float) -> Marks | None:
+    def shared(places: SurfaceLandmarks, scan: Mesh, uncertainty: float) -> ScanLandmarks | None:
         """Return those that `scan` has of `places`; None where it has none."""
         names = [name for name in places.names if name in scan.landmarks]
         if not names:
             return None
-        return Marks(places.select(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
+        return ScanLandmarks(places.select(names), np.stack([scan.landmarks[name] for name in names]), uncertainty)
 
-    def moved(self, T: Similarity) -> Marks:
-        """Return the same landmarks with their points moved by `T`."""
-        return Marks(self.places, T.apply(self.points), self.uncertainty)
+    def transformed(self, T: Similarity) -> ScanLandmarks:
+        """Return the same landmarks with their points transformed by `T`."""
+        return ScanLandmarks(self.places, T.apply(self.points), self.uncertainty)
 
     def pose(self, vertices: FloatArray) -> Similarity | None:
         """Return T_scan_template by the landmarks, or None where they are too few, or as good as on a line.
 
         Raises:
-            InputError: they are those of a mirror image, or of something else.
+            InputError: they are those of a mirror image, or contradict the template.
         """
         if len(self.points) < FEWEST:
             return None
@@ -96,18 +91,18 @@ class Marks:
             )
         return T
 
-    def pull(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
-        """Return (V, 3) the movement (2) of the surface `x` (V, 3), in whose frame the points must be."""
+    def correction(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
+        """Return (V, 3) the movement (C8) of the surface `x` (V, 3), in whose frame the points must be."""
         functions = self.places.interpolate(harmonics.functions)
-        spread = functions * harmonics.kept(range_mm)
-        kernel = spread @ functions.T
+        attenuated = functions * harmonics.attenuation(range_mm)
+        kernel = attenuated @ functions.T
         ratio = max(self.uncertainty * size_mm / (_OFF_SHARE * range_mm), _FIRMEST)
-        loaded = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
-        left = self.points - self.places.interpolate(x)
-        pulled: FloatArray = np.asarray(np.linalg.solve(loaded, left), dtype=np.float64)
-        return harmonics.functions @ (spread.T @ pulled)
+        covariance = kernel + ratio**2 * np.diag(kernel).mean() * np.eye(len(kernel))
+        offsets = self.points - self.places.interpolate(x)
+        weights: FloatArray = np.asarray(np.linalg.solve(covariance, offsets), dtype=np.float64)
+        return harmonics.functions @ (attenuated.T @ weights)  # C8
 
-    def rms(self, vertices: FloatArray) -> float:
+    def rms_distance(self, vertices: FloatArray) -> float:
         """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
         return _rms(self.places.interpolate(vertices) - self.points)
 
@@ -120,28 +115,28 @@ def on_triangles(mesh: Mesh, points: FloatArray) -> tuple[IntArray, FloatArray]:
     return np.asarray(faces_of(mesh)[near.triangle], dtype=np.int32), near.barycentric
 
 
-def astray(scan: Mesh) -> dict[str, float]:
-    """Return the landmarks of `scan` that are none of it: name -> distance off its surface, as a share of its size."""
+def stray_landmarks(scan: Mesh) -> dict[str, float]:
+    """Return the landmarks far off the surface of `scan`: name -> distance off its surface, as a share of its size."""
     if not scan.landmarks:
         return {}
-    off = build_engine(scan).query(np.stack(list(scan.landmarks.values()))).distance / rms_size(scan.vertices)
-    return {name: float(share) for name, share in zip(scan.landmarks, off, strict=True) if share > _ASTRAY}
+    distance = build_engine(scan).query(np.stack(list(scan.landmarks.values()))).distance / rms_size(scan.vertices)
+    return {name: float(share) for name, share in zip(scan.landmarks, distance, strict=True) if share > _STRAY}
 
 
-def without_astray(scan: Mesh) -> Mesh:
-    """Return `scan` without the landmarks that are `astray`."""
-    off = astray(scan)
-    return replace(scan, landmarks={name: point for name, point in scan.landmarks.items() if name not in off})
+def without_stray_landmarks(scan: Mesh) -> Mesh:
+    """Return `scan` without its stray landmarks."""
+    stray = stray_landmarks(scan)
+    return replace(scan, landmarks={name: point for name, point in scan.landmarks.items() if name not in stray})
 
 
-def unlike_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:
+def contradicts_most(template: Mesh, scans: Iterable[Mesh], uncertainty: float) -> bool:
     """Return whether most of the `scans` whose landmarks can be compared with those of `template` contradict them."""
     places = place_landmarks(template, template.landmarks)
-    told = [marks for scan in scans if (marks := Marks.shared(places, scan, uncertainty)) is not None]
+    shared = [ScanLandmarks.shared(places, scan, uncertainty) for scan in scans]
     refused, agreeing = 0, 0
-    for marks in told:
+    for landmarks in shared:
         try:
-            agreeing += marks.pose(template.vertices) is not None
+            agreeing += landmarks is not None and landmarks.pose(template.vertices) is not None
         except InputError:
             refused += 1
     return refused > agreeing
@@ -151,8 +146,8 @@ def _rms(difference: FloatArray) -> float:
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
-def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> SurfaceLandmarks:
-    """Return where on `mean` the landmarks of shapes lie: the middle of where those have them that agree with most.
+def consensus_landmarks(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> SurfaceLandmarks:
+    """Return the landmarks of shapes on `mean`: the median of their places on the shapes that agree with most others.
 
     Args:
         mean: with triangles.
@@ -162,15 +157,15 @@ def agreed(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArra
     names = list(dict.fromkeys(name for _, points in placed for name in points))
     if not names:
         return SurfaceLandmarks()
-    at = np.full((len(placed), len(names), 3), np.nan)
-    for own, (places, points) in zip(at, placed, strict=True):
+    positions = np.full((len(placed), len(names), 3), np.nan)
+    for own, (places, points) in zip(positions, placed, strict=True):
         own[[names.index(name) for name in points]] = places.interpolate(mean.vertices)
-    off = np.sqrt(np.array([np.nansum((at - own) ** 2, axis=(1, 2)) for own in at]))
-    shared = np.array([np.isfinite(at + own).all(axis=2).sum(axis=1) for own in at])
-    contrary = off > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
-    kept = ~contrary[((shared > 0) & ~contrary).sum(axis=1).argmax()]
-    middle: dict[str, FloatArray] = {}
-    for name, points in zip(names, at[kept].swapaxes(0, 1), strict=True):
+    distance = np.sqrt(np.array([np.nansum((positions - own) ** 2, axis=(1, 2)) for own in positions]))
+    shared = np.array([np.isfinite(positions + own).all(axis=2).sum(axis=1) for own in positions])
+    contrary = distance > _AGREE * rms_size(mean.vertices) * np.sqrt(shared)
+    consistent = ~contrary[((shared > 0) & ~contrary).sum(axis=1).argmax()]
+    medians: dict[str, FloatArray] = {}
+    for name, points in zip(names, positions[consistent].swapaxes(0, 1), strict=True):
         if np.isfinite(points).any():
-            middle[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
-    return place_landmarks(mean, middle)
+            medians[name] = np.asarray(np.nanmedian(points, axis=0), dtype=np.float64)
+    return place_landmarks(mean, medians)

@@ -1,4 +1,4 @@
-"""The mirror image of a shape, in the same correspondence: what `--symmetric` goes by."""
+"""The mirror image of a shape, in the same correspondence, for `--symmetric`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.landmarks import on_triangles
 from shapespace.correspondence.register import ElasticSettings, Template, register
-from shapespace.correspondence.template import Glance
+from shapespace.correspondence.template import PoseModel
 from shapespace.errors import InputError
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.mirror import FLIP
@@ -22,7 +22,7 @@ _UNLIKE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Mirror:
+class MirrorMap:
     """For each vertex of a template, the place on it that is the same place on its mirror image.
 
     Args:
@@ -34,16 +34,16 @@ class Mirror:
     weights: FloatArray
 
     @staticmethod
-    def of(mesh: Mesh, harmonics: Harmonics, settings: ElasticSettings, seed: int) -> Mirror:
-        """Return it for a template: the template registered to its own mirror image.
+    def of(mesh: Mesh, harmonics: Harmonics, settings: ElasticSettings, seed: int) -> MirrorMap:
+        """Return the map of a template, from the template registered to its own mirror image.
 
         Raises:
-            InputError: it is nowhere near its mirror image.
+            InputError: the template is not symmetric.
         """
         image = Mesh(mesh.vertices * FLIP, faces_of(mesh)[:, ::-1], name=mesh.name)
-        T = Glance.of(mesh).start(np.array(image.vertices), seed).T_scan_model
-        found = register(Template.of(mesh, harmonics), ScanTarget(image), T, settings, seed=seed)
-        mirror = Mirror(*on_triangles(image, found.T_scan_template.apply(found.vertices)))
+        T = PoseModel.of(mesh).search(np.array(image.vertices), seed).T_scan_model
+        registered = register(Template.of(mesh, harmonics), ScanTarget(image), T, settings, seed=seed)
+        mirror = MirrorMap(*on_triangles(image, registered.T_scan_template.apply(registered.vertices)))
         off = mirror.image(mesh.vertices) - mesh.vertices
         share = float(np.sqrt((off**2).sum(axis=1).mean())) / rms_size(mesh.vertices)
         if share > _UNLIKE:
@@ -58,6 +58,6 @@ class Mirror:
         flipped = np.einsum("vc,vcd->vd", self.weights, vertices[self.corners]) * FLIP
         return fit_similarity(flipped, vertices).apply(flipped)
 
-    def shown(self, seen: FloatArray) -> FloatArray:
-        """Return (N, V) how much each vertex counts of the images of shapes of which `seen` (N, V) counts."""
-        return seen[:, self.corners].min(axis=2)
+    def observed(self, weights: FloatArray) -> FloatArray:
+        """Return (N, V) the weights of the vertices of mirror images, from those of the shapes (N, V)."""
+        return weights[:, self.corners].min(axis=2)

@@ -1,10 +1,14 @@
-"""One scan of one round: where it lies, the template on it, and how well that is so."""
+"""One scan of one round: its pose, the template registered to it, and the quality of the registration.
+
+Equations Cn are those of docs/correspondence.md.
+"""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,9 +16,9 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.generic import generic_model
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks
+from shapespace.correspondence.landmarks import ScanLandmarks
 from shapespace.correspondence.register import ElasticSettings, Template, register
-from shapespace.correspondence.template import Glance
+from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.fit.dense import DenseSurface, dense_surface
 from shapespace.fit.fit import FitConfig, fit_scan
@@ -28,13 +32,13 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 REACHED = 0.03
-"""A scan's point is reached when the surface is this near, as a share of the size."""
+"""A scan's point is covered when the surface is this near, as a share of the size."""
 _ALTERNATIVES = 3
 _AS_GOOD = 0.8
 """Poses are all tried whose score times this is no worse than the best one's."""
 _LEFT_OVER = 0.05
-_OTHERS_SAY = 0.95
-"""A pose that the other shapes make likelier than all others is tried beside the one there is."""
+_BETTER_POSE = 0.95
+"""A pose that the search with the modes of the other scans makes likelier than all others is tried beside the known."""
 _OTHER_SIZE = 8.0
 """Units differ by more, and what a scan shows beside the object hardly does."""
 _CONTRADICTED = 2.0
@@ -43,23 +47,24 @@ _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _BULGING = 0.2
 """How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
 _FEW_HARMONICS = 4
-_GUIDING = FitConfig(unit="mm", scale="free")
+_GUIDE_CONFIG = FitConfig(unit="mm", scale="free")
 _MEASURED = 20_000
-_FAR = (np.inf, np.inf, np.inf, np.inf)
+_Distances: TypeAlias = tuple[float, float, float, float]
+_FAR: _Distances = (np.inf, np.inf, np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceTask:
-    """What to do with one scan.
+class RegistrationTask:
+    """The registration of one scan.
 
     Args:
         index: of the scan.
         scan: repaired, in its own frame and unit.
-        T_scan_template: where the template lies in it; None searches from anywhere.
+        T_scan_template: where the template lies in it; None searches all poses.
         expected: (V, 3) the shape to begin from, in the template's frame; None is the template.
         settings: of the registration.
-        glance: which of the bench's glances knows nothing of this scan.
-        marks: the scan's landmarks, in its own frame; None where it has none.
+        pose_model: which of the context's pose models is trained without this scan.
+        landmarks: of the scan, in its own frame; None where it has none.
     """
 
     index: int
@@ -67,63 +72,63 @@ class PlaceTask:
     T_scan_template: Similarity | None
     expected: FloatArray | None
     settings: ElasticSettings
-    glance: int = 0
-    marks: Marks | None = None
+    pose_model: int = 0
+    landmarks: ScanLandmarks | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """What came of it.
+class ScanRegistration:
+    """The template registered to one scan.
 
     Args:
         index: of the scan.
         vertices: (V, 3) in the template's frame.
         T_scan_template: to the scan's own frame.
-        seen: (V,) which vertices the scan shows.
-        covered: share of the scan's points that the surface reaches.
+        observed: (V,) which vertices the scan shows.
+        covered: share of the scan's points that the surface covers.
         distance: (4,) mean, 95 %, 99 % and largest distance both ways, in the template's unit.
-        seconds: CPU time.
-        reason: why there is nothing, where there is nothing; the arrays are then those of the template.
-        rivals: what came of other poses that are about as likely.
-        mirrored: how far from the template the scan's mirror image lies, as a share of how far the scan does, by what
-            is known for a pose; not-a-number where the pose is known or told by landmarks.
-        by_landmarks: whether they tell the pose.
+        cpu_s: CPU time.
+        reason: why the registration failed; empty where it did not. The arrays of a failed one are the template's.
+        alternatives: the registrations from other poses that are about as likely.
+        mirror_ratio: how far from the template the scan's mirror image lies, as a share of how far the scan does, by
+            the scores of the pose search; not-a-number where the pose is known or that of the landmarks.
+        posed_by_landmarks: whether the landmarks determine the pose.
     """
 
     index: int
     vertices: FloatArray
     T_scan_template: Similarity
-    seen: BoolArray
+    observed: BoolArray
     covered: float
-    distance: tuple[float, float, float, float]
-    seconds: float
+    distance: _Distances
+    cpu_s: float
     reason: str = ""
-    rivals: tuple[Placed, ...] = ()
-    mirrored: float = np.nan
-    by_landmarks: bool = False
+    alternatives: tuple[ScanRegistration, ...] = ()
+    mirror_ratio: float = np.nan
+    posed_by_landmarks: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class Workbench:
+class RoundContext:
     """What all tasks of a round share.
 
     Args:
         mesh: the template.
         harmonics: its smooth functions.
-        glances: the template with few vertices, for poses: one, or one for each part of the scans that it leaves out.
-        seed: of all that is drawn.
-        guide: a model whose mean is the template; where nothing else is known of a scan, its fit tells.
+        pose_models: for the pose search: one, or one for each part of the scans, trained without that part.
+        seed: of all random draws.
+        guide: a model whose mean is the template; its fit is where a scan without a prediction begins.
     """
 
     mesh: Mesh
     harmonics: Harmonics
-    glances: tuple[Glance, ...]
+    pose_models: tuple[PoseModel, ...]
     seed: int
     guide: ShapeModel | None = None
 
     @cached_property
     def template(self) -> Template:
-        """The template made ready."""
+        """The template with precomputed data for registrations."""
         return Template.of(self.mesh, self.harmonics)
 
     @cached_property
@@ -132,122 +137,166 @@ class Workbench:
         return generic_model(self.mesh, self.harmonics.slowest(_FEW_HARMONICS))
 
     @cached_property
-    def bare(self) -> Glance:
-        """The template with few vertices, with generic modes alone."""
-        return Glance.of(self.mesh)
+    def generic_pose_model(self) -> PoseModel:
+        """The pose model of the template with generic modes only."""
+        return PoseModel.of(self.mesh)
 
-    def place(self, task: PlaceTask) -> Placed:
-        """Return the template on the task's scan; a scan that cannot be reached gives a reason."""
+    def register(self, task: RegistrationTask) -> ScanRegistration:
+        """Register the template to the task's scan; a scan that cannot be registered has a reason."""
         begun = time.process_time()
         try:
             with threadpool_limits(limits=1, user_api="blas"):
-                placed = self._best(task)
+                registration = self._register(task)
         except ShapespaceError as error:
-            placed = self.nothing(task.index, str(error))
-        return replace(placed, seconds=time.process_time() - begun)
+            registration = self.failed(task.index, str(error))
+        return replace(registration, cpu_s=time.process_time() - begun)
 
-    def _best(self, task: PlaceTask) -> Placed:
-        T = task.T_scan_template
-        marked = None if task.marks is None else task.marks.pose(self.mesh.vertices)
-        if marked is not None:
-            ratio = marked.scale * rms_size(self.mesh.vertices) / rms_size(task.scan.vertices)
-            if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
-                raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; look at their unit")
-            told = (task, T) if T is not None and _is_same_turn(T, marked) else None
-            return replace(self._from(*(told or self._guided(replace(task, expected=None), marked))), by_landmarks=True)
-        glance, vertices = self.glances[task.glance], np.array(task.scan.vertices)
-        start = glance.start(vertices, self.seed)
-        if T is not None:
-            return self._unmarked(task, start)
-        mirrored = glance.start(vertices * FLIP, self.seed).score_mm / max(start.score_mm, 1e-12)
-        if self.guide is not None and mirrored < 1.0:  # what a model does not hold it holds of no mirror image either
-            scores = [self.bare.start(points, self.seed).score_mm for points in (vertices, vertices * FLIP)]
-            mirrored = max(mirrored, scores[1] / max(scores[0], 1e-12))
-        return replace(self._unmarked(task, start), mirrored=mirrored)
+    def failed(self, index: int, reason: str) -> ScanRegistration:
+        """Return the registration of a scan that could not be registered."""
+        return ScanRegistration(
+            index=index,
+            vertices=np.array(self.mesh.vertices),
+            T_scan_template=Similarity.identity(),
+            observed=np.zeros(len(self.mesh.vertices), np.bool_),
+            covered=0.0,
+            distance=_FAR,
+            cpu_s=0.0,
+            reason=reason,
+        )
 
-    def _unmarked(self, task: PlaceTask, start: Start) -> Placed:
+    # Which pose
+
+    def _register(self, task: RegistrationTask) -> ScanRegistration:
+        pose = None if task.landmarks is None else task.landmarks.pose(self.mesh.vertices)
+        if pose is not None:
+            return self._register_by_landmarks(task, pose)
+        start = self.pose_models[task.pose_model].search(np.array(task.scan.vertices), self.seed)
+        if task.T_scan_template is not None:
+            return self._register_near(task, task.T_scan_template, start)
+        mirror_ratio = self._mirror_ratio(task, start)
+        return replace(self._register_from_search(task, start), mirror_ratio=mirror_ratio)
+
+    def _register_by_landmarks(self, task: RegistrationTask, pose: Similarity) -> ScanRegistration:
+        ratio = pose.scale * rms_size(self.mesh.vertices) / rms_size(task.scan.vertices)
+        if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
+            raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; look at their unit")
         T = task.T_scan_template
-        if T is not None:
-            placed = self._from(task, T)
-            if start.score_mm > _OTHERS_SAY * start.runner_up_score_mm or _is_same_turn(T, start.T_scan_model):
-                return placed
-            if self._off(task, start.T_scan_model) > _CONTRADICTED * self._off(task, T):
-                return placed
-            rival = self._tried(replace(task, expected=None), start)
-            return placed if rival is None else replace(placed, rivals=(rival,))
-        starts = likely(start)
-        nearest = min(self._off(task, one.T_scan_model) for one in starts)
-        told = [one for one in starts if self._off(task, one.T_scan_model) <= _CONTRADICTED * nearest]
-        tries = [self._tried(task, one) for one in told]
-        good = [placed for placed in tries if placed is not None]
-        if not good:
+        if T is None or not _is_same_rotation(T, pose):
+            task, T = self._with_guide_fit(replace(task, expected=None), pose)
+        return replace(self._register_at(task, T), posed_by_landmarks=True)
+
+    def _mirror_ratio(self, task: RegistrationTask, start: Start) -> float:
+        vertices = np.array(task.scan.vertices)
+        mirrored = self.pose_models[task.pose_model].search(vertices * FLIP, self.seed)
+        ratio = mirrored.score_mm / max(start.score_mm, 1e-12)
+        if self.guide is None or ratio >= 1.0:
+            return ratio
+        # A shape outside the guide's span is as far outside it as its mirror image.
+        scores = [self.generic_pose_model.search(points, self.seed).score_mm for points in (vertices, vertices * FLIP)]
+        return max(ratio, scores[1] / max(scores[0], 1e-12))
+
+    def _register_near(self, task: RegistrationTask, T: Similarity, start: Start) -> ScanRegistration:
+        """Register from the known pose `T`; a much likelier pose of the search is an alternative."""
+        registration = self._register_at(task, T)
+        if start.score_mm > _BETTER_POSE * start.runner_up_score_mm or _is_same_rotation(T, start.T_scan_model):
+            return registration
+        if self._landmark_distance(task, start.T_scan_model) > _CONTRADICTED * self._landmark_distance(task, T):
+            return registration
+        alternative = self._try(replace(task, expected=None), start)
+        return registration if alternative is None else replace(registration, alternatives=(alternative,))
+
+    def _register_from_search(self, task: RegistrationTask, start: Start) -> ScanRegistration:
+        """Register from each likely pose of the search; those that cover about as much are alternatives."""
+        starts = likely_starts(start)
+        distances = [self._landmark_distance(task, one.T_scan_model) for one in starts]
+        nearest = min(distances)
+        tried = [
+            self._try(task, one)
+            for one, distance in zip(starts, distances, strict=True)
+            if distance <= _CONTRADICTED * nearest
+        ]
+        registered = [one for one in tried if one is not None]
+        if not registered:
             raise FitError("surface not reached: too little of the scan matches the template from any pose")
         # By how near it comes a smooth object fits in wrong poses too, so the search decides, unless much is left over.
-        most = max(placed.covered for placed in good)
-        first, *others = [placed for placed in good if placed.covered > most - _LEFT_OVER]
-        return replace(first, rivals=tuple(others))
+        most = max(one.covered for one in registered)
+        first, *others = [one for one in registered if one.covered > most - _LEFT_OVER]
+        return replace(first, alternatives=tuple(others))
 
-    def _off(self, task: PlaceTask, T: Similarity) -> float:
-        """Return how far, RMS in the template's unit, the landmarks lie off in a pose; 0 where there are none."""
-        return 0.0 if task.marks is None else task.marks.moved(T.inverse()).rms(self.mesh.vertices)
+    def _landmark_distance(self, task: RegistrationTask, T: Similarity) -> float:
+        """Return the RMS distance of the landmarks in a pose, in the template's unit; 0 where there are none."""
+        if task.landmarks is None:
+            return 0.0
+        return task.landmarks.transformed(T.inverse()).rms_distance(self.mesh.vertices)
 
-    def _tried(self, task: PlaceTask, start: Start) -> Placed | None:
+    def _try(self, task: RegistrationTask, start: Start) -> ScanRegistration | None:
         try:
-            return self._from(*self._guided(task, start.T_scan_model))
+            return self._register_at(*self._with_guide_fit(task, start.T_scan_model))
         except (FitError, InputError):
             return None
 
-    def _guided(self, task: PlaceTask, T: Similarity) -> tuple[PlaceTask, Similarity]:
-        """Return what the guide's fit from `T` says of the scan, where nothing else is known and it says something."""
+    def _with_guide_fit(self, task: RegistrationTask, T: Similarity) -> tuple[RegistrationTask, Similarity]:
+        """Return task and pose with the guide's fit from `T`, where there is no prediction and the fit converges."""
         if self.guide is None or task.expected is not None:
             return task, T
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
-        fit = fit_scan(self.guide, scan, _GUIDING, T_scan_model=Similarity.identity())
+        fit = fit_scan(self.guide, scan, _GUIDE_CONFIG, T_scan_model=Similarity.identity())
         if fit.status != "converged":
             return task, T
         shape = np.asarray(self.guide.reconstruct(fit.b), dtype=np.float64)
         return replace(task, expected=shape), T @ fit.T_scan_model
 
-    def _from(self, task: PlaceTask, T: Similarity) -> Placed:
+    # From one pose
+
+    def _register_at(self, task: RegistrationTask, T: Similarity) -> ScanRegistration:
+        """Register from the pose `T`: elastic registration, then the details by the dense stage of a fit."""
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
-        target = ScanTarget(_facing(scan, self.mesh))
-        found = register(
-            self.template, target, Similarity.identity(), task.settings, expected=task.expected,
-            marks=None if task.marks is None else task.marks.moved(T.inverse()), seed=self.seed,
-        )  # fmt: skip
-        start = found.T_scan_template.apply(found.vertices)
-        dense = dense_surface(self.model, target, start, found.T_scan_template, DenseSettings(seed=self.seed))
-        near = target.engine.query(dense.vertices_scan_mm)
-        seen = self._shown(dense, near, target, task.settings.normal_cosine)
-        covered, distance = self._judged(dense.vertices_scan_mm, near.distance[seen], target)
-        back = found.T_scan_template.inverse()
-        mean, p95, p99, largest = (back.scale * length for length in distance)
-        return Placed(
-            task.index, back.apply(dense.vertices_scan_mm), T @ found.T_scan_template, seen, covered,
-            (mean, p95, p99, largest), 0.0,
-        )  # fmt: skip
+        target = ScanTarget(_facing_like(scan, self.mesh))
+        elastic = register(
+            self.template,
+            target,
+            Similarity.identity(),
+            task.settings,
+            expected=task.expected,
+            landmarks=None if task.landmarks is None else task.landmarks.transformed(T.inverse()),
+            seed=self.seed,
+        )
+        start = elastic.T_scan_template.apply(elastic.vertices)
+        dense = dense_surface(self.model, target, start, elastic.T_scan_template, DenseSettings(seed=self.seed))
+        nearest = target.engine.query(dense.vertices_scan_mm)
+        observed = self._observed(dense, nearest, target, task.settings.normal_cosine)
+        covered, distance = self._quality(dense.vertices_scan_mm, nearest.distance[observed], target)
+        T_template_scan = elastic.T_scan_template.inverse()
+        mean, p95, p99, largest = (T_template_scan.scale * length for length in distance)
+        return ScanRegistration(
+            index=task.index,
+            vertices=T_template_scan.apply(dense.vertices_scan_mm),
+            T_scan_template=T @ elastic.T_scan_template,
+            observed=observed,
+            covered=covered,
+            distance=(mean, p95, p99, largest),
+            cpu_s=0.0,
+        )
 
-    def _shown(self, dense: DenseSurface, near: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
-        """Return (V,) which vertices the scan shows: those that lie on it, believed by the dense stage or on no rim.
+    def _observed(self, dense: DenseSurface, nearest: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
+        """Return (V,) which vertices the scan shows (C9): near it, and observed by the dense stage or on no rim.
 
-        On a clean scan that stage drops what lies off it by little; what it believes on a rim goes on beyond it.
+        On a clean scan that stage drops vertices that are a little off it; those that it keeps on a rim are beyond it.
         """
         if target.mesh.faces is None:
             return dense.seen
-        reached = near.distance < REACHED * self.template.size_mm
+        near = nearest.distance < REACHED * self.template.size_mm
         normals = vertex_normals(self.mesh.with_vertices(dense.vertices_scan_mm))
-        alike = np.einsum("vd,vd->v", normals, target.normals[near.vertex])
-        inside = (alike > cosine) & ~on_boundary(near, target.mesh, target.rim)
-        return np.asarray(reached & (dense.seen | inside))
+        alike = np.einsum("vd,vd->v", normals, target.normals[nearest.vertex])
+        inside = (alike > cosine) & ~on_boundary(nearest, target.mesh, target.rim)
+        return np.asarray(near & (dense.seen | inside))  # C9
 
-    def _judged(
-        self, vertices: FloatArray, forward: FloatArray, target: ScanTarget
-    ) -> tuple[float, tuple[float, float, float, float]]:
-        """Return the share of the scan that is reached, and distances both ways over what both show.
+    def _quality(self, vertices: FloatArray, forward: FloatArray, target: ScanTarget) -> tuple[float, _Distances]:
+        """Return the share of the scan that is covered (C10), and distances both ways over the overlap.
 
         Args:
             vertices: (V, 3) of the surface.
-            forward: of those that are seen, to the scan.
+            forward: distances of the observed vertices from the scan.
             target: the scan.
         """
         surface = Mesh(vertices, self.mesh.faces)
@@ -255,42 +304,38 @@ class Workbench:
         points = target.mesh.vertices
         if len(points) > _MEASURED:
             points = points[np.sort(rng.choice(len(points), _MEASURED, replace=False))]
-        back = build_engine(surface).query(points)
-        beyond = on_boundary(back, surface, boundary_vertices(surface))
+        nearest = build_engine(surface).query(points)
+        beyond = on_boundary(nearest, surface, boundary_vertices(surface))
         limit = REACHED * self.template.size_mm
-        covered = float((back.distance[~beyond] < limit).mean()) if not beyond.all() else 0.0
-        both = np.concatenate([forward, back.distance[~beyond]])
+        covered = float((nearest.distance[~beyond] < limit).mean()) if not beyond.all() else 0.0  # C10
+        both = np.concatenate([forward, nearest.distance[~beyond]])
         if not len(both):
             return 0.0, _FAR
-        shares = np.quantile(both, [0.95, 0.99, 1.0])
-        return covered, (float(both.mean()), float(shares[0]), float(shares[1]), float(shares[2]))
-
-    def nothing(self, index: int, reason: str) -> Placed:
-        """Return what stands for a scan that is not placed."""
-        vertices = np.array(self.mesh.vertices)
-        return Placed(index, vertices, Similarity.identity(), np.zeros(len(vertices), np.bool_), 0.0, _FAR, 0.0, reason)
+        p95, p99, largest = (float(value) for value in np.quantile(both, [0.95, 0.99, 1.0]))
+        return covered, (float(both.mean()), p95, p99, largest)
 
 
-def _facing(scan: Mesh, surface: Mesh) -> Mesh:
-    """Return `scan`, turned where it looks against `surface`, on which it lies; only sheets as much bowl as cap are.
+def _facing_like(scan: Mesh, surface: Mesh) -> Mesh:
+    """Return `scan`, its winding reversed where its normals oppose those of `surface`, on which it lies.
 
-    The normals of others tell which side is outside, and so which of two poses is right.
+    Only sheets as much bowl as cap are reversed: the normals of others show which side is outside, and so which of two
+    poses is right.
     """
     if scan.faces is None or not len(boundary_edges(scan.faces)):
         return scan
     normals, arms = vertex_normals(scan), scan.vertices - scan.vertices.mean(axis=0)
     if abs(float((normals * arms).sum())) > _BULGING * float(np.linalg.norm(arms, axis=1).sum()):
         return scan
-    near = cKDTree(surface.vertices).query(scan.vertices)[1]
-    agree = np.einsum("vd,vd->v", normals, vertex_normals(surface)[near])
+    nearest = cKDTree(surface.vertices).query(scan.vertices)[1]
+    agree = np.einsum("vd,vd->v", normals, vertex_normals(surface)[nearest])
     return scan if np.median(agree) >= 0 else Mesh(scan.vertices, scan.faces[:, ::-1], name=scan.name)
 
 
-def _is_same_turn(one: Similarity, other: Similarity) -> bool:
-    return float(np.trace(one.rotation @ other.rotation.T)) > _SAME_TURN_TRACE
+def _is_same_rotation(a: Similarity, b: Similarity) -> bool:
+    return float(np.trace(a.rotation @ b.rotation.T)) > _SAME_TURN_TRACE
 
 
-def likely(start: Start) -> list[Start]:
+def likely_starts(start: Start) -> list[Start]:
     """Return the best start and those about as good."""
     others = [one for one in start.alternatives if _AS_GOOD * one.score_mm <= start.score_mm]
     return [start, *others][:_ALTERNATIVES]

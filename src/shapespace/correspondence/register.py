@@ -1,13 +1,11 @@
 """One scan registered to a template: forces from both sides, averaged over the surface and never fitted.
 
 Viscous and elastic, as White et al. (2019) have it. In each iteration every point of the template is drawn to the scan
-and by the scan; the forces f, weighted by w, are averaged over a range r of the surface, as heat diffuses (H_r):
-
-    v = H_r(w f) / H_r(w),     d <- H_e(d + v)                                        (1)
-
-The range r of what moves and the range e of what stays moved fall together, from a good part of the object to its
-details. A force that is averaged does not pull a smooth field through every match, as a fit would; that is why matches
-that are wrong sideways, as most are at first, do so little harm here.
+and by the scan (C3, C4), outliers are down-weighted (C5), and the forces are averaged over a range of the surface (C6)
+and added to the movement, which is smoothed over the same range (C7). The range falls from a good part of the object to
+its details. A force that is averaged does not pull a smooth field through every match, as a fit would; that is why
+matches that are wrong sideways, as most are at first, do so little harm here. Equations Cn are those of
+docs/correspondence.md.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import Marks
+from shapespace.correspondence.landmarks import ScanLandmarks
 from shapespace.fit.kernels import normals_into
 from shapespace.fit.moving_model import Topology
 from shapespace.fit.scan_target import ScanTarget
@@ -29,6 +27,8 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 _NEAR = 3
 """Points of the other side that a point is matched with, by inverse squared distance."""
 _TOUCHING = 1e-8
+"""Square of a length, mm^2, so that a point that touches another one has a finite weight."""
+_OUTLIER_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ElasticSettings:
 
     Args:
         harmonics: functions that the movement is made of.
-        widest: range of (1) in the first iteration,
+        widest: range of (C6) in the first iteration,
         narrowest: and in the last; it falls geometrically.
         iterations: of these many.
         points: of each side that are matched while the range is wide; all are below `fine` of the widest.
@@ -67,7 +67,7 @@ class Template:
 
     Args:
         mesh: its triangles; its vertices in mm are where a registration begins.
-        topology: who neighbours whom.
+        topology: of the triangles.
         harmonics: its smooth functions.
         size_mm: RMS distance from its middle.
     """
@@ -79,14 +79,14 @@ class Template:
 
     @staticmethod
     def of(mesh: Mesh, harmonics: Harmonics | int) -> Template:
-        """Return `mesh` ready to be registered, with that many functions of its own, or those of a like surface."""
+        """Return `mesh` with data for registrations: that many functions of its own, or those of a similar surface."""
         functions = harmonics if isinstance(harmonics, Harmonics) else Harmonics.of(mesh, harmonics)
         return Template(mesh, Topology.of(mesh), functions, rms_size(mesh.vertices))
 
 
 @dataclass(frozen=True, eq=False)
-class Registered:
-    """A template on a scan.
+class ElasticState:
+    """The template in one iteration of its registration to a scan, and the result of the last iteration.
 
     Args:
         vertices: (V, 3) in the template's frame.
@@ -97,6 +97,40 @@ class Registered:
     T_scan_template: Similarity
 
 
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What no iteration changes.
+
+    Args:
+        template: the surface.
+        target: the scan in its mm frame.
+        base: (V, 3) the shape without movement, in the template's frame.
+        landmarks: of the scan, in its mm frame.
+        settings: of the registration.
+    """
+
+    template: Template
+    target: ScanTarget
+    base: FloatArray
+    landmarks: ScanLandmarks | None
+    settings: ElasticSettings
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Points of one surface that are matched with the other one, in the template's frame.
+
+    Args:
+        points: (M, 3) mm.
+        normals: (M, 3), zero where the surface has no triangles.
+        on_border: (M,) whether they are on the border of the surface.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    on_border: BoolArray
+
+
 def register(
     template: Template,
     target: ScanTarget,
@@ -104,9 +138,9 @@ def register(
     settings: ElasticSettings,
     *,
     expected: FloatArray | None = None,
-    marks: Marks | None = None,
+    landmarks: ScanLandmarks | None = None,
     seed: int = 0,
-) -> Registered:
+) -> ElasticState:
     """Return the template moved onto the scan, all of it: where the scan shows nothing, as its neighbours move.
 
     Args:
@@ -115,94 +149,108 @@ def register(
         T_scan_template: where to begin.
         settings: how.
         expected: (V, 3) the shape that the scan is thought to have, in the template's frame; None is the template.
-        marks: the scan's landmarks, in its mm frame.
+        landmarks: of the scan, in its mm frame.
         seed: of the points that are matched.
     """
-    rng, t = np.random.default_rng(seed), settings
     base = np.array(template.mesh.vertices if expected is None else expected)
-    x, T = base.copy(), T_scan_template
-    normals = np.empty_like(x)
-    for range_share in np.geomspace(t.widest, t.narrowest, t.iterations):
-        coarse = range_share > t.fine * t.widest
-        own = template.topology.used
-        if coarse and len(own) > t.points:
-            own = np.sort(rng.choice(own, t.points, replace=False))
-        chosen = target.draw(t.points if coarse else None, rng)
-        y = T.inverse().apply(target.mesh.vertices[chosen])
-        side = target.normals[chosen] @ T.rotation
-        normals_into(x, template.topology.faces, normals)
-        force, weight = _forces(template, x, normals, own, y, side, target.rim[chosen], t)
-        weight = weight * _inlying(force, weight, t.inliers, template.size_mm)
-        x = x + _averaged(template.harmonics, own, force, weight, range_share * template.size_mm, t.floor)
-        pose = fit_similarity(base, x)
-        T, x = T @ pose, pose.inverse().apply(x)
-        x = base + template.harmonics.diffused(x - base, range_share * template.size_mm)
-        if marks is not None:
-            here = marks.moved(T.inverse())
-            x = x + here.pull(x, template.harmonics, range_share * template.size_mm, template.size_mm)
-    return Registered(x, T)
+    problem = _Problem(template, target, base, landmarks, settings)
+    state, rng = ElasticState(base, T_scan_template), np.random.default_rng(seed)
+    for range_share in np.geomspace(settings.widest, settings.narrowest, settings.iterations):
+        state = _step(problem, state, float(range_share), rng)
+    return state
+
+
+def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.random.Generator) -> ElasticState:
+    """Return the state after one iteration over a range of the surface, a share of its size; `rng` draws the points."""
+    template, settings = problem.template, problem.settings
+    harmonics, size_mm = template.harmonics, template.size_mm
+    range_mm = range_share * size_mm
+    x, T = state.vertices, state.T_scan_template
+    own, surface, scan = _samples(problem, state, range_share > settings.fine * settings.widest, rng)
+    force, weight = _forces(surface, scan, settings, size_mm)
+    weight = weight * _inlier_probability(force, weight, settings.inliers, size_mm)
+    x = x + _averaged(harmonics, own, force, weight, range_mm, settings.floor)
+    pose = fit_similarity(problem.base, x)
+    T, x = T @ pose, pose.inverse().apply(x)
+    x = problem.base + harmonics.diffused(x - problem.base, range_mm)  # C7
+    if problem.landmarks is not None:
+        x = x + problem.landmarks.transformed(T.inverse()).correction(x, harmonics, range_mm, size_mm)
+    return ElasticState(x, T)
+
+
+def _samples(
+    problem: _Problem, state: ElasticState, coarse: bool, rng: np.random.Generator
+) -> tuple[IntArray, _Samples, _Samples]:
+    """Return the vertices (M,) of the template that are matched, with their points, and points of the scan."""
+    topology, target, settings = problem.template.topology, problem.target, problem.settings
+    own = topology.used
+    if coarse and len(own) > settings.points:
+        own = np.sort(rng.choice(own, settings.points, replace=False))
+    chosen = target.draw(settings.points if coarse else None, rng)
+    T = state.T_scan_template
+    normals = np.empty_like(state.vertices)
+    normals_into(state.vertices, topology.faces, normals)
+    surface = _Samples(state.vertices[own], normals[own], topology.rim[own])
+    points = T.inverse().apply(target.mesh.vertices[chosen])
+    return own, surface, _Samples(points, target.normals[chosen] @ T.rotation, target.rim[chosen])
 
 
 def _forces(
-    template: Template,
-    x: FloatArray,
-    normals: FloatArray,
-    own: IntArray,
-    y: FloatArray,
-    side: FloatArray,
-    rim: BoolArray,
-    settings: ElasticSettings,
+    surface: _Samples, scan: _Samples, settings: ElasticSettings, size_mm: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return forces (M, 3), mm, on the vertices `own` (M,), and their weights (M,): 1 for each side that is sure."""
-    at, up, count = x[own], normals[own], len(own)
-    bare = not side.any()  # points without triangles have no normals
-    turn = settings.turn * template.size_mm
-    here, there = (at, y) if bare else (np.hstack([at, turn * up]), np.hstack([y, turn * side]))
-    near, share = _weighted(there, here)
-    pull = np.einsum("mk,mkd->md", share, y[near]) - at
-    allowed = bare | (np.einsum("md,mkd,mk->m", up, side[near], share) > settings.normal_cosine)
-    back, back_share = _weighted(here, there)
-    push = y - np.einsum("mk,mkd->md", back_share, at[back])
-    heard = bare | (np.einsum("md,mkd,mk->m", side, up[back], back_share) > settings.normal_cosine)
+    """Return forces (M, 3), mm, on the points of the surface, and their weights (M,): 1 for each side that is sure."""
+    x, y, count = surface.points, scan.points, len(surface.points)
+    is_cloud = not scan.normals.any()
+    turn = settings.turn * size_mm
+    surface_features = x if is_cloud else np.hstack([x, turn * surface.normals])
+    scan_features = y if is_cloud else np.hstack([y, turn * scan.normals])
+    near, share = _soft_matches(scan_features, surface_features)
+    to_scan = np.einsum("mk,mkd->md", share, y[near]) - x
+    cosine = np.einsum("md,mkd,mk->m", surface.normals, scan.normals[near], share)
+    is_valid = is_cloud | (cosine > settings.normal_cosine)
+    back, back_share = _soft_matches(surface_features, scan_features)
+    from_surface = y - np.einsum("mk,mkd->md", back_share, x[back])
+    cosine = np.einsum("md,mkd,mk->m", scan.normals, surface.normals[back], back_share)
+    back_is_valid = is_cloud | (cosine > settings.normal_cosine)
     if not settings.borders:
-        allowed &= ~rim[near].any(axis=1)
-        heard &= ~template.topology.rim[own][back].any(axis=1)
+        is_valid &= ~scan.on_border[near].any(axis=1)
+        back_is_valid &= ~surface.on_border[back].any(axis=1)
     # Each side counts alike, however densely it is sampled.
-    carried = (back_share * heard[:, None]).ravel() * (count / len(y))
-    weight = allowed + np.bincount(back.ravel(), carried, count)
-    moved = np.stack(
-        [np.bincount(back.ravel(), carried * np.repeat(push[:, k], _NEAR), count) for k in range(3)], axis=1
+    back_weight = (back_share * back_is_valid[:, None]).ravel() * (count / len(y))
+    weight = is_valid + np.bincount(back.ravel(), back_weight, count)
+    by_scan = np.stack(
+        [np.bincount(back.ravel(), back_weight * np.repeat(from_surface[:, k], _NEAR), count) for k in range(3)], axis=1
     )
-    force = (allowed[:, None] * pull + moved) / np.maximum(weight, 1e-9)[:, None]
+    force = (is_valid[:, None] * to_scan + by_scan) / np.maximum(weight, 1e-9)[:, None]  # C4
     return force, np.minimum(weight, 1.0)
 
 
-def _weighted(points: FloatArray, queries: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return (M, `_NEAR`) the nearest of `points` to each of `queries`, and what each counts."""
+def _soft_matches(points: FloatArray, queries: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return (M, `_NEAR`) the nearest of `points` to each of `queries`, and their shares of the match."""
     distance, near = cKDTree(points).query(queries, k=_NEAR)
     share = 1.0 / (np.asarray(distance) ** 2 + _TOUCHING)
-    return np.asarray(near, dtype=np.int32), share / share.sum(axis=1, keepdims=True)
+    return np.asarray(near, dtype=np.int32), share / share.sum(axis=1, keepdims=True)  # C3
 
 
-def _inlying(force: FloatArray, weight: FloatArray, inliers: float, size_mm: float) -> FloatArray:
-    """Return (M,) how likely each force is none of the outliers, whose density is even."""
+def _inlier_probability(force: FloatArray, weight: FloatArray, inliers: float, size_mm: float) -> FloatArray:
+    """Return (M,) the probability that each force is not an outlier; the density of outliers is uniform."""
     length = np.linalg.norm(force, axis=1)
-    share = np.ones(len(force))
-    for _ in range(4):
-        sure = weight * share
+    probability = np.ones(len(force))
+    for _ in range(_OUTLIER_ROUNDS):
+        sure = weight * probability
         spread = max(float(np.sqrt((sure * length**2).sum() / max(sure.sum(), 1e-12))), 1e-4 * size_mm)
-        inside = np.exp(-0.5 * (length / spread) ** 2)
-        share = inside / (inside + np.exp(-0.5 * inliers**2))
-    return share
+        inlier = np.exp(-0.5 * (length / spread) ** 2)
+        probability = inlier / (inlier + np.exp(-0.5 * inliers**2))  # C5
+    return probability
 
 
 def _averaged(
     harmonics: Harmonics, own: IntArray, force: FloatArray, weight: FloatArray, range_mm: float, floor: float
 ) -> FloatArray:
-    """Return (V, 3) the average (1) of forces at the vertices `own`, everywhere."""
+    """Return (V, 3) the average (C6) of forces at the vertices `own`, everywhere."""
     functions, area = harmonics.functions[own], harmonics.area[own]
     area = area * (harmonics.area.sum() / area.sum())
-    kept = harmonics.kept(range_mm)[:, None]
-    weighed = np.column_stack([weight[:, None] * force, weight])
-    spread = harmonics.functions @ (kept * (functions.T @ (area[:, None] * weighed)))
-    return spread[:, :3] / np.maximum(spread[:, 3:], floor)
+    weighted = np.column_stack([weight[:, None] * force, weight])
+    attenuation = harmonics.attenuation(range_mm)[:, None]
+    diffused = harmonics.functions @ (attenuation * (functions.T @ (area[:, None] * weighted)))
+    return diffused[:, :3] / np.maximum(diffused[:, 3:], floor)  # C6

@@ -1,4 +1,4 @@
-"""What scans have in common: the same surface twice, and the unit that most are in."""
+"""Comparisons of scans: copies of the same surface, and their units."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _RATIOS = _RATIOS[(_RATIOS == 1.0) | (np.abs(np.log(_RATIOS)) > np.log(_LEAST_RA
 def copies(scans: Sequence[Mesh]) -> dict[int, int]:
     """Return which of `scans` are earlier ones again, in any pose and size: the number of each, and of the first."""
     first: dict[object, list[int]] = {}
-    found: dict[int, int] = {}
+    copy_of: dict[int, int] = {}
     for i, scan in enumerate(scans):
         alike = first.setdefault((len(scan.vertices), None if scan.faces is None else scan.faces.tobytes()), [])
         same = next((j for j in alike if _equal(scan, scans[j])), None)
         if same is None:
             alike.append(i)
         else:
-            found[i] = same
-    return found
+            copy_of[i] = same
+    return copy_of
 
 
 def _equal(one: Mesh, other: Mesh) -> bool:
@@ -44,19 +44,19 @@ def _equal(one: Mesh, other: Mesh) -> bool:
 
 
 def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-    """Return what sizes tell of units.
+    """Return sizes and units relative to those of most scans.
 
     Args:
-        scales: (N,) of scans beside one template.
+        scales: (N,) of scans relative to one template.
 
     Returns:
-        (N,) sizes beside those of most, units told apart, and (N,) how many times as large as in the unit of most the
-        coordinates are, such as 0.001 for metres among millimetres; 1 for most.
+        (N,) sizes relative to the median of most scans, in one unit, and (N,) how many times as large as in the unit of
+        most the coordinates are, such as 0.001 for metres among millimetres; 1 for most.
     """
     logs = np.log(np.asarray(scales, dtype=np.float64))
     near = np.abs(logs[:, None] - logs) < 0.5 * np.log(_LEAST_RATIO)
     # As many in one unit as in another: the finer one.
     most = max(range(len(logs)), key=lambda i: (int(near[i].sum()), logs[i]))
-    beside = logs - np.median(logs[near[most]])
-    ratios = _RATIOS[np.abs(beside[:, None] - np.log(_RATIOS)).argmin(axis=1)]
-    return np.exp(beside) / ratios, ratios
+    relative = logs - np.median(logs[near[most]])
+    ratios = _RATIOS[np.abs(relative[:, None] - np.log(_RATIOS)).argmin(axis=1)]
+    return np.exp(relative) / ratios, ratios

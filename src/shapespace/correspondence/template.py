@@ -19,8 +19,8 @@ from shapespace.geometry.surface import boundary_edges, face_areas, faces_of, rm
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
-_GLANCE_VERTICES = 1500
-_GLANCE_HARMONICS = 40
+_POSE_VERTICES = 1500
+_POSE_HARMONICS = 40
 _CANDIDATES, _OTHERS = 6, 6
 _FEWEST = 100
 """Vertices: fewer do not tell an object's shape."""
@@ -32,32 +32,32 @@ the longest border of all may be one that the object has, and must be shorter to
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
-    """A surface with few vertices and generic modes, to find poses with; in mm, of the size it has.
+class PoseModel:
+    """A template with few vertices, as a shape model for the pose search; in mm, of the size it has.
 
     Args:
-        model: the shape space of one shape.
+        model: with generic modes, and those of aligned shapes if there are some.
     """
 
     model: ShapeModel
 
     @staticmethod
-    def of(mesh: Mesh, known: FloatArray | None = None) -> Glance:
-        """Return a glance at `mesh`; of aligned shapes `known` (N, V, 3) on the same vertices it has the modes too.
+    def of(mesh: Mesh, shapes: FloatArray | None = None) -> PoseModel:
+        """Return the pose model of `mesh`, with the modes of aligned `shapes` (N, V, 3) on the same vertices too.
 
         Raises:
-            MeshError: it is no sheet.
+            MeshError: it is not a sheet.
         """
         parts, own = remesh.parted(faces_of(mesh))
-        wanted = round(len(parts) * min(1.0, _GLANCE_VERTICES / len(own)))
+        wanted = round(len(parts) * min(1.0, _POSE_VERTICES / len(own)))
         _, faces, origin = remesh.collapse(mesh.vertices[own], parts, wanted, mesh.name)
         origin = own[origin]
         coarse = Mesh(mesh.vertices[origin], faces.astype(np.int32), name=mesh.name)
-        harmonics = Harmonics.of(coarse, _GLANCE_HARMONICS)
-        return Glance(generic_model(coarse, harmonics, None if known is None else known[:, origin]))
+        harmonics = Harmonics.of(coarse, _POSE_HARMONICS)
+        return PoseModel(generic_model(coarse, harmonics, None if shapes is None else shapes[:, origin]))
 
-    def start(self, vertices_mm: FloatArray, seed: int) -> Start:
-        """Return where the surface lies in a scan with `vertices_mm` (S, 3), whatever the scan's size and pose.
+    def search(self, vertices_mm: FloatArray, seed: int) -> Start:
+        """Search all poses and sizes of the surface in a scan with `vertices_mm` (S, 3).
 
         The score is in mm of this surface.
         """
@@ -73,11 +73,11 @@ class Glance:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Which scan was chosen as the first template.
+class TemplateChoice:
+    """The scan that is the first template.
 
     Args:
-        index: of it.
+        index: of the scan.
         nearness: (N,) mean distance from a candidate to other scans after smooth adaptation, share of its size;
             not-a-number for scans that were no candidates.
     """
@@ -86,7 +86,7 @@ class Choice:
     nearness: tuple[float, ...]
 
 
-def choose(scans: Sequence[Mesh], seed: int) -> Choice:
+def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
     Candidates are some with few pieces and short borders, as those lack least. One that lacks a part shows less of the
@@ -96,33 +96,33 @@ def choose(scans: Sequence[Mesh], seed: int) -> Choice:
         MeshError: none of them can be a template.
     """
     rng = np.random.default_rng(seed)
-    whole = np.array([_wholeness(scan) for scan in scans])
-    candidates = np.argsort(whole, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
-    candidates = candidates[np.isfinite(whole[candidates])]
+    incompleteness = np.array([_incompleteness(scan) for scan in scans])
+    candidates = np.argsort(incompleteness, kind="stable")[: max(_CANDIDATES, len(scans) // 2)]
+    candidates = candidates[np.isfinite(incompleteness[candidates])]
     candidates = np.sort(rng.choice(candidates, min(_CANDIDATES, len(candidates)), replace=False))
     others = np.sort(rng.choice(len(scans), min(_OTHERS, len(scans)), replace=False))
-    nearness, shown = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
+    nearness, visible = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
     for i in map(int, candidates):
         try:
-            glance = Glance.of(clean(scans[i]))
+            pose_model = PoseModel.of(clean_scan(scans[i]))
         except ShapespaceError:
             continue
-        size = rms_size(glance.model.mean_vertices)
-        starts = {j: glance.start(np.array(scans[j].vertices), seed) for j in map(int, others) if j != i}
+        size = rms_size(pose_model.model.mean_vertices)
+        starts = {j: pose_model.search(np.array(scans[j].vertices), seed) for j in map(int, others) if j != i}
         nearness[i] = float(np.median([start.score_mm / size for start in starts.values()])) if starts else 0.0
         shares = [_area(scans[i]) * s.T_scan_model.scale**2 / _area(scans[j]) for j, s in starts.items()]
-        shown[i] = np.median([share for share in shares if np.isfinite(share)] or [1.0])
+        visible[i] = np.median([share for share in shares if np.isfinite(share)] or [1.0])
     if not np.isfinite(nearness).any():
         raise MeshError(
             f"None of the scans can be a template, since none is a sheet of triangles with {_FEWEST} vertices or more; "
             "give --template MESH."
         )
-    fair = np.where(shown >= _AS_WHOLE * np.nanmax(shown), nearness, np.inf)
-    return Choice(int(np.nanargmin(fair)), tuple(float(share) for share in nearness))
+    fair = np.where(visible >= _AS_WHOLE * np.nanmax(visible), nearness, np.inf)
+    return TemplateChoice(int(np.nanargmin(fair)), tuple(float(share) for share in nearness))
 
 
-def given(template: Mesh) -> Mesh:
-    """Return a template that somebody gives, repaired.
+def check_template(template: Mesh) -> Mesh:
+    """Return a template that the user gives, repaired.
 
     Raises:
         MeshError: it has no triangles, cannot be repaired, or has too few vertices to follow a scan.
@@ -140,7 +140,7 @@ def given(template: Mesh) -> Mesh:
     return mesh
 
 
-def clean(scan: Mesh) -> Mesh:
+def clean_scan(scan: Mesh) -> Mesh:
     """Return the largest piece of `scan`, repaired, small holes closed by a fan.
 
     Raises:
@@ -157,11 +157,11 @@ def clean(scan: Mesh) -> Mesh:
     return Mesh(vertices, faces, name=scan.name)
 
 
-def resampled(mesh: Mesh, vertices: int) -> Mesh:
+def resample(mesh: Mesh, vertices: int) -> Mesh:
     """Return `mesh` with about that many vertices, evenly spread: split until fine enough, shortest edges collapsed.
 
     Raises:
-        MeshError: it is no sheet.
+        MeshError: it is not a sheet.
     """
     x, faces = np.array(mesh.vertices), faces_of(mesh).astype(np.int64)
     while len(x) < 2 * vertices:
@@ -176,7 +176,7 @@ def _area(scan: Mesh) -> float:
     return np.nan if scan.faces is None else float(face_areas(scan).sum())
 
 
-def _wholeness(scan: Mesh) -> float:
+def _incompleteness(scan: Mesh) -> float:
     """Return a number that grows with the border of `scan`; infinite for what can be no template."""
     if scan.faces is None or len(scan.vertices) < _FEWEST:
         return np.inf
@@ -222,10 +222,10 @@ def _borders(faces: IntArray) -> list[IntArray]:
     loops: list[IntArray] = []
     while following:
         first = next(iter(following))
-        loop, at = [first], following.pop(first)
-        while at in following:
-            loop.append(at)
-            at = following.pop(at)
-        if at == first:
+        loop, vertex = [first], following.pop(first)
+        while vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if vertex == first:
             loops.append(np.array(loop, dtype=np.int32))
     return loops

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.crop import Crop
-from shapespace.fit.marks import SHARE, Marks
+from shapespace.fit.marks import SHARE, LandmarkConstraint
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.methods import method_named
 from shapespace.fit.region_fit import RegionFit
@@ -322,7 +322,7 @@ def _place(
         start = start_from_any_pose(model, scan_mm.vertices, seed=config.seed, with_scale=with_scale)
     if landmarks:
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(whole.mean_vertices) * start.T_scan_model.scale
-        start = replace(start, marks=Marks.of(model, marks_mm, stddev_mm))
+        start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
     said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
 

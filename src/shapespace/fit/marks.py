@@ -27,7 +27,7 @@ _WIDTH, _MAD, _FAR = 3.0, 1.48, 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Marks:
+class LandmarkConstraint:
     """Landmarks of a scan that the model has too.
 
     Args:
@@ -43,12 +43,12 @@ class Marks:
     far_mm: float
 
     @staticmethod
-    def of(model: ShapeModel, landmarks_mm: Mapping[str, FloatArray], stddev_mm: float) -> Marks | None:
+    def of(model: ShapeModel, landmarks_mm: Mapping[str, FloatArray], stddev_mm: float) -> LandmarkConstraint | None:
         """Return those of `landmarks_mm` (name -> (3,)) that `model` has too; None where there are none."""
         names = [name for name in model.landmarks if name in landmarks_mm]
         if not names or not np.isfinite(stddev_mm):
             return None
-        return Marks(
+        return LandmarkConstraint(
             model.landmarks.select(names),
             np.stack([landmarks_mm[name] for name in names]),
             stddev_mm,

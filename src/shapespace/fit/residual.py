@@ -25,13 +25,17 @@ from shapespace.geometry.mirror import find_mirror
 from shapespace.geometry.surface import rms_size
 from shapespace.io.disk_cache import keep, recall
 from shapespace.model import local_modes
-from shapespace.model.local_modes import smooth_fields, strongest_products
+from shapespace.model.local_modes import (
+    MOST_PRODUCTS,
+    largest_eigenpairs,
+    smooth_fields,
+    strongest_products,
+    vertex_blocks,
+)
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 from shapespace.version import __version__
 
-_MOST_PRODUCTS = 600
-_BLOCK = 250
 _LEAST_VALUE = 1e-8
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
@@ -78,14 +82,12 @@ def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
 
 
 def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    from scipy.linalg import eigh  # takes a moment, which whoever finds the modes kept need not wait for
-
     x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
     fields = smooth_fields(x, settings.range_share * rms_size(x))
-    mode, at = strongest_products(model.stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS // len(sources))
+    mode, at = strongest_products(model.stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS // len(sources))
     field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev
 
@@ -97,16 +99,14 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
         parts += [mirrored * source[rows] for source in sources[1:]]
         return np.concatenate(parts, axis=2).reshape(3 * len(parts[0]), -1)
 
-    # All at once they are ten times as large as the model; block by block they are nothing.
-    blocks = _blocks(len(x))
+    blocks = vertex_blocks(len(x))
     own = [modes[rows].reshape(-1, len(stddev)) for rows in blocks]
     inside = np.asarray(sum(P.T @ products(rows) for P, rows in zip(own, blocks, strict=True)))
     gram = np.zeros((inside.shape[1], inside.shape[1]))
     for P, rows in zip(own, blocks, strict=True):
         outside = products(rows) - P @ inside
         gram += outside.T @ outside
-    value, vector = eigh(gram, overwrite_a=True, subset_by_index=(max(0, len(gram) - settings.count), len(gram) - 1))
-    value, vector = value[::-1], vector[:, ::-1]
+    value, vector = largest_eigenpairs(gram, settings.count)
     kept = value > _LEAST_VALUE * value[0]
     stddev_mm = np.sqrt(value[kept])
     mix = (vector[:, kept] / stddev_mm).astype(np.float32)
@@ -128,13 +128,9 @@ def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
 
     def mirrored(field: Float32Array) -> Float32Array:
         out = np.empty_like(field)
-        for rows in _blocks(len(corners)):
+        for rows in vertex_blocks(len(corners)):
             there = sum(weights[rows, c, None, None] * field[corners[rows, c]] for c in range(3))
             np.matmul(turn.T, there, out=out[rows])
         return out
 
     return mirrored
-
-
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]

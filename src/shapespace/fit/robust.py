@@ -27,7 +27,7 @@ from shapespace.errors import FitError
 from shapespace.fit.equations import Estimate, NormalEquations, Prior, normal_equations
 from shapespace.fit.evidence import MatchEvidence
 from shapespace.fit.final_matches import FinalMatches
-from shapespace.fit.marks import Marks, worth
+from shapespace.fit.marks import LandmarkConstraint, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, MatchHint, Weights
 from shapespace.fit.moving_model import LinearShape, ModelSurface, PreparedModel, prepare
 from shapespace.fit.posterior import Posterior, covariance_of_landmarks, lack_of_new_shapes, new_shapes, posterior
@@ -130,12 +130,12 @@ class Problem:
     settings: RobustSettings
     prior: Prior
     shape: LinearShape
-    marks: Marks | None = None
+    marks: LandmarkConstraint | None = None
 
     @staticmethod
     def of(
         prepared: PreparedModel, target: ScanTarget, settings: RobustSettings, start_scale: float, *, with_scale: bool,
-        marks: Marks | None = None,
+        marks: LandmarkConstraint | None = None,
     ) -> Problem:  # fmt: skip
         """Return the problem with the model's own modes."""
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)

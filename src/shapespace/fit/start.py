@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.marks import Marks
+from shapespace.fit.marks import LandmarkConstraint
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
@@ -46,7 +46,7 @@ class Start:
     b: FloatArray = field(default_factory=lambda: np.zeros(0))
     runner_up_score_mm: float = float("inf")
     alternatives: tuple[Start, ...] = ()
-    marks: Marks | None = None
+    marks: LandmarkConstraint | None = None
 
 
 def find_unit(model: ShapeModel, scan: Mesh) -> str:

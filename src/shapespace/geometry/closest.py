@@ -87,8 +87,8 @@ class VertexEngine:
         if near is None:
             vertex, squared = self._tree.nearest(asked)
             return ClosestPoints(self._vertices[vertex], np.sqrt(squared), None, None, vertex)
-        vertex, squared, found, followed = self._tree.follow(asked, near.followed)
-        return ClosestPoints(found, np.sqrt(squared), None, None, vertex, followed)
+        vertex, squared, point, followed = self._tree.follow(asked, near.followed)
+        return ClosestPoints(point, np.sqrt(squared), None, None, vertex, followed)
 
 
 class SurfaceEngine:
@@ -105,9 +105,9 @@ class SurfaceEngine:
     def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the closest surface point of each of `points` (M, 3)."""
         asked = _checked(points, near)
-        triangle, barycentric, found, squared = self._tree.closest(asked, None if near is None else near.triangle)
+        triangle, barycentric, point, squared = self._tree.closest(asked, None if near is None else near.triangle)
         vertex = self._faces[triangle, barycentric.argmax(axis=1)]
-        return ClosestPoints(found, np.sqrt(squared), triangle, barycentric, vertex)
+        return ClosestPoints(point, np.sqrt(squared), triangle, barycentric, vertex)
 
 
 def on_boundary(matches: ClosestPoints, mesh: Mesh, boundary: BoolArray) -> BoolArray:

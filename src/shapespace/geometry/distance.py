@@ -6,7 +6,7 @@ together (Sariyanidi et al., IJCB 2023).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from shapespace.types import BoolArray, FloatArray, Mesh, require
 
 @dataclass(frozen=True)
 class DistanceSummary:
-    """What is said of one direction, in mm; `count` points were measured, `fraction` of those there were."""
+    """Summary of the distances in one direction, mm; `count` points were measured, `fraction` of all."""
 
     mean: float
     median: float
@@ -31,26 +31,30 @@ class DistanceSummary:
     @staticmethod
     def of(distance_mm: FloatArray, counted: BoolArray | None = None) -> DistanceSummary:
         """Summarise `distance_mm` (M,) over the points `counted` (M,); not-a-number where none are."""
-        kept = distance_mm if counted is None else distance_mm[counted]
-        if len(kept) == 0:
-            nan = float("nan")
-            return DistanceSummary(nan, nan, nan, nan, nan, 0, 0.0)
+        used = distance_mm if counted is None else distance_mm[counted]
+        nan = float("nan")
+        if len(used) == 0:
+            return DistanceSummary(mean=nan, median=nan, rms=nan, p95=nan, max=nan, count=0, fraction=0.0)
         return DistanceSummary(
-            float(kept.mean()),
-            float(np.median(kept)),
-            float(np.sqrt((kept**2).mean())),
-            float(np.percentile(kept, 95)),
-            float(kept.max()),
-            len(kept),
-            len(kept) / len(distance_mm),
+            mean=float(used.mean()),
+            median=float(np.median(used)),
+            rms=float(np.sqrt((used**2).mean())),
+            p95=float(np.percentile(used, 95)),
+            max=float(used.max()),
+            count=len(used),
+            fraction=len(used) / len(distance_mm),
         )
 
     def times(self, length: float) -> DistanceSummary:
         """Return the same with all lengths times `length`."""
-        return DistanceSummary(
-            self.mean * length, self.median * length, self.rms * length, self.p95 * length, self.max * length,
-            self.count, self.fraction,
-        )  # fmt: skip
+        return replace(
+            self,
+            mean=self.mean * length,
+            median=self.median * length,
+            rms=self.rms * length,
+            p95=self.p95 * length,
+            max=self.max * length,
+        )
 
 
 @dataclass(frozen=True, eq=False)

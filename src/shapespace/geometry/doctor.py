@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import MeshError
 from shapespace.geometry.surface import without_vertices
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh
 
 NON_FINITE = "coordinates that are NaN or infinite"
 """Text of findings on vertices without a position."""
@@ -28,6 +28,9 @@ _FAR = 100.0
 _REVERSED = -0.05
 
 
+FindingLevel: TypeAlias = Literal["fixed", "note", "refused"]
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing the doctor found.
@@ -38,7 +41,7 @@ class Finding:
         action: a sentence on what fitting does about it, or for "refused", what the user can do.
     """
 
-    level: Literal["fixed", "note", "refused"]
+    level: FindingLevel
     what: str
     action: str
 
@@ -105,7 +108,7 @@ def examine(mesh: Mesh, *, strict: bool = False) -> MeshReport:
         mesh: any mesh, also one without points or with NaN in it.
         strict: whether triangles that use vertices with non-finite coordinates are a reason to refuse the mesh.
     """
-    return _Doctor(mesh, strict=strict).report()
+    return _examine_and_repair(mesh, strict=strict).report
 
 
 def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ...]]:
@@ -125,355 +128,408 @@ def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ..
     Raises:
         MeshError: it cannot be fitted; the one sentence names it and says what to do.
     """
-    doctor = _Doctor(mesh, strict=strict)
-    for finding in doctor.findings:
+    state = _examine_and_repair(mesh, strict=strict)
+    for finding in state.report.findings:
         if finding.level == "refused":
             raise MeshError(f"{mesh.name}: {finding.what[0].lower()}{finding.what[1:-1]}; {finding.action}")
-    return doctor.repaired(), tuple(doctor.findings)
+    return state.repaired(mesh), state.report.findings
 
 
-class _Doctor:
-    """One pass over a mesh that repairs as it goes and counts what it met."""
+@dataclass(frozen=True, eq=False)
+class _RepairState:
+    """A mesh between two repairs, and the report so far; each step returns a new state.
 
-    def __init__(self, mesh: Mesh, *, strict: bool) -> None:
-        self.mesh = mesh
-        self.strict = strict
-        self.findings: list[Finding] = []
-        self.vertices = mesh.vertices
-        self.colours = mesh.colours
-        self.faces: IntArray | None = None if mesh.faces is None else np.array(mesh.faces)
-        self.in_file = self.faces
-        """The triangles in the numbering of the file, in step with `faces`."""
-        self.changed = False
-        self.non_finite = self.duplicates = self.unreferenced = self.degenerate = self.repeated = 0
-        self.components = self.boundary = self.non_manifold = self.inconsistent = self.turned = 0
-        self.share = 1.0 if self.faces is not None else 0.0
-        self.planarity = self.origin_distance = float("nan")
-        finite = _finite(mesh.vertices)
-        self.finite = finite
-        if self._drop_non_finite(finite):
-            self._run()
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3), or None for a point cloud.
+        faces_in_file: (F, 3) the same triangles in the vertex numbers of the file.
+        colours: of the vertices, or None.
+        report: counts and findings so far.
+    """
 
-    def _run(self) -> None:
-        if not len(self.vertices):
-            return self._refuse("There are no points in it.", "export the scan again.")
-        if np.abs(self.vertices).max() > _ABSURD:
-            return self._refuse("Its coordinates are too large to be lengths.", "export the scan again.")
-        self._merge_vertices()
-        if self.faces is not None:
-            self._drop_triangles()
-            self._drop_unreferenced()
-        self._measure_spread()
-        if self.faces is not None and len(self.faces):
-            self._inspect_surface()
-        return None
+    vertices: FloatArray
+    faces: IntArray | None
+    faces_in_file: IntArray | None
+    colours: ByteArray | None
+    report: MeshReport
 
-    def _refuse(self, what: str, action: str) -> None:
-        self.findings.append(Finding("refused", what, action))
-
-    def _fixed(self, what: str, action: str) -> None:
-        self.changed = True
-        self.findings.append(Finding("fixed", what, action))
-
-    def _note(self, what: str, action: str) -> None:
-        self.findings.append(Finding("note", what, action))
-
-    def _drop_non_finite(self, finite: BoolArray) -> bool:
-        """Remove vertices that are not finite, and triangles that use them; return whether the rest can go on."""
-        bad = int((~finite).sum())
-        self.non_finite = bad
-        if not bad:
-            return True
-        what = f"It has {_some(bad, 'vertex', 'vertices')} with {NON_FINITE}"
-        whole = None if self.faces is None else np.asarray(finite[self.faces].all(axis=1))
-        lost = 0 if whole is None else int((~whole).sum())
-        if whole is None or not lost:
-            self._keep_vertices(finite)
-            self._fixed(f"{what}.", "They are missing points that no triangle uses, and are dropped.")
-            return True
-        what += f", used by {_some(lost, 'triangle', 'triangles')}."
-        if self.strict:
-            self._refuse(what, "export the scan again without them, or leave out --strict to remove them.")
-            return False
-        self._keep_triangles(whole)
-        self._keep_vertices(finite)
-        self._fixed(what, "They are removed together, which leaves a hole.")
-        return True
-
-    def _keep_vertices(self, keep: BoolArray) -> None:
-        self.colours = None if self.colours is None else self.colours[keep]
-        if self.faces is None:
-            self.vertices = self.vertices[keep]
-        else:
-            self.vertices, self.faces = without_vertices(self.vertices, self.faces, keep)
-
-    def _keep_triangles(self, keep: BoolArray | IntArray) -> None:
-        assert self.faces is not None and self.in_file is not None
-        self.faces, self.in_file = self.faces[keep], self.in_file[keep]
-
-    def _merge_vertices(self) -> None:
-        first, index = _equal_rows((self.vertices + 0.0).view(np.int64))  # 0 and -0 have other bits
-        self.duplicates = len(self.vertices) - len(first)
-        if self.duplicates:
-            self.vertices = self.vertices[first]
-            self.colours = None if self.colours is None else self.colours[first]
-            self.faces = None if self.faces is None else index[self.faces]
-            self._fixed(
-                f"{_some(self.duplicates, 'vertex lies', 'vertices lie')} exactly on another.",
-                "Equal vertices are merged into one.",
-            )
-
-    def _drop_triangles(self) -> None:
-        from shapespace.geometry import topology  # compiled
-
-        assert self.faces is not None
-        flat = topology.flat_triangles(np.array(self.vertices), self.faces, _DEGENERATE)
-        self.degenerate = int(flat.sum())
-        if self.degenerate:
-            self._keep_triangles(~flat)
-            self._fixed(f"{_some(self.degenerate, 'triangle has', 'triangles have')} no area.", "They are dropped.")
-        if len(self.faces):
-            ranked = np.sort(self.faces, axis=1)
-            first, _ = _equal_rows(ranked)
-            self.repeated = len(self.faces) - len(first)
-            if self.repeated:
-                self._keep_triangles(first)
-                self._fixed(
-                    f"{_some(self.repeated, 'triangle repeats', 'triangles repeat')} an earlier one.",
-                    "Only the first of each is kept.",
-                )
-
-    def _drop_unreferenced(self) -> None:
-        assert self.faces is not None
-        if not len(self.faces):
-            return
-        used = np.zeros(len(self.vertices), dtype=np.bool_)
-        used[self.faces] = True
-        self.unreferenced = int((~used).sum())
-        if self.unreferenced:
-            self._keep_vertices(used)
-            self._fixed(
-                f"{_some(self.unreferenced, 'vertex belongs', 'vertices belong')} to no triangle.",
-                "They are not part of the surface, and are dropped.",
-            )
-
-    def _measure_spread(self) -> None:
-        """Refuse what spans no space; note what lies far from the origin."""
-        vertices = self.vertices
-        centre = vertices.mean(axis=0)
-        centred = vertices - centre
-        # The eigenvalues of the 3 x 3 covariance would lose half of the digits; R of QR keeps them.
-        spread = np.linalg.svd(np.linalg.qr(centred, mode="r"), compute_uv=False)
-        spread = np.concatenate([spread, np.zeros(3 - len(spread))])
-        largest = float(spread[0])
-        self.planarity = float(spread[2]) / largest if largest > 0 else 0.0
-        diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-        far = float(np.linalg.norm(centre))
-        self.origin_distance = far / diagonal if diagonal > 0 else float("inf")
-        tolerance = _FLAT
-        coarse = float(np.abs(vertices).max()) * float(np.finfo(np.float32).eps)
-        stored_single = bool((np.abs(vertices) <= np.finfo(np.float32).max).all()) and np.array_equal(
-            vertices.astype(np.float32), vertices
-        )
-        if stored_single and largest > 0:
-            # Rounding to float32 lifts a plane off itself by up to this much.
-            tolerance = max(tolerance, coarse * float(np.sqrt(len(vertices))) / largest)
-        if len(vertices) == 1:
-            self._refuse("All its points are equal.", "give a scan of a surface.")
-        elif spread[1] <= tolerance * largest:
-            self._refuse("All its points lie on a line.", "give a scan of a surface.")
-        elif self.faces is not None and len(self.faces) <= 1:
-            count = "only one triangle" if len(self.faces) else "no triangle that has an area"
-            self._refuse(f"It has {count}.", "give a scan of a whole surface.")
-        elif len(vertices) < 4:
-            self._refuse(f"It has only {len(vertices)} different points.", "give at least 4, not on a plane.")
-        elif spread[2] <= tolerance * largest:
-            self._refuse("All its points lie on a plane.", "give a scan of a surface with some depth.")
-        if diagonal > 0 and self.origin_distance > _FAR:
-            grid = f", on a grid of about {coarse:.2g}" if stored_single else ""
-            self._note(
-                f"It lies {far:.3g} units from the origin, {self.origin_distance:.0f} times its own size{grid}.",
-                "It is moved to its centroid in double precision before fitting, and back after.",
-            )
-        if self.faces is None:
-            self._note("It has no triangles: a point cloud.", "Distances are measured to its points.")
-
-    def _inspect_surface(self) -> None:
-        from shapespace.geometry import topology  # compiled
-
-        assert self.faces is not None
-        edges = _Edges(self.faces, len(self.vertices))
-        self.boundary, self.non_manifold = edges.boundary, edges.non_manifold
-        if self.non_manifold:
-            self._note(
-                f"{_some(self.non_manifold, 'edge has', 'edges have')} more than two triangles.",
-                "They are kept; winding is not carried across them.",
-            )
-        self.inconsistent = int(edges.same_way.sum())
-        self._orient(edges)
-        vertices = np.array(self.vertices)
-        middles, normals = topology.middles_and_normals(vertices, self.faces, vertices.mean(axis=0))
-        self._turn_outward(edges, middles, normals)
-        areas = _lengths(normals)
-        self.components, pieces = _components(len(self.vertices), self.faces[:, :2], self.faces[:, 1:])
-        by_piece = np.bincount(pieces[self.faces[:, 0]], weights=areas)
-        self.share = float(by_piece.max() / areas.sum())
-        if self.components > 1:
-            self._note(
-                f"It has {self.components} separate pieces; the largest has {100 * self.share:.1f} % of the area.",
-                "All are kept.",
-            )
-
-    def _orient(self, edges: _Edges) -> None:
-        """Make winding consistent in each patch, turning the smaller side."""
-        assert self.faces is not None and self.in_file is not None
-        if not self.inconsistent:
-            return
-        # Where merging glued two pieces that touch, their winding says nothing about each other; in a soup of
-        # triangles every edge is glued, and winding is all there is.
-        meet = (self.in_file[edges.pairs[:, 0], :, None] == self.in_file[edges.pairs[:, 1], None, :]).sum(axis=(1, 2))
-        glued = meet < 2
-        if glued.mean() < 0.5 and (glued & edges.same_way).any():
-            count = int((glued & edges.same_way).sum())
-            edges.cut(glued & edges.same_way)
-            self._note(
-                f"At {_some(count, 'edge', 'edges')}, pieces that wind against each other touch.",
-                "They are kept; winding is not carried across.",
-            )
-        n = len(self.faces)
-        # Each triangle is there twice, as it is (i) and turned (i + n); an edge ties the states that agree.
-        # A patch that can be oriented falls into two mirrored halves; a Moebius strip stays in one.
-        a, b = edges.pairs.T
-        shift = np.where(edges.same_way, n, 0)
-        _, label = _components(2 * n, np.stack([a, b + shift], axis=1), np.stack([a + n, b + n - shift], axis=1))
-        as_is, turned = label[:n], label[n:]
-        size = np.bincount(as_is, minlength=int(label.max()) + 1)
-        smaller = (size[as_is] < size[turned]) | ((size[as_is] == size[turned]) & (as_is > turned))
-        stuck = int((as_is == turned).sum())
-        flip = smaller & (as_is != turned)
-        if flip.any():
-            self._turn(flip)
-            self._fixed(
-                f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours.",
-                "They are turned round.",
-            )
-        if stuck:
-            self._note(
-                f"{_some(stuck, 'triangle is', 'triangles are')} on a one-sided surface (a Moebius strip).",
-                "They are kept as they are; their normals cannot be trusted.",
-            )
-
-    def _turn(self, flip: BoolArray) -> None:
-        assert self.faces is not None
-        self.faces = np.where(flip[:, None], self.faces[:, ::-1], self.faces)
-        self.turned += int(flip.sum())
-
-    def _turn_outward(self, edges: _Edges, middles: FloatArray, normals: FloatArray) -> None:
-        """Turn closed patches with negative volume, and the open surface if its normals point inward."""
-        assert self.faces is not None
-        count, patch = edges.patches()
-        closed = np.ones(count, dtype=np.bool_)
-        closed[patch[edges.loose]] = False
-        areas = _lengths(normals)
-        if closed.any():
-            self._turn_closed_outward(closed, patch, areas, middles, normals)
-        # Patches of one scan come from one scanner, so the open ones are judged and turned together.
-        is_open = ~closed[patch]
-        if not is_open.any():
-            return
-        weight = np.where(is_open, areas, 0.0)
-        arm = middles - weight @ middles / weight.sum()
-        reach = float(weight @ _lengths(arm))
-        outward = np.where(is_open, np.einsum("fi,fi->f", normals, arm), 0.0)
-        score = float(outward.sum()) / reach if reach > 0 else 0.0
-        if score < _REVERSED:
-            self._turn(is_open)
-            normals[is_open] *= -1
-            self._fixed(
-                "The normals of the open surface point to its inside, so its winding looks reversed.",
-                "Its winding is reversed.",
-            )
-
-    def _turn_closed_outward(
-        self, closed: BoolArray, patch: IntArray, areas: FloatArray, middles: FloatArray, normals: FloatArray
-    ) -> None:
-        from shapespace.geometry import topology  # compiled
-
-        count = len(closed)
-        area = np.bincount(patch, weights=areas, minlength=count)
-        centre = np.stack(
-            [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
-        )
-        outward = np.einsum("fi,fi->f", normals, middles - centre[patch])
-        volume = np.bincount(patch, weights=outward, minlength=count) / 3
-        biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
-        low, high = topology.boxes_of(middles, patch, count)
-        # The wall of a cavity rightly looks inward.
-        cavity = (low > low[biggest]).all(axis=1) & (high < high[biggest]).all(axis=1)
-        inside_out = closed & (volume < 0) & ~cavity
-        if inside_out.any():
-            self._turn(inside_out[patch])
-            normals[inside_out[patch]] *= -1
-            self._fixed(
-                f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out.",
-                "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed.",
-            )
-
-    def repaired(self) -> Mesh:
-        """Return the mesh after the repairs."""
-        if not self.changed:
-            return self.mesh
-        mesh = self.mesh
+    def repaired(self, mesh: Mesh) -> Mesh:
+        """Return the mesh after the repairs: `mesh` itself if there were none."""
+        if all(finding.level != "fixed" for finding in self.report.findings):
+            return mesh
         return Mesh(self.vertices, self.faces, mesh.landmarks, mesh.name, self.colours, mesh.notes)
 
-    def report(self) -> MeshReport:
-        """Return what was found."""
-        finite = self.mesh.vertices[self.finite]
-        bounds = np.stack([finite.min(axis=0), finite.max(axis=0)]) if len(finite) else np.full((2, 3), np.nan)
-        return MeshReport(
-            name=self.mesh.name,
-            vertices=len(self.mesh.vertices),
-            triangles=0 if self.mesh.faces is None else len(self.mesh.faces),
-            bounds=bounds,
-            extent=bounds[1] - bounds[0],
-            components=self.components,
-            largest_component_share=self.share,
-            boundary_edges=self.boundary,
-            non_manifold_edges=self.non_manifold,
-            duplicate_vertices=self.duplicates,
-            unreferenced_vertices=self.unreferenced,
-            degenerate_triangles=self.degenerate,
-            duplicate_triangles=self.repeated,
-            non_finite_vertices=self.non_finite,
-            inconsistent_edges=self.inconsistent,
-            reversed_triangles=self.turned,
-            planarity=self.planarity,
-            origin_distance=self.origin_distance,
-            findings=tuple(self.findings),
+    def measured(self, **values: Any) -> _RepairState:
+        """Return the state with these fields of the report."""
+        return replace(self, report=replace(self.report, **values))
+
+    def reported(self, level: FindingLevel, what: str, action: str) -> _RepairState:
+        """Return the state with one more finding."""
+        return self.measured(findings=(*self.report.findings, Finding(level, what, action)))
+
+    def with_vertices_where(self, keep: BoolArray) -> _RepairState:
+        """Return the state with some of the vertices, and the triangles between them."""
+        colours = None if self.colours is None else self.colours[keep]
+        if self.faces is None:
+            return replace(self, vertices=self.vertices[keep], colours=colours)
+        vertices, faces = without_vertices(self.vertices, self.faces, keep)
+        return replace(self, vertices=vertices, faces=faces, colours=colours)
+
+    def with_triangles_where(self, keep: BoolArray | IntArray) -> _RepairState:
+        """Return the state with some of the triangles."""
+        assert self.faces is not None and self.faces_in_file is not None
+        return replace(self, faces=self.faces[keep], faces_in_file=self.faces_in_file[keep])
+
+    def with_triangles_reversed(self, reverse: BoolArray) -> _RepairState:
+        """Return the state with the winding of some of the triangles (F,) reversed."""
+        assert self.faces is not None
+        faces = np.where(reverse[:, None], self.faces[:, ::-1], self.faces)
+        count = self.report.reversed_triangles + int(reverse.sum())
+        return replace(self, faces=faces).measured(reversed_triangles=count)
+
+
+def _examine_and_repair(mesh: Mesh, *, strict: bool) -> _RepairState:
+    finite = _finite(mesh.vertices)
+    state = _drop_non_finite(_initial(mesh, finite), finite, strict=strict)
+    if not state.report.usable:
+        return state
+    if not len(state.vertices):
+        return state.reported("refused", "There are no points in it.", "export the scan again.")
+    if np.abs(state.vertices).max() > _ABSURD:
+        return state.reported("refused", "Its coordinates are too large to be lengths.", "export the scan again.")
+    state = _merge_vertices(state)
+    if state.faces is not None:
+        state = _drop_unreferenced(_drop_repeated(_drop_degenerate(state)))
+    state = _check_spread(state)
+    return _inspect_surface(state) if state.faces is not None and len(state.faces) else state
+
+
+def _initial(mesh: Mesh, finite: BoolArray) -> _RepairState:
+    """Return the state of `mesh` as it is in its file; `finite` (V,) are the vertices with a position."""
+    faces = None if mesh.faces is None else np.array(mesh.faces)
+    points = mesh.vertices[finite]
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)]) if len(points) else np.full((2, 3), np.nan)
+    report = MeshReport(
+        name=mesh.name,
+        vertices=len(mesh.vertices),
+        triangles=0 if faces is None else len(faces),
+        bounds=bounds,
+        extent=bounds[1] - bounds[0],
+        components=0,
+        largest_component_share=0.0 if faces is None else 1.0,
+        boundary_edges=0,
+        non_manifold_edges=0,
+        duplicate_vertices=0,
+        unreferenced_vertices=0,
+        degenerate_triangles=0,
+        duplicate_triangles=0,
+        non_finite_vertices=int((~finite).sum()),
+        inconsistent_edges=0,
+        reversed_triangles=0,
+        planarity=float("nan"),
+        origin_distance=float("nan"),
+        findings=(),
+    )
+    return _RepairState(mesh.vertices, faces, faces, mesh.colours, report)
+
+
+def _drop_non_finite(state: _RepairState, finite: BoolArray, *, strict: bool) -> _RepairState:
+    """Remove vertices that are not finite, and triangles that use them; refuse these triangles if `strict`."""
+    count = state.report.non_finite_vertices
+    if not count:
+        return state
+    what = f"It has {_some(count, 'vertex', 'vertices')} with {NON_FINITE}"
+    whole = None if state.faces is None else np.asarray(finite[state.faces].all(axis=1))
+    lost = 0 if whole is None else int((~whole).sum())
+    if whole is None or not lost:
+        action = "They are missing points that no triangle uses, and are dropped."
+        return state.with_vertices_where(finite).reported("fixed", f"{what}.", action)
+    what += f", used by {_some(lost, 'triangle', 'triangles')}."
+    if strict:
+        action = "export the scan again without them, or leave out --strict to remove them."
+        return state.reported("refused", what, action)
+    state = state.with_triangles_where(whole).with_vertices_where(finite)
+    return state.reported("fixed", what, "They are removed together, which leaves a hole.")
+
+
+def _merge_vertices(state: _RepairState) -> _RepairState:
+    first, index = _equal_rows((state.vertices + 0.0).view(np.int64))  # 0 and -0 have other bits
+    count = len(state.vertices) - len(first)
+    if not count:
+        return state
+    merged = replace(
+        state,
+        vertices=state.vertices[first],
+        faces=None if state.faces is None else index[state.faces],
+        colours=None if state.colours is None else state.colours[first],
+    )
+    return merged.measured(duplicate_vertices=count).reported(
+        "fixed",
+        f"{_some(count, 'vertex lies', 'vertices lie')} exactly on another.",
+        "Equal vertices are merged into one.",
+    )
+
+
+def _drop_degenerate(state: _RepairState) -> _RepairState:
+    from shapespace.geometry import topology  # compiled
+
+    assert state.faces is not None
+    flat = topology.flat_triangles(np.array(state.vertices), state.faces, _DEGENERATE)
+    count = int(flat.sum())
+    if not count:
+        return state
+    what = f"{_some(count, 'triangle has', 'triangles have')} no area."
+    state = state.with_triangles_where(~flat).measured(degenerate_triangles=count)
+    return state.reported("fixed", what, "They are dropped.")
+
+
+def _drop_repeated(state: _RepairState) -> _RepairState:
+    assert state.faces is not None
+    if not len(state.faces):
+        return state
+    first, _ = _equal_rows(np.sort(state.faces, axis=1))
+    count = len(state.faces) - len(first)
+    if not count:
+        return state
+    what = f"{_some(count, 'triangle repeats', 'triangles repeat')} an earlier one."
+    state = state.with_triangles_where(first).measured(duplicate_triangles=count)
+    return state.reported("fixed", what, "Only the first of each is kept.")
+
+
+def _drop_unreferenced(state: _RepairState) -> _RepairState:
+    assert state.faces is not None
+    if not len(state.faces):
+        return state
+    used = np.zeros(len(state.vertices), dtype=np.bool_)
+    used[state.faces] = True
+    count = int((~used).sum())
+    if not count:
+        return state
+    what = f"{_some(count, 'vertex belongs', 'vertices belong')} to no triangle."
+    state = state.with_vertices_where(used).measured(unreferenced_vertices=count)
+    return state.reported("fixed", what, "They are not part of the surface, and are dropped.")
+
+
+def _check_spread(state: _RepairState) -> _RepairState:
+    """Refuse a mesh whose points span no space; note one that is far from the origin, and a point cloud."""
+    vertices = state.vertices
+    centre = vertices.mean(axis=0)
+    # The eigenvalues of the 3 x 3 covariance would lose half of the digits; R of QR keeps them.
+    spread = np.linalg.svd(np.linalg.qr(vertices - centre, mode="r"), compute_uv=False)
+    spread = np.concatenate([spread, np.zeros(3 - len(spread))])
+    largest = float(spread[0])
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    distance = float(np.linalg.norm(centre))
+    origin_distance = distance / diagonal if diagonal > 0 else float("inf")
+    state = state.measured(
+        planarity=float(spread[2]) / largest if largest > 0 else 0.0, origin_distance=origin_distance
+    )
+    rounding = _float32_rounding(vertices)
+    tolerance = _FLAT
+    if rounding is not None and largest > 0:
+        # Rounding to float32 lifts a plane off itself by up to this much.
+        tolerance = max(tolerance, rounding * float(np.sqrt(len(vertices))) / largest)
+    if (refusal := _refusal(state, spread, tolerance)) is not None:
+        state = state.reported("refused", *refusal)
+    if diagonal > 0 and origin_distance > _FAR:
+        grid = "" if rounding is None else f", on a grid of about {rounding:.2g}"
+        state = state.reported(
+            "note",
+            f"It lies {distance:.3g} units from the origin, {origin_distance:.0f} times its own size{grid}.",
+            "It is moved to its centroid in double precision before fitting, and back after.",
         )
+    if state.faces is None:
+        state = state.reported("note", "It has no triangles: a point cloud.", "Distances are measured to its points.")
+    return state
 
 
+def _float32_rounding(vertices: FloatArray) -> float | None:
+    """Return the rounding error of coordinates that are stored as float32, in their unit; None for others."""
+    largest = np.abs(vertices).max()
+    in_range = bool((np.abs(vertices) <= np.finfo(np.float32).max).all())
+    if not in_range or not np.array_equal(vertices.astype(np.float32), vertices):
+        return None
+    return float(largest) * float(np.finfo(np.float32).eps)
+
+
+def _refusal(state: _RepairState, spread: FloatArray, tolerance: float) -> tuple[str, str] | None:
+    """Return what is wrong with points of these singular values (3,) and what to do about it; None if nothing is."""
+    if len(state.vertices) == 1:
+        return "All its points are equal.", "give a scan of a surface."
+    if spread[1] <= tolerance * float(spread[0]):
+        return "All its points lie on a line.", "give a scan of a surface."
+    if state.faces is not None and len(state.faces) <= 1:
+        count = "only one triangle" if len(state.faces) else "no triangle that has an area"
+        return f"It has {count}.", "give a scan of a whole surface."
+    if len(state.vertices) < 4:
+        return f"It has only {len(state.vertices)} different points.", "give at least 4, not on a plane."
+    if spread[2] <= tolerance * float(spread[0]):
+        return "All its points lie on a plane.", "give a scan of a surface with some depth."
+    return None
+
+
+def _inspect_surface(state: _RepairState) -> _RepairState:
+    """Count edges and pieces, and make the winding consistent and outward."""
+    from shapespace.geometry import topology  # compiled
+
+    assert state.faces is not None
+    edges = _Edges.of(state.faces, len(state.vertices))
+    state = state.measured(
+        boundary_edges=edges.boundary,
+        non_manifold_edges=edges.non_manifold,
+        inconsistent_edges=int(edges.same_way.sum()),
+    )
+    if edges.non_manifold:
+        state = state.reported(
+            "note",
+            f"{_some(edges.non_manifold, 'edge has', 'edges have')} more than two triangles.",
+            "They are kept; winding is not carried across them.",
+        )
+    if state.report.inconsistent_edges:
+        state, edges = _cut_glued_edges(state, edges)
+        state = _make_winding_consistent(state, edges)
+    assert state.faces is not None
+    vertices = np.array(state.vertices)
+    middles, normals = topology.middles_and_normals(vertices, state.faces, vertices.mean(axis=0))
+    state = _turn_outward(state, edges, middles, normals)
+    assert state.faces is not None
+    components, pieces = _components(len(vertices), state.faces[:, :2], state.faces[:, 1:])
+    areas = _lengths(normals)
+    share = float(np.bincount(pieces[state.faces[:, 0]], weights=areas).max() / areas.sum())
+    state = state.measured(components=components, largest_component_share=share)
+    if components > 1:
+        what = f"It has {components} separate pieces; the largest has {100 * share:.1f} % of the area."
+        state = state.reported("note", what, "All are kept.")
+    return state
+
+
+def _cut_glued_edges(state: _RepairState, edges: _Edges) -> tuple[_RepairState, _Edges]:
+    """Separate pieces that wind against each other where only the merging of vertices has joined them.
+
+    In a soup of triangles merging has joined every edge, and winding is all there is.
+    """
+    assert state.faces_in_file is not None
+    first, second = state.faces_in_file[edges.pairs].swapaxes(0, 1)
+    glued = (first[:, :, None] == second[:, None, :]).sum(axis=(1, 2)) < 2
+    seam = glued & edges.same_way
+    if glued.mean() >= 0.5 or not seam.any():
+        return state, edges
+    what = f"At {_some(int(seam.sum()), 'edge', 'edges')}, pieces that wind against each other touch."
+    return state.reported("note", what, "They are kept; winding is not carried across."), edges.without(seam)
+
+
+def _make_winding_consistent(state: _RepairState, edges: _Edges) -> _RepairState:
+    """Make winding consistent in each patch, turning the smaller side."""
+    assert state.faces is not None
+    n = len(state.faces)
+    # Each triangle is there twice, as it is (i) and turned (i + n); an edge ties the states that agree.
+    # A patch that can be oriented falls into two mirrored halves; a Moebius strip stays in one.
+    a, b = edges.pairs.T
+    shift = np.where(edges.same_way, n, 0)
+    _, label = _components(2 * n, np.stack([a, b + shift], axis=1), np.stack([a + n, b + n - shift], axis=1))
+    as_is, turned = label[:n], label[n:]
+    size = np.bincount(as_is, minlength=int(label.max()) + 1)
+    smaller = (size[as_is] < size[turned]) | ((size[as_is] == size[turned]) & (as_is > turned))
+    one_sided = int((as_is == turned).sum())
+    flip = smaller & (as_is != turned)
+    if flip.any():
+        what = f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours."
+        state = state.with_triangles_reversed(flip).reported("fixed", what, "They are turned round.")
+    if one_sided:
+        state = state.reported(
+            "note",
+            f"{_some(one_sided, 'triangle is', 'triangles are')} on a one-sided surface (a Moebius strip).",
+            "They are kept as they are; their normals cannot be trusted.",
+        )
+    return state
+
+
+def _turn_outward(state: _RepairState, edges: _Edges, middles: FloatArray, normals: FloatArray) -> _RepairState:
+    """Turn closed patches with negative volume, and the open surface if its normals point inward.
+
+    Args:
+        state: with consistent winding in each patch.
+        edges: of its triangles.
+        middles: (F, 3) of the triangles, from the centroid of the vertices.
+        normals: (F, 3), as long as the triangles are large.
+    """
+    count, patch = edges.patches()
+    closed = np.ones(count, dtype=np.bool_)
+    closed[patch[edges.loose]] = False
+    if closed.any() and (inside_out := _inside_out(closed, patch, middles, normals)).any():
+        what = f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
+        action = "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed."
+        state = state.with_triangles_reversed(inside_out[patch]).reported("fixed", what, action)
+    # Patches of one scan come from one scanner, so the open ones are judged and turned together.
+    is_open = ~closed[patch]
+    if is_open.any() and _points_inward(is_open, middles, normals):
+        what = "The normals of the open surface point to its inside, so its winding looks reversed."
+        state = state.with_triangles_reversed(is_open).reported("fixed", what, "Its winding is reversed.")
+    return state
+
+
+def _inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals: FloatArray) -> BoolArray:
+    """Return (P,) which of the `closed` patches (P,) have a negative volume and are not the wall of a cavity."""
+    from shapespace.geometry import topology  # compiled
+
+    count, areas = len(closed), _lengths(normals)
+    area = np.bincount(patch, weights=areas, minlength=count)
+    centre = np.stack(
+        [np.bincount(patch, weights=areas * middles[:, k], minlength=count) / area for k in range(3)], axis=1
+    )
+    outward = np.einsum("fi,fi->f", normals, middles - centre[patch])
+    volume = np.bincount(patch, weights=outward, minlength=count) / 3
+    biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
+    low, high = topology.boxes_of(middles, patch, count)
+    # The wall of a cavity rightly looks inward.
+    cavity = (low > low[biggest]).all(axis=1) & (high < high[biggest]).all(axis=1)
+    return np.asarray(closed & (volume < 0) & ~cavity)
+
+
+def _points_inward(is_open: BoolArray, middles: FloatArray, normals: FloatArray) -> bool:
+    """Return whether the normals of the triangles `is_open` (F,) point to the inside of their surface."""
+    weight = np.where(is_open, _lengths(normals), 0.0)
+    arm = middles - weight @ middles / weight.sum()
+    reach = float(weight @ _lengths(arm))
+    outward = np.where(is_open, np.einsum("fi,fi->f", normals, arm), 0.0)
+    return (float(outward.sum()) / reach if reach > 0 else 0.0) < _REVERSED
+
+
+@dataclass(frozen=True, eq=False)
 class _Edges:
-    """The edges of triangles (F, 3): how many are boundary or non-manifold, and who meets across the others."""
+    """The edges of F triangles.
 
-    def __init__(self, faces: IntArray, vertices: int) -> None:
+    Args:
+        n_faces: F.
+        pairs: (E, 2) the triangles that meet across each manifold edge.
+        same_way: (E,) whether they run along it in the same direction, so that one of them is turned.
+        loose: the triangles at all other edges.
+        boundary: number of edges with one triangle.
+        non_manifold: number of edges with more than two triangles.
+    """
+
+    n_faces: int
+    pairs: IntArray
+    same_way: BoolArray
+    loose: IntArray
+    boundary: int
+    non_manifold: int
+
+    @staticmethod
+    def of(faces: IntArray, vertices: int) -> _Edges:
         from shapespace.geometry import topology  # compiled
 
-        self.faces = len(faces)
-        self.pairs, self.same_way, self.loose, self.boundary, self.non_manifold = topology.meeting_triangles(
-            faces, vertices
-        )
-        """`pairs` (E, 2) are the triangles that meet across each manifold edge, `same_way` (E,) whether they run along
-        it in the same direction, so that one of them is turned; `loose` are the triangles at all other edges."""
+        pairs, same_way, loose, boundary, non_manifold = topology.meeting_triangles(faces, vertices)
+        return _Edges(len(faces), pairs, same_way, loose, boundary, non_manifold)
 
-    def cut(self, seam: BoolArray) -> None:
-        """Take the pairs where `seam` (E,) as not joined."""
-        self.loose = np.concatenate([self.loose, self.pairs[seam].ravel()])
-        self.pairs, self.same_way = self.pairs[~seam], self.same_way[~seam]
+    def without(self, seam: BoolArray) -> _Edges:
+        """Return the edges with the pairs where `seam` (E,) not joined."""
+        loose = np.concatenate([self.loose, self.pairs[seam].ravel()])
+        return replace(self, pairs=self.pairs[~seam], same_way=self.same_way[~seam], loose=loose)
 
     def patches(self) -> tuple[int, IntArray]:
         """Return the number of patches joined by manifold edges, and (F,) the patch of each triangle."""
-        return _components(self.faces, self.pairs)
+        return _components(self.n_faces, self.pairs)
 
 
 def _components(nodes: int, *links: IntArray) -> tuple[int, IntArray]:

@@ -180,7 +180,7 @@ def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
     points = vertices[rim]
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     steps = np.maximum(steps, _TINY * steps.sum())
-    at = (np.cumsum(steps) - steps) / steps.sum()
+    position = (np.cumsum(steps) - steps) / steps.sum()
     normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     centred = points - points.mean(axis=0)
     if np.linalg.norm(normal) > 0:
@@ -190,11 +190,11 @@ def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
     main = main * np.sign(main[np.argmax(np.abs(main))])
     # The first harmonic of the rim tells at which angle it starts.
     plane = centred @ np.cross(main, normal) + 1j * (centred @ main)
-    phase = np.angle((plane * np.exp(-2j * np.pi * at) * steps).sum()) / (2 * np.pi)
+    phase = np.angle((plane * np.exp(-2j * np.pi * position) * steps).sum()) / (2 * np.pi)
     angle = np.linspace(0.0, 2 * np.pi, 4097)
     curve = _rim_curve(angle)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    theta = np.asarray(cast(Any, np.interp)((at + phase) % 1.0, along / along[-1], angle), dtype=np.float64)
+    theta = np.asarray(cast(Any, np.interp)((position + phase) % 1.0, along / along[-1], angle), dtype=np.float64)
     return 0.5 + 0.5 * _rim_curve(theta)
 
 

@@ -136,9 +136,9 @@ class KdTree:
             known = Followed(np.full((m, NOTED + 1), -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
         elif len(known.reach) != m:
             raise InputError(f"What is known of {len(known.reach)} queries cannot serve {m}.")
-        found, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
-        follow_into(self.arrays, queries, known, found, squared, points)
-        return found, squared, points, known
+        nearest, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
+        follow_into(self.arrays, queries, known, nearest, squared, points)
+        return nearest, squared, points, known
 
 
 def writable(queries: FloatArray) -> FloatArray:
@@ -333,8 +333,8 @@ def nearest_into(
     """Write index (M,) and squared distance (M,) of the points nearest to `queries` (M, 3) given `guess` (M,)."""
     stack = np.empty(STACK_SIZE)
     for i in range(len(queries)):
-        found, squared = nearest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
-        index_out[i], squared_out[i] = found, squared
+        nearest, squared = nearest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
+        index_out[i], squared_out[i] = nearest, squared
 
 
 @compiled

@@ -39,8 +39,8 @@ def mirror_vertices(vertices: FloatArray) -> IntArray:
         InputError: the surface is not its own mirror image, or its vertices do not pair up.
     """
     centred = vertices - vertices.mean(axis=0) * [0.0, 1.0, 1.0]
-    found = cKDTree(centred).query(centred * FLIP)
-    distance, other = np.asarray(found[0]), np.asarray(found[1], dtype=np.int32)
+    neighbours = cKDTree(centred).query(centred * FLIP)
+    distance, other = np.asarray(neighbours[0]), np.asarray(neighbours[1], dtype=np.int32)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))
     if distance.max() > _OFF * size or (other[other] != np.arange(len(other))).any():
         raise InputError("This surface is not its own mirror image about x = 0; train without mirror images.")
@@ -106,10 +106,12 @@ def find_mirror(mesh: Mesh) -> SurfaceMirror:
     tried.sort(key=lambda one: one[0])
     rms, flip, T = tried[0]
     image = T.apply((x - centre) @ flip.T + centre)
-    at = engine.query(image)
-    assert at.triangle is not None and at.barycentric is not None
+    nearest = engine.query(image)
+    assert nearest.triangle is not None and nearest.barycentric is not None
     others = tuple(one[0] / size for one in tried[1:])
-    return SurfaceMirror(faces_of(mesh)[at.triangle], at.barycentric, T.rotation @ flip, rms / size, others, image)
+    return SurfaceMirror(
+        faces_of(mesh)[nearest.triangle], nearest.barycentric, T.rotation @ flip, rms / size, others, image
+    )
 
 
 def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
@@ -142,12 +144,12 @@ def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: In
     mutual = nearest[nearest] == np.arange(count)
     off = np.where(mutual, np.linalg.norm(x[nearest] - image, axis=1), np.inf)[faces].max(axis=1)
     tries = 0
-    for at in np.argsort(off, kind="stable"):
-        if not np.isfinite(off[at]):
+    for triangle in np.argsort(off, kind="stable"):
+        if not np.isfinite(off[triangle]):
             break
-        if (other[faces[at]] >= 0).all():
+        if (other[faces[triangle]] >= 0).all():
             continue
-        grown = _grown(faces[at].tolist(), nearest, across)
+        grown = _grown(faces[triangle].tolist(), nearest, across)
         if grown is not None:
             other[list(grown)] = list(grown.values())
         elif (tries := tries + 1) > _TRIES:
@@ -162,19 +164,19 @@ def _grown(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], 
     there = [int(nearest[v]) for v in seed]
     if across.get((there[1], there[0])) != there[2]:
         return None
-    found = dict(zip(seed, there, strict=True))
+    pairs = dict(zip(seed, there, strict=True))
     edges = deque((seed[k], seed[(k + 1) % 3]) for k in range(3))
     while edges:
         p, q = edges.popleft()
         # The triangle beyond an edge runs along it the other way, and its image the other way again.
-        beyond, image = across.get((q, p)), across.get((found[p], found[q]))
+        beyond, image = across.get((q, p)), across.get((pairs[p], pairs[q]))
         if (beyond is None) != (image is None):
             return None
         if beyond is None or image is None:
             continue
-        if beyond not in found:
-            found[beyond] = image
+        if beyond not in pairs:
+            pairs[beyond] = image
             edges += [(p, beyond), (beyond, q)]
-        elif found[beyond] != image:
+        elif pairs[beyond] != image:
             return None
-    return found
+    return pairs

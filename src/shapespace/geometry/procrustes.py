@@ -1,6 +1,7 @@
 """Generalised Procrustes: bring corresponding shapes into one pose, in a stated gauge.
 
-Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991.
+Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991. Equations Cn are those of docs/correspondence.md and
+docs/missing.md.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from shapespace.types import FloatArray, IntArray, Similarity
 _TANGENT_ROUNDS, _IN_TANGENT = 20, 1e-13
 _TOLERANCE, _MOST_ROUNDS = 1e-10, 100
 _ON_A_LINE = 1e-9
+_WEIGHTED_ROUNDS = 6
+_LEAST_WEIGHT = 1e-3
+"""So that a vertex that no shape observes has a mean."""
 
 Gauge: TypeAlias = Literal["form", "shape"]
 """`form`: rigid alignment, size stays in the modes. `shape`: alignment with scale, size is divided out."""
@@ -85,10 +89,10 @@ def align_in_place(
                 scale = size / centroid_size(shapes[index][chosen])
                 centre = shapes[index][chosen].mean(axis=0)
                 rotation = T_mean_shape.rotation
-                T_mean_shape = Similarity(scale, rotation, -scale * rotation @ centre)
+                T_mean_shape = Similarity(scale, rotation, -scale * rotation @ centre)  # C18
             shapes[index] = T_mean_shape.apply(shapes[index])
             mean += shapes[index]
-        mean = _in_frame(mean / len(shapes), reference, chosen, size, with_scale)
+        mean = _in_frame(mean / len(shapes), reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -97,6 +101,26 @@ def align_in_place(
     else:
         return Alignment(mean, max_iterations, converged=False)
     return Alignment(shapes.mean(axis=0), iteration, converged=True)
+
+
+def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return `shapes` (N, V, 3) in the pose and size of their weighted mean, and the mean (V, 3) in those of `frame`.
+
+    Unlike in `align_in_place`, each size is fitted, and vertices may be missing.
+
+    Args:
+        shapes: in any poses and sizes.
+        weights: (N, V) of the vertices, 0 to 1; poses are fitted to those above 0.
+        frame: (V, 3) the shape whose pose and size the mean has.
+    """
+    mean, aligned = frame, shapes
+    floored = np.maximum(weights, _LEAST_WEIGHT)[:, :, None]
+    for _ in range(_WEIGHTED_ROUNDS):
+        poses = [fit_similarity(x[w > 0], mean[w > 0]) for x, w in zip(shapes, weights, strict=True)]  # C11
+        aligned = np.stack([pose.apply(x) for pose, x in zip(poses, shapes, strict=True)])
+        mean = (floored * aligned).sum(axis=0) / floored.sum(axis=0)  # C12
+        mean = fit_similarity(mean, frame).apply(mean)
+    return aligned, mean
 
 
 def check_alignment(gauge: Gauge, alignment_vertices: IntArray | None, n_vertices: int) -> IntArray | slice:
@@ -143,7 +167,7 @@ def scale_to_tangent(shapes: FloatArray) -> None:
     mean = flat.mean(axis=0)
     for _ in range(_TANGENT_ROUNDS):
         along = flat @ mean / (mean @ mean)
-        flat /= along[:, None]
+        flat /= along[:, None]  # C20
         mean = flat.mean(axis=0)
         if np.abs(along - 1.0).max() < _IN_TANGENT:
             break
@@ -227,10 +251,10 @@ def align_streamed(
             if with_scale:
                 linear *= (size / shapes.sizes[start : start + len(linear)])[:, None, None]
             moved = np.einsum("nab,nb->na", linear, centres)
-            return linear, -moved if with_scale else centre - moved
+            return linear, -moved if with_scale else centre - moved  # C18
 
         unframed = _pass(shapes, target, chosen, poses, turned)
-        mean = _in_frame(unframed, reference, chosen, size, with_scale)
+        mean = _in_frame(unframed, reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -263,7 +287,7 @@ def scale_to_tangent_streamed(shapes: Streamed, mean: FloatArray, poses: Poses) 
             linear, offset = poses.linear[part], poses.offset[part]
             along = (np.einsum("nba,nab->n", linear, products) + offset @ total) / square
             furthest = max(furthest, float(np.abs(along - 1.0).max()))
-            return linear / along[:, None, None], offset / along[:, None]
+            return linear / along[:, None, None], offset / along[:, None]  # C20
 
         mean = _pass(shapes, target, slice(None), poses, scaled)
         if furthest < _IN_TANGENT:

@@ -23,22 +23,22 @@ def faces_of(mesh: Mesh) -> IntArray:
     return mesh.faces
 
 
-def without_vertices(vertices: FloatArray, faces: IntArray, kept: BoolArray) -> tuple[FloatArray, IntArray]:
-    """Return the vertices `kept` (V,) of (V, 3) and, told in their numbers, the triangles (F, 3) that have no other."""
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    return vertices[kept], number[faces[kept[faces].all(axis=1)]]
+def without_vertices(vertices: FloatArray, faces: IntArray, keep: BoolArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices `keep` (V,) of (V, 3) and, in their numbers, the triangles of (F, 3) between them."""
+    number = np.cumsum(keep, dtype=np.int32) - 1
+    return vertices[keep], number[faces[keep[faces].all(axis=1)]]
 
 
-def part_of(mesh: Mesh, kept: BoolArray) -> Mesh:
-    """Return the vertices `kept` (V,) of a mesh or cloud with the triangles that have no other, and all else it has."""
+def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
+    """Return a mesh or cloud with its vertices `keep` (V,) and the triangles between them; all else is unchanged."""
     faces = mesh.faces
     if faces is None:
-        vertices = mesh.vertices[kept]
+        vertices = mesh.vertices[keep]
     else:
-        vertices, faces = without_vertices(mesh.vertices, faces, kept)
-    colours = None if mesh.colours is None else mesh.colours[kept]
-    observed = None if mesh.observed is None else mesh.observed[kept]
-    return Mesh(vertices, faces, mesh.landmarks, mesh.name, colours, mesh.notes, observed)
+        vertices, faces = without_vertices(mesh.vertices, faces, keep)
+    colours = None if mesh.colours is None else mesh.colours[keep]
+    observed = None if mesh.observed is None else mesh.observed[keep]
+    return replace(mesh, vertices=vertices, faces=faces, colours=colours, observed=observed)
 
 
 def without_estimates(mesh: Mesh) -> Mesh:

@@ -26,17 +26,17 @@ def first_of_equal(rows: npt.NDArray[Any]) -> IntArray:
         key = np.uint64(rows[i, 0]) * np.uint64(0x9E3779B97F4A7C15)
         key = (key ^ (key >> np.uint64(29)) ^ np.uint64(rows[i, 1])) * np.uint64(0xBF58476D1CE4E5B9)
         key = (key ^ (key >> np.uint64(32)) ^ np.uint64(rows[i, 2])) * np.uint64(0x94D049BB133111EB)
-        at = np.int64((key ^ (key >> np.uint64(31))) & np.uint64(size - 1))
+        slot = np.int64((key ^ (key >> np.uint64(31))) & np.uint64(size - 1))
         while True:
-            j = table[at]
+            j = table[slot]
             if j < 0:
-                table[at] = i
+                table[slot] = i
                 first[i] = i
                 break
             if rows[i, 0] == rows[j, 0] and rows[i, 1] == rows[j, 1] and rows[i, 2] == rows[j, 2]:
                 first[i] = j
                 break
-            at = (at + 1) & (size - 1)
+            slot = (slot + 1) & (size - 1)
     return first
 
 
@@ -87,15 +87,15 @@ def single_edges(faces: IntArray, vertices: int) -> IntArray:
     """Return the edges (E, 2), lower vertex first and sorted, that belong to exactly one of `faces` (F, 3)."""
     start, upper, _ = sorted_edges(faces, vertices)
     count = 0
-    found = np.empty((len(upper), 2), dtype=np.int32)
+    edges = np.empty((len(upper), 2), dtype=np.int32)
     for v in range(vertices):
         for i in range(start[v], start[v + 1]):
             before = i > start[v] and upper[i - 1] == upper[i]
             after = i + 1 < start[v + 1] and upper[i + 1] == upper[i]
             if not (before or after):
-                found[count, 0], found[count, 1] = v, upper[i]
+                edges[count, 0], edges[count, 1] = v, upper[i]
                 count += 1
-    return found[:count].copy()
+    return edges[:count].copy()
 
 
 @compiled

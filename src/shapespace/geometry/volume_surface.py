@@ -119,7 +119,7 @@ def surface_of_volume(
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
     memory = _Memory(volume.labels.nbytes, max_memory_bytes, volume.name)
     mask, corner = _cut_out(volume.labels, chosen, np.ceil(3 * sigma).astype(int) + 3, memory)
-    part = _Part.of(mask, keep_pieces=keep_pieces)
+    part = _Solid.of(mask, keep_pieces=keep_pieces)
     memory.check(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
         raise InputError(
@@ -205,46 +205,46 @@ def labels_in(labels: _Labels) -> tuple[int, ...]:
     Raises:
         InputError: there are more than a segmentation has.
     """
-    found: set[int] = set()
+    numbers: set[int] = set()
     for block in _blocks(labels.shape):
         values = labels[block]
         if values.any():
             low, high = int(values.min()), int(values.max())
             if high - low < 2:
-                found.update((low, high))
+                numbers.update((low, high))
             elif high - low < _MOST_LABELS:
                 # Subtraction wraps round in uint64, so that it is right for labels below 0 too.
                 above = (values.astype(np.uint64) - np.uint64(low % 2**64)).astype(np.intp)
-                found.update(low + int(at) for at in np.flatnonzero(np.bincount(above.ravel())))
+                numbers.update(low + int(value) for value in np.flatnonzero(np.bincount(above.ravel())))
             else:
-                found.update(np.unique(values).tolist())
-        if len(found) > _MOST_LABELS:
+                numbers.update(np.unique(values).tolist())
+        if len(numbers) > _MOST_LABELS:
             raise InputError(
                 f"It has more than {_MOST_LABELS:,} labels, so it is an image, not a segmentation; give the label map."
             )
-    return tuple(sorted(found - {0}))
+    return tuple(sorted(numbers - {0}))
 
 
 def _chosen(volume: LabelVolume, labels: int | Sequence[int] | Literal["all"] | None) -> tuple[int, ...]:
     try:
-        found = labels_in(volume.labels)
+        present = labels_in(volume.labels)
     except InputError as error:
         raise InputError(f"{volume.name}: {error}") from error
-    if not found:
+    if not present:
         raise InputError(f"{volume.name}: all its voxels are 0; give a volume with a label.")
-    listed = ", ".join(map(str, found[:_LISTED])) + (f", ... ({len(found)})" if len(found) > _LISTED else "")
+    listed = ", ".join(map(str, present[:_LISTED])) + (f", ... ({len(present)})" if len(present) > _LISTED else "")
     if labels is None:
-        if len(found) > 1:
+        if len(present) > 1:
             raise InputError(
                 f"{volume.name}: it has the labels {listed}; say which (--label), or take all as one (--label all)."
             )
-        return found
+        return present
     if isinstance(labels, str):
         if labels != "all":
             raise InputError(f"Labels must be whole numbers or 'all', not {labels!r}.")
-        return found
+        return present
     asked = {int(label) for label in np.atleast_1d(np.asarray(labels, dtype=np.int64))}
-    absent = tuple(sorted(asked - set(found)))
+    absent = tuple(sorted(asked - set(present)))
     if absent or not asked:
         raise InputError(f"{volume.name}: there is no {_named(absent) if absent else 'label'} in it; it has {listed}.")
     return tuple(sorted(asked))
@@ -270,11 +270,13 @@ def _cut_out(
     mask = np.zeros(high - low + 2 * margin, dtype=np.bool_)
     corner = low - margin
     for block in _blocks(labels.shape):
-        begin = [max(one.start, int(at)) for one, at in zip(block, low, strict=True)]
-        end = [min(one.stop, int(at)) for one, at in zip(block, high, strict=True)]
+        begin = [max(one.start, int(offset)) for one, offset in zip(block, low, strict=True)]
+        end = [min(one.stop, int(offset)) for one, offset in zip(block, high, strict=True)]
         if all(a < b for a, b in zip(begin, end, strict=True)):
             there = tuple(slice(a, b) for a, b in zip(begin, end, strict=True))
-            here = tuple(slice(a - int(at), b - int(at)) for a, b, at in zip(begin, end, corner, strict=True))
+            here = tuple(
+                slice(a - int(offset), b - int(offset)) for a, b, offset in zip(begin, end, corner, strict=True)
+            )
             mask[here] = _is_one_of(labels[there], wanted)
     return mask, corner.astype(np.float64)
 
@@ -295,13 +297,15 @@ def count_crossings(mask: BoolArray) -> int:
 
 def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
     """Return how many voxels of `mask`, which begins at `corner` of a volume of that `shape`, are its outermost."""
-    inner = tuple(slice(max(1 - int(at), 0), count - 1 - int(at)) for at, count in zip(corner, shape, strict=True))
+    inner = tuple(
+        slice(max(1 - int(offset), 0), count - 1 - int(offset)) for offset, count in zip(corner, shape, strict=True)
+    )
     return int(mask.sum() - mask[inner].sum())
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """Voxels to make a surface of: none touch along an edge alone, so that it is a sheet whatever smoothing does."""
+class _Solid:
+    """Voxels inside a surface: none touch along an edge alone, so that the surface is a sheet however smoothed."""
 
     mask: BoolArray
     voxels: int
@@ -309,25 +313,37 @@ class _Part:
     left_out: int
     filled: int
     added: int
-    kept: tuple[int, int]
+    topology: tuple[int, int]
     """Pieces and cavities that the surface has."""
 
     @staticmethod
-    def of(mask: BoolArray, *, keep_pieces: bool) -> _Part:
+    def of(mask: BoolArray, *, keep_pieces: bool) -> _Solid:
         whole = _without_edge_contacts(mask)
         label, pieces = _components(whole)
         sizes = np.bincount(label[mask], minlength=pieces + 1)
         if keep_pieces:
-            kept = (pieces, _components(~whole)[1] - 1)
-            return _Part(whole, int(sizes.sum()), pieces, 0, 0, int(whole.sum() - mask.sum()), kept)
+            return _Solid(
+                mask=whole,
+                voxels=int(sizes.sum()),
+                pieces=pieces,
+                left_out=0,
+                filled=0,
+                added=int(whole.sum() - mask.sum()),
+                topology=(pieces, _components(~whole)[1] - 1),
+            )
         largest = 1 + int(np.argmax(sizes[1:]))
         piece = label == largest
         outside, _ = _components(~piece)
         closed = outside != outside[0, 0, 0]
-        filled = int((closed & ~piece).sum())
-        added = int((piece & ~mask).sum())
-        left_out = int(sizes.sum() - sizes[largest] - (closed & mask & ~piece).sum())
-        return _Part(closed, int(sizes[largest]), pieces, left_out, filled, added, (1, 0))
+        return _Solid(
+            mask=closed,
+            voxels=int(sizes[largest]),
+            pieces=pieces,
+            left_out=int(sizes.sum() - sizes[largest] - (closed & mask & ~piece).sum()),
+            filled=int((closed & ~piece).sum()),
+            added=int((piece & ~mask).sum()),
+            topology=(1, 0),
+        )
 
 
 def _without_edge_contacts(mask: BoolArray) -> BoolArray:
@@ -352,7 +368,7 @@ def _components(mask: BoolArray) -> tuple[IntArray, int]:
     return label, int(count)
 
 
-def _smoothed(part: _Part, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Field, float]:
+def _smoothed(part: _Solid, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Field, float]:
     """Return a field that is positive inside, and the share of the smoothing that it has.
 
     Less is smoothed where pieces would part or join otherwise, and in the end no voxel changes side.
@@ -363,11 +379,11 @@ def _smoothed(part: _Part, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Fi
         held = np.zeros_like(part.mask)
         for _ in range(_ROUNDS):
             side = _without_edge_contacts(field > 0)
-            if part.kept == (1, 0):
-                side = _Part.of(side, keep_pieces=False).mask
+            if part.topology == (1, 0):
+                side = _Solid.of(side, keep_pieces=False).mask
             lost = _vanished(part.mask, side)
             if not lost.any():
-                if (_components(side)[1], _components(~side)[1] - 1) == part.kept:
+                if (_components(side)[1], _components(~side)[1] - 1) == part.topology:
                     return _clear_of_middles(field, side), share
                 break
             held = _grown(held) | lost
@@ -375,7 +391,7 @@ def _smoothed(part: _Part, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Fi
     return _clear_of_middles(_levelled(distance, _FINER[-1] * sigma, part.mask), part.mask), 0.0
 
 
-def _freed(distance: _Field, sigma: FloatArray, part: _Part) -> _Field:
+def _freed(distance: _Field, sigma: FloatArray, part: _Solid) -> _Field:
     """Return `distance` smoothed so that voxels change side by half a voxel at most, less where something would vanish.
 
     A voxel of something thin that would vanish all the same keeps its side.
@@ -419,16 +435,16 @@ def _squared_distance(side: BoolArray, step: FloatArray, most: float) -> _Field:
 
     One axis after the other, as squares add up; SciPy's transform, without a bound, takes ten times as long.
     """
-    found = np.where(side, np.float32(most**2), np.float32(0))
+    squared = np.where(side, np.float32(most**2), np.float32(0))
     for axis, length in enumerate(step):
-        before = np.moveaxis(found, axis, 0)
-        found = found.copy()
-        after = np.moveaxis(found, axis, 0)
+        before = np.moveaxis(squared, axis, 0)
+        squared = squared.copy()
+        after = np.moveaxis(squared, axis, 0)
         for k in range(1, int(most / length) + 1):
             cost = np.float32((k * length) ** 2)
             np.minimum(after[:-k], before[k:] + cost, out=after[:-k])
             np.minimum(after[k:], before[:-k] + cost, out=after[k:])
-    return found
+    return squared
 
 
 def _level(field: _Field, voxels: int) -> float:
@@ -491,7 +507,7 @@ def _volume(points: FloatArray, faces: IntArray) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
 
 
-def _notes(part: _Part, voxel_mm: FloatArray, at_border: int, share: float) -> list[str]:
+def _notes(part: _Solid, voxel_mm: FloatArray, at_border: int, share: float) -> list[str]:
     notes: list[str] = []
     if at_border:
         notes.append("It touches the border of the volume, where the surface is closed; what lies beyond is missing.")
@@ -501,7 +517,7 @@ def _notes(part: _Part, voxel_mm: FloatArray, at_border: int, share: float) -> l
             f"{others} smaller {'piece' if others == 1 else 'pieces'} with {part.left_out} of "
             f"{part.voxels + part.left_out} voxels {'is' if others == 1 else 'are'} left out."
         )
-    elif others and part.kept[0] > 1:
+    elif others and part.topology[0] > 1:
         notes.append(f"It is in {part.pieces} pieces.")
     if part.filled:
         notes.append(f"Cavities of {part.filled} {'voxel' if part.filled == 1 else 'voxels'} inside it are filled.")

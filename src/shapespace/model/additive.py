@@ -288,12 +288,12 @@ class AdditiveModel:
         """
         if is_foreign(Path(path)):
             foreign = load_foreign(Path(path))
-            found = model_of_foreign(foreign, Path(path))
-            if isinstance(found, ShapeModel):
+            model = model_of_foreign(foreign, Path(path))
+            if isinstance(model, ShapeModel):
                 raise ModelFileError(
                     f"{path} ({foreign.format}) does not part identity and expression; give one that does."
                 )
-            return found
+            return model
         return _split(ShapeModel.load(path), Path(path))
 
     def as_linear(self) -> LinearModel:
@@ -400,13 +400,13 @@ def _identity(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the mean (3V,), what one standard deviation of each mode does (3V, Ka), variance kept and left, mm^2."""
     flat = neutrals.reshape(len(neutrals), -1)
-    found, centred = principal_components(flat, modes), flat - flat.mean(axis=0)
+    components, centred = principal_components(flat, modes), flat - flat.mean(axis=0)
     gram = centred @ centred.T
-    held = held_out_shapes(gram, kin, len(found.variance), centred=True)
+    held = held_out_shapes(gram, kin, len(components.variance), centred=True)
     variance = _of_new_people(gram / (len(flat) - 1), len(flat), held)
-    L, of_local = local_modes(found.mean.reshape(-1, 3), found.basis, variance, held.left_mm2, most_local)
-    directions = np.concatenate([found.basis, L], axis=1) * np.sqrt(np.concatenate([variance, of_local]))
-    return found.mean, directions, np.array([variance.sum(), held.left_mm2])
+    L, of_local = local_modes(components.mean.reshape(-1, 3), components.basis, variance, held.left_mm2, most_local)
+    directions = np.concatenate([components.basis, L], axis=1) * np.sqrt(np.concatenate([variance, of_local]))
+    return components.mean, directions, np.array([variance.sum(), held.left_mm2])
 
 
 def _expression(moved: FloatArray, kin: Sequence[str], modes: int | float | None) -> tuple[FloatArray, FloatArray]:
@@ -431,16 +431,16 @@ def _modes_through_zero(
     total = float(values.sum())
     if total <= data.shape[1] * _NO_MOTION_MM**2:
         raise InputError("No expression differs from its neutral face, so there is nothing to model.")
-    kept = int((values > _NO_VARIANCE * values[0]).sum())
+    count = int((values > _NO_VARIANCE * values[0]).sum())
     if isinstance(wanted, float):
-        kept = min(kept, modes_for_variance(values, wanted))
+        count = min(count, modes_for_variance(values, wanted))
     elif wanted is not None:
-        if not 1 <= wanted <= kept:
-            raise InputError(f"These expressions give 1 to {kept} modes, so {wanted} cannot be had.")
-        kept = wanted
-    values, vectors = values[:kept], vectors[:, :kept]
+        if not 1 <= wanted <= count:
+            raise InputError(f"These expressions give 1 to {count} modes, so {wanted} cannot be had.")
+        count = wanted
+    values, vectors = values[:count], vectors[:, :count]
     modes = data.T @ (vectors / np.sqrt(values * len(data)))
-    modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(kept)])
+    modes *= np.sign(modes[np.abs(modes).argmax(axis=0), np.arange(count)])
     return modes, values
 
 

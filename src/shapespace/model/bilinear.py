@@ -56,10 +56,11 @@ class BilinearModel:
         mean = table.mean(axis=(0, 1))
         centred = table - mean
         people = np.linalg.svd(centred.reshape(S, -1), full_matrices=False)[0][:, :identity_rank]
-        shown = np.linalg.svd(centred.transpose(1, 0, 2).reshape(X, -1), full_matrices=False)[0][:, :expression_rank]
-        core = np.einsum("sxk,si,xj->ijk", centred, people, shown, optimize=True)
-        left = centred - np.einsum("si,xj,ijk->sxk", people, shown, core, optimize=True)
-        return cls(mean, core, people, shown, left.var(axis=(0, 1)))
+        unfolded = centred.transpose(1, 0, 2).reshape(X, -1)
+        expressions = np.linalg.svd(unfolded, full_matrices=False)[0][:, :expression_rank]
+        core = np.einsum("sxk,si,xj->ijk", centred, people, expressions, optimize=True)
+        left = centred - np.einsum("si,xj,ijk->sxk", people, expressions, core, optimize=True)
+        return cls(mean, core, people, expressions, left.var(axis=(0, 1)))
 
     def decode(self, identity: FloatArray, expression: FloatArray) -> FloatArray:
         """Return b (K,), mm, of an identity (I,) with an expression (J,)."""
@@ -79,12 +80,12 @@ class BilinearModel:
         K = len(self.mean)
         if b.ndim != 2 or b.shape[1] != K or b_stddev.shape != b.shape or not np.isfinite(b).all():
             raise InputError(f"Give (n, {K}) finite coefficients and standard deviations, not {b.shape}.")
-        told = 1.0 / (b_stddev**2 + self.left + _LEAST_VARIANCE_MM2)
+        precision = 1.0 / (b_stddev**2 + self.left + _LEAST_VARIANCE_MM2)
         priors = [
             (part.mean(axis=0), 1.0 / part.var(axis=0).clip(1e-12)) for part in (self.identities, self.expressions)
         ]
         identities, expressions = np.empty((len(b), self.core.shape[0])), np.empty((len(b), self.core.shape[1]))
-        for row, (value, weight) in enumerate(zip(b - self.mean, told, strict=True)):
+        for row, (value, weight) in enumerate(zip(b - self.mean, precision, strict=True)):
             identity, expression = priors[0][0].copy(), priors[1][0].copy()
             for _ in range(iterations):
                 before = expression

@@ -76,9 +76,9 @@ def choose_modes(data: FloatArray, *, folds: int = 5, seed: int = 0, counted: Bo
     gram = _gram(centred.reshape(n, d))
     errors = np.zeros((n, len(candidates)))
     for held_out in parts:
-        shown = np.zeros(d // 3, dtype=np.bool_)
-        shown[rng.permutation(d // 3)[: d // 6]] = True
-        errors[held_out] = _errors_of_hidden(centred, gram, held_out, shown, candidates, counted)
+        observed = np.zeros(d // 3, dtype=np.bool_)
+        observed[rng.permutation(d // 3)[: d // 6]] = True
+        errors[held_out] = _errors_of_hidden(centred, gram, held_out, observed, candidates, counted)
     mean = errors.mean(axis=0)
     standard_error = errors.std(axis=0, ddof=1) / np.sqrt(n)
     best = int(mean.argmin())
@@ -105,7 +105,7 @@ def _errors_of_hidden(
     centred: FloatArray,
     gram: FloatArray,
     held_out: IntArray,
-    shown: BoolArray,
+    observed: BoolArray,
     candidates: IntArray,
     counted: BoolArray | None,
 ) -> FloatArray:
@@ -117,7 +117,7 @@ def _errors_of_hidden(
         centred: (N, 3, V) all shapes less their mean.
         gram: (N, N) their products over all coordinates.
         held_out: (H,) indices of the shapes that the model does not know.
-        shown: (V,) True where a vertex is shown.
+        observed: (V,) True for the vertices that coefficients are computed from.
         candidates: (C,) numbers of modes.
         counted: (N, V) False where a vertex is no evidence; None for all.
     """
@@ -131,25 +131,25 @@ def _errors_of_hidden(
     variance, sums = _modes_as_sums(within, float(gram.trace()))
     total = float(within.trace()) / (len(known) - 1)
 
-    in_shown = from_mean @ _gram(_at(centred, shown)) @ from_mean.T
+    in_shown = from_mean @ _gram(_at(centred, observed)) @ from_mean.T
     overlap = sums.T @ in_shown[np.ix_(known, known)] @ sums
     evidence = in_shown[np.ix_(held_out, known)] @ sums
-    hidden = _at(centred, ~shown)
+    hidden = _at(centred, ~observed)
     mean = hidden[known].mean(axis=0)
     # The sums of each column are zero in all but rounding, so the mean need not be taken off first.
     modes = sums.T @ hidden[known]
     residual = hidden[held_out] - mean
     weight = None
     if counted is not None:
-        weight = counted[held_out][:, ~shown].astype(np.float64)
+        weight = counted[held_out][:, ~observed].astype(np.float64)
         weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
     errors = np.empty((len(held_out), len(candidates)))
     for column, k in enumerate(candidates):
-        kept = min(int(k), len(variance))
-        noise = max((total - variance[:kept].sum()) / (d - kept), _LEAST_NOISE * variance[0] / d)
-        system = overlap[:kept, :kept] + noise * np.diag(1.0 / variance[:kept])
-        b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :kept].T), dtype=np.float64)
-        wrong = (residual - b.T @ modes[:kept]).reshape(len(held_out), 3, -1)
+        count = min(int(k), len(variance))
+        noise = max((total - variance[:count].sum()) / (d - count), _LEAST_NOISE * variance[0] / d)
+        system = overlap[:count, :count] + noise * np.diag(1.0 / variance[:count])
+        b: FloatArray = np.asarray(np.linalg.solve(system, evidence[:, :count].T), dtype=np.float64)
+        wrong = (residual - b.T @ modes[:count]).reshape(len(held_out), 3, -1)
         distance = np.sqrt(wrong[:, 0] ** 2 + wrong[:, 1] ** 2 + wrong[:, 2] ** 2)
         errors[:, column] = distance.mean(axis=1) if weight is None else (distance * weight).sum(axis=1)
     return errors

@@ -63,7 +63,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
     """
     from shapespace.formats.registry import read_linear
 
-    found, linear = read_linear(path)
+    model_format, linear = read_linear(path)
     if expressions is not None:
         linear = _with_expressions(linear, path, expressions)
     notes = list(linear.notes)
@@ -86,16 +86,11 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         notes.append("Identity and expression share modes, so they cannot be separated and are treated as one.")
     if linear.n_training is None and not linear.held_out:
         notes.append(f"It does not say of how many shapes it was made; {len(stddev) + 1} are taken.")
-    kept = float((stddev**2).sum())
-    told = [block.total_variance for block in (linear.shape, linear.expression) if block is not None]
-    total = kept
-    if all(one is not None for one in told):
-        total = max(kept, sum(one for one in told if one is not None) * mm**2)
     fields: ModelFields = {
         "mean": linear.mean.ravel() * mm,
         "basis": basis,
         "stddev": stddev,
-        "total_variance": total,
+        "total_variance": _total_variance(linear, stddev, mm),
         "n_training": linear.n_training or len(stddev) + 1,
         "faces": linear.faces,
         # Others align rigidly and leave size in the modes.
@@ -109,7 +104,19 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "residuals": None,
         "regions": {},
     }
-    return Foreign(fields, rotation, n_identity, found.title, tuple(notes))
+    return Foreign(fields, rotation, n_identity, model_format.title, tuple(notes))
+
+
+def _total_variance(linear: LinearModel, stddev: FloatArray, mm: float) -> float:
+    """Return the total variance that the file states, mm^2, if it does and it is above that of the modes."""
+    of_modes = float((stddev**2).sum())
+    total = 0.0
+    for block in (linear.shape, linear.expression):
+        if block is not None:
+            if block.total_variance is None:
+                return of_modes
+            total += block.total_variance
+    return max(of_modes, total * mm**2)
 
 
 def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> LinearModel:
@@ -162,15 +169,15 @@ def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> Lin
     return whole.noting(f"A weight of one of the {block.moved.shape[1]} blendshapes is one standard deviation.")
 
 
-def _changes(moved: FloatArray, kept: int, *, parted: bool) -> list[str]:
+def _changes(moved: FloatArray, count: int, *, parted: bool) -> list[str]:
     length = np.linalg.norm(moved, axis=0)
-    there = length > 0
-    unit = moved[:, there] / length[there]
+    varies = length > 0
+    unit = moved[:, varies] / length[varies]
     skew = float(np.abs(unit.T @ unit - np.eye(unit.shape[1])).max(initial=0.0))
-    said: list[str] = []
+    notes: list[str] = []
     if skew > ORTHOGONAL:
-        what = "Modes of identity and expression were" if parted else "The basis was"
-        said.append(f"{what} not orthonormal (by {skew:.2g}) and made so, which keeps the covariance.")
-    if kept < moved.shape[1]:
-        said.append(f"{moved.shape[1] - kept} of {moved.shape[1]} modes do not vary and are left out.")
-    return said
+        subject = "Modes of identity and expression were" if parted else "The basis was"
+        notes.append(f"{subject} not orthonormal (by {skew:.2g}) and made so, which keeps the covariance.")
+    if count < moved.shape[1]:
+        notes.append(f"{moved.shape[1] - count} of {moved.shape[1]} modes do not vary and are left out.")
+    return notes

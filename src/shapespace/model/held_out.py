@@ -44,9 +44,9 @@ def held_out_shapes(gram: FloatArray, groups: Sequence[str], modes: int, *, cent
         count = min(modes, len(own))
         values, vectors = eigh(inner, subset_by_index=(len(own) - count, len(own) - 1), check_finite=False)
         values, vectors = values[::-1], vectors[:, ::-1]
-        kept = int((values > _NO_VARIANCE * max(values[0], 0.0)).sum())
-        along = (cross @ (vectors[:, :kept] / np.sqrt(values[:kept]))) ** 2
-        squares[:kept] += along.sum(axis=0)
-        seen[:kept] += len(out)
+        retained = int((values > _NO_VARIANCE * max(values[0], 0.0)).sum())
+        along = (cross @ (vectors[:, :retained] / np.sqrt(values[:retained]))) ** 2
+        squares[:retained] += along.sum(axis=0)
+        seen[:retained] += len(out)
         left += float(np.maximum(size - along.sum(axis=1), 0.0).sum())
     return HeldOut(squares, seen / len(gram), len(gram), len(names), left / len(gram))

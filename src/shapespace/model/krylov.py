@@ -118,8 +118,8 @@ def leading(
     while True:
         basis.append(Q)
         step = len(basis)
-        told = kept.recall(step) if kept is not None else None
-        if told is None:
+        recalled = kept.recall(step) if kept is not None else None
+        if recalled is None:
             W = apply(Q)
             products = _taken_off(W, basis)
             products += _taken_off(W, basis)
@@ -127,7 +127,7 @@ def leading(
             if kept is not None:
                 kept.keep(step, Q, products, beyond)
         else:
-            Q, products, beyond = told
+            Q, products, beyond = recalled
         T = _bordered(T, products)
         full, exhausted = len(T) + Q.shape[1] > most_columns, not Q.shape[1]
         wanted = _wanted(T, modes, total)
@@ -138,9 +138,9 @@ def leading(
             if on_pass is not None:
                 on_pass(step, float(residuals.max() / values[0]))
             if exhausted or stop.reached(values, residuals) or (full and residuals.max() <= stop.enough * values[0]):
-                found = _refined(apply, basis, S[:, :count])
-                if exhausted or found.residuals.max() <= stop.enough * found.values[0]:
-                    return found
+                ritz = _refined(apply, basis, S[:, :count])
+                if exhausted or ritz.residuals.max() <= stop.enough * ritz.values[0]:
+                    return ritz
         if full:
             return None
 
@@ -194,10 +194,10 @@ def _bordered(T: FloatArray, products: FloatArray) -> FloatArray:
 
 def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray], S: FloatArray) -> Leading:
     """Return the eigenvectors within the span of the sums `S` (m, K) of the basis, and what a product says of them."""
-    V, at = np.zeros((len(basis[0]), S.shape[1])), 0
+    V, column = np.zeros((len(basis[0]), S.shape[1])), 0
     for Q in basis:
-        V += Q @ S[at : at + Q.shape[1]]
-        at += Q.shape[1]
+        V += Q @ S[column : column + Q.shape[1]]
+        column += Q.shape[1]
     CV = apply(V)
     small = V.T @ CV
     values, R = np.linalg.eigh((small + small.T) / 2)

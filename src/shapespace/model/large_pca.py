@@ -70,16 +70,18 @@ def large_components(
         residuals = np.linalg.norm(CV - rows.T * variance, axis=0)
     else:
         # All modes of so many shapes were refused.
-        found = _leading(covariance, d, cast(int | float, modes), total, Stop(), seed, kept, on_pass)
-        if found is None:
+        leading_modes = _leading(
+            covariance, d, cast(int | float, modes), total, Stop(), seed, kept=kept, on_pass=on_pass
+        )
+        if leading_modes is None:
             raise InputError(
                 f"The modes asked for cannot be separated from the next ones in {_columns(d)} directions, the number "
                 "that memory is reserved for; ask for fewer modes."
             )
-        variance = varying(found.values)
-        rows = np.ascontiguousarray(found.vectors.T[: len(variance)])
+        variance = varying(leading_modes.values)
+        rows = np.ascontiguousarray(leading_modes.vectors.T[: len(variance)])
         fix_signs(rows)
-        residuals = found.residuals[: len(variance)]
+        residuals = leading_modes.residuals[: len(variance)]
     return PrincipalComponents(mean, rows.T, variance, total, n, residuals)
 
 
@@ -185,10 +187,10 @@ def _by_gram(
 
 def _gram(shapes: Spill, mean: FloatArray) -> FloatArray:
     """Return the lower triangle of the products (N, N) of the centred rows."""
-    gram, at = np.zeros((shapes.rows, shapes.rows), order="F"), 0
+    gram, start = np.zeros((shapes.rows, shapes.rows), order="F"), 0
     for block in shapes.column_blocks():
-        block -= mean[at : at + block.shape[1]]
-        at += block.shape[1]
+        block -= mean[start : start + block.shape[1]]
+        start += block.shape[1]
         gram = syrk(block, onto=gram)
     return gram
 
@@ -202,9 +204,9 @@ def _eigenvectors(
     n = len(gram)
     dsymm = cast(Any, blas).dsymm
     if modes is not None and n > _WHOLE and (isinstance(modes, float) or modes <= n // _FEW):
-        found = _leading(lambda Y: dsymm(1.0, gram, Y, lower=1), n, modes, trace, _TO_ROUNDING, seed)
-        if found is not None:
-            return found.values, found.vectors
+        leading_modes = _leading(lambda Y: dsymm(1.0, gram, Y, lower=1), n, modes, trace, _TO_ROUNDING, seed)
+        if leading_modes is not None:
+            return leading_modes.values, leading_modes.vectors
     wanted = modes if isinstance(modes, int) else n - 1
     values, vectors = eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True)
     return values[::-1], vectors[:, ::-1]

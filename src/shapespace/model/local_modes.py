@@ -1,7 +1,7 @@
 """Smooth local versions of a model's modes: a prior for what a new shape has outside the span of a few.
 
-What modes leave varies as they do, only locally, so their covariance damped with distance foretells it (Wilms, Handels
-and Ehrhardt, Medical Image Analysis 38, 2017). How much there is of it is told by shapes left out.
+What modes leave varies as they do, only locally, so their covariance damped with distance predicts it (Wilms, Handels
+and Ehrhardt, Medical Image Analysis 38, 2017). Its total variance is measured on shapes left out.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from shapespace.types import FloatArray, IntArray
 
 _CENTRES = 40
 _FIELD_SHARE = 0.999
-_MOST_PRODUCTS = 600
+MOST_PRODUCTS = 600
 _BLOCK = 250
+"""Vertices: the products of all at once are many times as large as the model."""
 _RANGE_SHARE = 0.6
 _FAINT = 1e-7
 """Of the variance of the modes; local modes with less are not worth their time."""
@@ -37,15 +38,14 @@ def local_modes(
     """
     fields = smooth_fields(mean, _RANGE_SHARE * rms_size(mean))
     stddev = np.sqrt(variance)
-    mode, at = strongest_products(stddev, np.linalg.norm(fields, axis=0), _MOST_PRODUCTS)
+    mode, damping = strongest_products(stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS)
     vertex_modes = modes.reshape(*mean.shape, -1)
 
     def products(rows: slice) -> FloatArray:
-        field = fields[rows][:, at] * stddev[mode]
+        field = fields[rows][:, damping] * stddev[mode]
         return (vertex_modes[rows][:, :, mode] * field[:, None]).reshape(-1, len(mode))
 
-    # All at once they are many times as large as the model; block by block they are nothing.
-    blocks = [slice(start, start + _BLOCK) for start in range(0, len(mean), _BLOCK)]
+    blocks = vertex_blocks(len(mean))
     inside, gram = np.zeros((len(variance), len(mode))), np.zeros((len(mode), len(mode)))
     for rows in blocks:
         part = products(rows)
@@ -55,13 +55,23 @@ def local_modes(
     whole, count = float(np.trace(gram)), min(most, len(gram), mean.size // _ROOM)
     if count < 1 or whole <= 0 or left_mm2 <= 0:
         return np.zeros((mean.size, 0)), np.zeros(0)
-    value, vector = eigh(gram, subset_by_index=(len(gram) - count, len(gram) - 1))
-    value, vector = value[::-1], vector[:, ::-1]
-    kept = value * left_mm2 / whole > _FAINT * variance.sum()
-    mix = vector[:, kept] / np.sqrt(value[kept])
+    value, vector = largest_eigenpairs(gram, count)
+    significant = value * left_mm2 / whole > _FAINT * variance.sum()
+    mix = vector[:, significant] / np.sqrt(value[significant])
     local = np.concatenate([products(rows) @ mix for rows in blocks]) - modes @ (inside @ mix)
     # Faint ones lose digits where most of them lies inside.
-    return np.linalg.qr(local)[0], value[kept] * left_mm2 / whole
+    return np.linalg.qr(local)[0], value[significant] * left_mm2 / whole
+
+
+def vertex_blocks(count: int) -> list[slice]:
+    """Return slices that cover `count` vertices, block by block."""
+    return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
+
+
+def largest_eigenpairs(gram: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the `count` largest eigenvalues of a symmetric matrix, falling, and their vectors as columns."""
+    value, vector = eigh(gram, subset_by_index=(max(0, len(gram) - count), len(gram) - 1))
+    return value[::-1], vector[:, ::-1]
 
 
 def strongest_products(stddev: FloatArray, size: FloatArray, count: int) -> tuple[IntArray, IntArray]:

@@ -1,9 +1,10 @@
-"""Shapes of which vertices are missing: a vertex that no scan showed is marked, not-a-number, and never invented.
+"""Models of shapes with missing vertices, which are not-a-number.
 
 Poses need whole shapes: what is aligned by the parts that happen to be there leans towards them. So shapes are
 completed by probabilistic PCA, aligned as whole shapes are, and completed anew, the last time with all modes that so
-many shapes can tell. The modes are then those of the completed shapes, with what stays unknown of the missing vertices
-added to their covariance, so that holes neither narrow nor bend them.
+many shapes determine. The modes are then those of the completed shapes, with the conditional covariance of the missing
+vertices added to their covariance, so that holes neither narrow nor bend them. Equations Cn are those of
+docs/missing.md.
 """
 
 from __future__ import annotations
@@ -25,70 +26,69 @@ from shapespace.model.ppca import Ppca, ppca
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 MIN_SEEN = 0.5
-"""Share of the shapes that must show a vertex for it to be in a model, where nobody says how many."""
+"""Share of the shapes that must observe a vertex for it to be in a model, by default."""
 _FEWEST = 2
 _POSES_BY = (8, 60)
-"""Modes of the completions that poses are taken from, one after the other: with few only, what they cannot tell turns
-into poses, and alignment then takes real modes out."""
+"""Modes of the completions that poses are taken from, one after the other: with few only, variation that they lack
+becomes pose, and alignment then removes real modes."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
-"""Modes that probabilistic PCA begins with; it takes the width of those that nothing speaks for."""
+"""Modes that probabilistic PCA begins with; those without evidence lose their width."""
 _MEAN_ROUNDS, _STILL = 50, 1e-8
 
 
-def shown_vertices(meshes: Sequence[Mesh]) -> BoolArray:
-    """Return (N, V) which vertices of corresponding meshes are there: no coordinate of theirs is not-a-number."""
-    return _there(np.stack([mesh.vertices for mesh in meshes]))
+def observed_vertices(meshes: Sequence[Mesh]) -> BoolArray:
+    """Return (N, V) which vertices of corresponding meshes are observed: no coordinate is not-a-number."""
+    return _observed(np.stack([mesh.vertices for mesh in meshes]))
 
 
-def _there(shapes: FloatArray) -> BoolArray:
+def _observed(shapes: FloatArray) -> BoolArray:
     return ~np.logical_or.reduce(np.isnan(shapes), axis=2)
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
-    """What is left of corresponding meshes when vertices that few of them show are taken out.
+class ObservedMeshes:
+    """Corresponding meshes without the vertices that few of them observe.
 
     Args:
-        meshes: N, with the vertices kept and the triangles that have no other.
-        vertices: (V,) True for each vertex that is kept.
+        meshes: N, with the observed vertices and the triangles between them.
+        vertices: (V,) True for each vertex that is used.
     """
 
     meshes: Sequence[Mesh]
     vertices: BoolArray
 
     @staticmethod
-    def of(meshes: Sequence[Mesh], min_seen: float) -> Kept:
-        """Return what at least the share `min_seen` of the meshes show, and two of them: one shows no variation.
+    def of(meshes: Sequence[Mesh], min_seen: float) -> ObservedMeshes:
+        """Return the meshes with the vertices that at least the share `min_seen` of them, and two, observe.
 
         Raises:
-            InputError: a share that is none, a mesh that shows nothing, or no vertex that enough of them show.
+            InputError: a share outside (0, 1], a mesh with no observed vertex, or no vertex that enough meshes observe.
         """
         if not 0 < min_seen <= 1:
             raise InputError(f"The share of meshes that show a vertex lies above 0 and at most at 1, not {min_seen:g}.")
-        shown = shown_vertices(meshes)
-        if shown.all():
-            return Kept(meshes, shown[0])
-        for mesh, there in zip(meshes, shown, strict=True):
-            if not there.any():
+        observed = observed_vertices(meshes)
+        if observed.all():
+            return ObservedMeshes(meshes, observed[0])
+        for mesh, own in zip(meshes, observed, strict=True):
+            if not own.any():
                 raise InputError(f"{mesh.name}: all of its vertices are missing; leave it out.")
-        kept = shown.sum(axis=0) >= max(min_seen * len(meshes) * (1 - 1e-12), _FEWEST)
-        if not kept.any():
+        used = observed.sum(axis=0) >= max(min_seen * len(meshes) * (1 - 1e-12), _FEWEST)
+        if not used.any():
             raise InputError(
-                f"No vertex is shown by {100 * min_seen:g} % of the meshes and two of them, so nothing varies that "
+                f"No vertex is observed by {100 * min_seen:g} % of the meshes and two of them, so nothing varies that "
                 "could be learnt; give a smaller --min-seen (min_seen) or meshes with fewer missing vertices."
             )
-        if kept.all():
-            return Kept(meshes, kept)
-        cut = [part_of(mesh, kept) for mesh in meshes]
-        return Kept(cut, kept)
+        if used.all():
+            return ObservedMeshes(meshes, used)
+        return ObservedMeshes([part_of(mesh, used) for mesh in meshes], used)
 
     def regions(self, regions: Mapping[str, IntArray]) -> dict[str, IntArray]:
-        """Return what is left of each region, in new numbers; regions of which nothing is left are left out."""
+        """Return the observed vertices of each region, in new numbers; regions without any are left out."""
         number = np.cumsum(self.vertices, dtype=np.int32) - 1
-        return {name: number[at[self.vertices[at]]] for name, at in regions.items() if self.vertices[at].any()}
+        return {name: number[own[self.vertices[own]]] for name, own in regions.items() if self.vertices[own].any()}
 
     def landmarks(self, landmarks: Mapping[str, int]) -> SurfaceLandmarks:
-        """Return the landmarks whose vertices are all kept, in their new numbers.
+        """Return the landmarks whose vertices are all used, in their new numbers.
 
         Raises:
             InputError: a landmark on a vertex that the meshes do not have.
@@ -98,7 +98,7 @@ class Kept:
         return given.renumbered(self.vertices)
 
     def indices(self, vertices: IntArray | None) -> IntArray | None:
-        """Return those of `vertices` that are kept, in their new numbers; None stays None."""
+        """Return those of `vertices` that are used, in their new numbers; None stays None."""
         if vertices is None or self.vertices.all():
             return vertices
         chosen = np.asarray(vertices)
@@ -107,18 +107,18 @@ class Kept:
 
 
 @dataclass(frozen=True, eq=False)
-class Completed:
-    """Aligned shapes with the places where their missing vertices are expected, and how well that is known.
+class CompletedShapes:
+    """Aligned shapes with their missing vertices at the conditional means, and the uncertainty of these.
 
     Args:
         shapes: (N, V, 3) mm.
-        shown: (N, V).
-        found: what they were completed by.
+        observed: (N, V).
+        fitted: the probabilistic PCA that completed them.
     """
 
     shapes: FloatArray
-    shown: BoolArray
-    found: Ppca
+    observed: BoolArray
+    fitted: Ppca
 
     def components(self, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of whole shapes.
@@ -129,11 +129,11 @@ class Completed:
         n = len(self.shapes)
         data = self.shapes.reshape(n, -1)
         if modes == "auto":
-            modes = choose_modes(data, seed=seed, counted=self.shown).modes
+            modes = choose_modes(data, seed=seed, counted=self.observed).modes
         modes = checked_modes(modes, n)
         whole = principal_components(data)
-        unknown, total = self._unknown(whole.basis)
-        values, vectors = eigh(np.diag(whole.variance) + unknown / (n - 1))
+        conditional, total = self._conditional_covariance(whole.basis)
+        values, vectors = eigh(np.diag(whole.variance) + conditional / (n - 1))  # C29
         variance, vectors = values[::-1].copy(), vectors[:, ::-1]
         count = len(variance)
         if modes is not None:
@@ -142,17 +142,20 @@ class Completed:
         fix_signs(rows)
         return PrincipalComponents(whole.mean, rows.T, variance[:count], whole.total_variance + total / (n - 1), n)
 
-    def _unknown(self, basis: FloatArray) -> tuple[FloatArray, float]:
-        """Return what is unknown of all shapes along `basis` (3V, R): its covariance (R, R), and its trace in all."""
-        r, k = basis.shape[1], len(self.found.width)
+    def _conditional_covariance(self, basis: FloatArray) -> tuple[FloatArray, float]:
+        """Return the covariance (R, R) of missing vertices along `basis` (3V, R), summed over shapes, and its trace.
+
+        The trace is that over all coordinates.
+        """
+        r, k = basis.shape[1], len(self.fitted.width)
         modes = basis.reshape(-1, 3, r)
         out, trace = np.zeros((r, r)), 0.0
-        for i, hidden in enumerate(self.found.patterns.hidden):
-            Q, W = modes[hidden].reshape(-1, r), self.found.W[hidden, :, :k].reshape(-1, k)
-            C, apart = self.found.y_covariance[i, :k, :k], np.repeat(self.found.apart(i), 3)
+        for i, hidden in enumerate(self.fitted.patterns.hidden):
+            Q, W = modes[hidden].reshape(-1, r), self.fitted.W[hidden, :, :k].reshape(-1, k)
+            C, residual = self.fitted.y_covariance[i, :k, :k], np.repeat(self.fitted.residual_variance(i), 3)
             along = Q.T @ W
-            out += along @ C @ along.T + (Q.T * apart) @ Q
-            trace += float(np.einsum("dk,kl,dl->", W, C, W)) + float(apart.sum())
+            out += along @ C @ along.T + (Q.T * residual) @ Q
+            trace += float(np.einsum("dk,kl,dl->", W, C, W)) + float(residual.sum())
         return out, trace
 
 
@@ -163,8 +166,8 @@ def complete(
     *,
     align: bool = True,
     alignment_vertices: IntArray | None = None,
-) -> Completed:
-    """Align shapes by what they show, and find where their missing vertices are expected.
+) -> CompletedShapes:
+    """Align shapes by their observed vertices, and estimate the missing ones.
 
     Args:
         shapes: (N, V, 3) mm, each vertex in at least one; not-a-number where missing.
@@ -174,22 +177,24 @@ def complete(
         alignment_vertices: as of `align_in_place`.
 
     Raises:
-        InputError: a shape of which too little is there to be aligned.
+        InputError: too little of a shape is observed to align it.
     """
-    shown = _there(shapes)
+    observed = _observed(shapes)
     n = len(shapes)
     most = max(1, min(round(_MODES_A_SHAPE * n), _MOST_MODES, n - 2))
-    guess = _mean_filled(shapes, shown, names, gauge) if align else _filled(shapes, shown, _mean_of(shapes, shown))
+    guess = (
+        _mean_filled(shapes, observed, names, gauge) if align else _filled(shapes, observed, _mean_of(shapes, observed))
+    )
     if align:
         for modes in _POSES_BY:
             posed = _aligned(guess, gauge, alignment_vertices)
-            found = ppca(posed, shown, min(most, modes))
-            guess = _in_own_pose(shapes, shown, posed, found)
+            fitted = ppca(posed, observed, min(most, modes))
+            guess = _in_own_pose(shapes, observed, posed, fitted)
         guess = _aligned(guess, gauge, alignment_vertices)
-    found = ppca(guess, shown, most)
-    for i, hidden in enumerate(found.patterns.hidden):
-        guess[i, hidden] = found.place(i)
-    return Completed(guess, shown, found)
+    fitted = ppca(guess, observed, most)
+    for i, hidden in enumerate(fitted.patterns.hidden):
+        guess[i, hidden] = fitted.estimate(i)
+    return CompletedShapes(guess, observed, fitted)
 
 
 def with_estimates(shapes: FloatArray, names: Sequence[str], gauge: Gauge = "shape") -> FloatArray:
@@ -206,36 +211,36 @@ def with_estimates(shapes: FloatArray, names: Sequence[str], gauge: Gauge = "sha
     Raises:
         InputError: too little of a shape is observed to align it.
     """
-    found = complete(shapes, names, gauge)
-    return _in_own_pose(shapes, found.shown, found.shapes, found.found)
+    completed = complete(shapes, names, gauge)
+    return _in_own_pose(shapes, completed.observed, completed.shapes, completed.fitted)
 
 
-def _mean_filled(shapes: FloatArray, shown: BoolArray, names: Sequence[str], gauge: Gauge) -> FloatArray:
-    """Return the shapes, each in its own pose, with the mean where they show nothing.
+def _mean_filled(shapes: FloatArray, observed: BoolArray, names: Sequence[str], gauge: Gauge) -> FloatArray:
+    """Return the shapes, each in its own pose, with the mean at missing vertices.
 
-    The mean is that of generalised Procrustes over shared vertices, as large as the shape that shows most.
+    The mean is that of generalised Procrustes over shared vertices, as large as the most complete shape.
     """
-    first = int(shown.sum(axis=1).argmax())
-    mean, shared, size = shapes[first], shown & shown[first], 0.0
+    first = int(observed.sum(axis=1).argmax())
+    mean, shared, size = shapes[first], observed & observed[first], 0.0
     poses: list[Similarity] = []
     for _ in range(_MEAN_ROUNDS):
-        poses = [_pose(x, mean, there, name, gauge) for x, there, name in zip(shapes, shared, names, strict=True)]
-        previous, mean = mean, _mean_of(np.stack([T.apply(x) for T, x in zip(poses, shapes, strict=True)]), shown)
+        poses = [_pose(x, mean, own, name, gauge) for x, own, name in zip(shapes, shared, names, strict=True)]
+        previous, mean = mean, _mean_of(np.stack([T.apply(x) for T, x in zip(poses, shapes, strict=True)]), observed)
         size = size or centroid_size(mean)
         mean = mean * (size / centroid_size(mean))
-        if shared is shown and float(np.abs(mean - previous).max()) <= _STILL * size:
+        if shared is observed and float(np.abs(mean - previous).max()) <= _STILL * size:
             break
-        shared = shown
-    return _filled(shapes, shown, np.stack([T.inverse().apply(mean) for T in poses]))
+        shared = observed
+    return _filled(shapes, observed, np.stack([T.inverse().apply(mean) for T in poses]))
 
 
-def _mean_of(shapes: FloatArray, shown: BoolArray) -> FloatArray:
-    there = shown[:, :, None]
-    return np.asarray(np.where(there, shapes, 0.0).sum(axis=0) / there.sum(axis=0), dtype=np.float64)
+def _mean_of(shapes: FloatArray, observed: BoolArray) -> FloatArray:
+    weights = observed[:, :, None]
+    return np.asarray(np.where(weights, shapes, 0.0).sum(axis=0) / weights.sum(axis=0), dtype=np.float64)
 
 
-def _filled(shapes: FloatArray, shown: BoolArray, by: FloatArray) -> FloatArray:
-    return np.where(shown[:, :, None], shapes, by)
+def _filled(shapes: FloatArray, observed: BoolArray, by: FloatArray) -> FloatArray:
+    return np.where(observed[:, :, None], shapes, by)
 
 
 def _aligned(whole: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None) -> FloatArray:
@@ -246,13 +251,13 @@ def _aligned(whole: FloatArray, gauge: Gauge, alignment_vertices: IntArray | Non
     return posed
 
 
-def _in_own_pose(shapes: FloatArray, shown: BoolArray, posed: FloatArray, found: Ppca) -> FloatArray:
-    """Return the shapes in the poses and sizes that they came in, completed by what was found in the common one."""
+def _in_own_pose(shapes: FloatArray, observed: BoolArray, posed: FloatArray, fitted: Ppca) -> FloatArray:
+    """Return the shapes in the poses and sizes that they came in, completed by the estimates in the common one."""
     out = shapes.copy()
-    for i, hidden in enumerate(found.patterns.hidden):
+    for i, hidden in enumerate(fitted.patterns.hidden):
         if len(hidden):
-            T_shape_posed = fit_similarity(posed[i, shown[i]], shapes[i, shown[i]])
-            out[i, hidden] = T_shape_posed.apply(found.place(i))
+            T_shape_posed = fit_similarity(posed[i, observed[i]], shapes[i, observed[i]])
+            out[i, hidden] = T_shape_posed.apply(fitted.estimate(i))
     return out
 
 

@@ -121,9 +121,9 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     return arrays, attributes
 
 
-def _regions(told: str, vertices: IntArray | None) -> dict[str, IntArray]:
+def _regions(text: str, vertices: IntArray | None) -> dict[str, IntArray]:
     """Return name -> vertices, of what the attribute tells of how many each has, and the array of all of them."""
-    counts = msgspec.convert(plain_json(told), dict[str, int])
+    counts = msgspec.convert(plain_json(text), dict[str, int])
     ends = np.cumsum(list(counts.values()), dtype=np.int64)
     if any(count < 1 for count in counts.values()) or sum(counts.values()) != (
         0 if vertices is None else vertices.size
@@ -134,10 +134,10 @@ def _regions(told: str, vertices: IntArray | None) -> dict[str, IntArray]:
 
 def _landmarks(vertices: Mapping[str, int], arrays: Mapping[str, npt.NDArray[Any]]) -> SurfaceLandmarks:
     """Return landmarks of version 2: their arrays, with the names of the attribute and its nearest vertices."""
-    found = SurfaceLandmarks(tuple(vertices), arrays[_CORNERS], arrays[_BARYCENTRIC], arrays[_DISTANCE])
-    if dict(found) != dict(vertices):
+    landmarks = SurfaceLandmarks(tuple(vertices), arrays[_CORNERS], arrays[_BARYCENTRIC], arrays[_DISTANCE])
+    if dict(landmarks) != dict(vertices):
         raise ValueError("landmarks do not belong to their triangles")
-    return found
+    return landmarks
 
 
 def load(path: Path) -> ModelFields:
@@ -160,12 +160,12 @@ def load(path: Path) -> ModelFields:
             f"versions {_VERSION_OF_VERTICES} and {FORMAT_VERSION}; update shapespace."
         )
     try:
-        told = msgspec.convert(attributes, _Told)
-        vertices = msgspec.convert(plain_json(told.landmarks), dict[str, int])
+        attributes_of_file = msgspec.convert(attributes, _Told)
+        vertices = msgspec.convert(plain_json(attributes_of_file.landmarks), dict[str, int])
         for name, array in arrays.items():
             if array.dtype != (np.int32 if name in _WHOLE_NUMBERS else np.float64):
                 raise ValueError(f"{name} is of the type {array.dtype}")
-        if told.representation == "vertices" and arrays["basis"].ndim == 2:
+        if attributes_of_file.representation == "vertices" and arrays["basis"].ndim == 2:
             with np.errstate(over="ignore"):
                 length = np.einsum("dk,dk->k", arrays["basis"], arrays["basis"])
             if not (np.abs(length - 1.0) < _UNIT_TOLERANCE).all():
@@ -177,18 +177,18 @@ def load(path: Path) -> ModelFields:
             "basis": owned["basis"],
             "stddev": owned["stddev"],
             "faces": owned.get("faces"),
-            "total_variance": told.total_variance,
-            "n_training": told.n_training,
-            "gauge": told.gauge,
+            "total_variance": attributes_of_file.total_variance,
+            "n_training": attributes_of_file.n_training,
+            "gauge": attributes_of_file.gauge,
             "landmarks": _landmarks(vertices, owned) if version == FORMAT_VERSION else SurfaceLandmarks.of(vertices),
-            "representation": told.representation,
+            "representation": attributes_of_file.representation,
             "coding": {name: array for name, array in owned.items() if name not in _EVERY_MODEL},
-            "provenance": told.provenance,
-            "licence": told.licence,
-            "held_out": told.variance_divisor == _HELD_OUT,
+            "provenance": attributes_of_file.provenance,
+            "licence": attributes_of_file.licence,
+            "held_out": attributes_of_file.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
-            "regions": _regions(told.regions, owned.get(_REGIONS)),
+            "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
         }
     except (KeyError, ValueError) as error:
-        what = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")
-        raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {what}.") from error
+        reason = str(error)[:_TOLD].replace("`", "").replace("Object missing", "missing")
+        raise ModelFileError(f"{path} is a shapespace model but a part of it is missing or wrong: {reason}.") from error

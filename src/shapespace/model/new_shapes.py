@@ -101,8 +101,8 @@ def _log_factor(variance: FloatArray, held_out: HeldOut) -> FloatArray:
     waves: FloatArray = np.asarray(legvander(np.linspace(-1.0, 1.0, k), min(_DEGREE, k - 1)), dtype=np.float64)
     weight = 0.5 * held_out.groups * held_out.seen
     ratio = held_out.squares / np.maximum(held_out.seen * held_out.shapes, 1.0) / variance
-    found = [_at_width(waves, weight, ratio, width) for width in _WIDTHS]
-    return waves @ max(found, key=lambda one: one[0])[1]
+    factors = [_at_width(waves, weight, ratio, width) for width in _WIDTHS]
+    return waves @ max(factors, key=lambda one: one[0])[1]
 
 
 def _at_width(waves: FloatArray, weight: FloatArray, ratio: FloatArray, width: float) -> tuple[float, FloatArray]:

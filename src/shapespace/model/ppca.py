@@ -1,9 +1,10 @@
-"""Probabilistic principal components of shapes of which vertices are missing, by expectation and maximisation.
+"""Probabilistic principal components of shapes with missing vertices, by expectation and maximisation.
 
-A shape is mean + W y + e, with y normal of unit variance and e normal of variance `noise` in every coordinate. Each
-round takes the distribution of y given what a shape shows, mean and covariance (E), and then the distributions of the
-mean and W and the likeliest noise (M): each vertex from the shapes that show it. As the covariances count, what is
-missing does not narrow the variances. Roweis, NIPS 10, 1998; Tipping and Bishop, JRSS B 61(3), 1999.
+A shape is mean + W y + e (C21), y normal of unit variance and e normal of variance `noise` in every coordinate. Each
+round computes the distribution of y given the observed vertices of a shape, mean and covariance (E), and then the
+distributions of the mean and W and the likeliest noise (M): each vertex from the shapes that observe it. As the
+covariances count, missing vertices do not narrow the variances. Roweis, NIPS 10, 1998; Tipping and Bishop, JRSS B
+61(3), 1999. Equations Cn are those of docs/missing.md.
 
 There are far more coordinates than shapes, so that the likeliest W alone follows the noise of what few shapes show, and
 fills worse than the mean does. So W has a normal prior, a width a mode, and its covariance counts too (variational
@@ -24,28 +25,28 @@ from scipy.linalg import solve_triangular
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 _LEAST_NOISE = 1e-9
-"""Of the variance of a coordinate: shapes without noise have none that could be told."""
+"""Of the variance of a coordinate: shapes without noise do not determine it."""
 _FIRST_NOISE = 1e-3
 """Of the variance, at least: without noise nothing would move."""
-_STILL = 1e-5
-"""Nats a coordinate that is shown."""
+_CONVERGED = 1e-5
+"""Nats a coordinate that is observed."""
 _MOST_ROUNDS = 60
 _BLOCK = 512
 
 
 @dataclass(frozen=True, eq=False)
 class Ppca:
-    """What probabilistic PCA found of N shapes with V vertices, K modes and P patterns of missing vertices.
+    """Probabilistic PCA of N shapes with V vertices, K modes and P patterns of missing vertices.
 
     Args:
         W: (V, 3, K + 1) mm, how each vertex moves with each of y, and last the mean.
         W_covariance: (P, K + 1, K + 1) of each coordinate of the vertices of a pattern.
-        noise: variance of a coordinate that the modes leave over, mm^2.
+        noise: residual variance of a coordinate, mm^2.
         y: (N, K + 1) means of the latent coefficients of each shape, in standard deviations, and last a one.
         y_covariance: (N, K + 1, K + 1) of the same.
         width: (K,) variance of a coordinate of each mode, mm^2.
         patterns: which vertices are missing where.
-        bounds: (rounds,) of the log probability of what is shown, nats, up to a constant; they never fall.
+        bounds: (rounds,) of the log probability of the observed vertices, nats, up to a constant; they never fall.
     """
 
     W: FloatArray
@@ -57,23 +58,20 @@ class Ppca:
     patterns: Patterns
     bounds: FloatArray
 
-    def place(self, shape: int) -> FloatArray:
-        """Return where the missing vertices of a shape are expected, (M, 3) mm."""
-        return np.asarray(self.W[self.patterns.hidden[shape]] @ self.y[shape], dtype=np.float64)
+    def estimate(self, shape: int) -> FloatArray:
+        """Return the conditional means of the missing vertices of a shape, (M, 3) mm."""
+        return np.asarray(self.W[self.patterns.hidden[shape]] @ self.y[shape], dtype=np.float64)  # C27
 
-    def apart(self, shape: int) -> FloatArray:
-        """Return the variance (M,), mm^2, that each coordinate of a missing vertex has beside that by y."""
+    def residual_variance(self, shape: int) -> FloatArray:
+        """Return the variance (M,), mm^2, of each coordinate of a missing vertex in addition to that of y (C28)."""
         second = np.outer(self.y[shape], self.y[shape]) + self.y_covariance[shape]
         known: FloatArray = np.asarray(np.einsum("pab,ab->p", self.W_covariance, second), dtype=np.float64)
-        beside: FloatArray = np.empty(len(self.patterns.hidden[shape]))
-        beside[:] = known[self.patterns.of_vertex[self.patterns.hidden[shape]]]
-        beside += self.noise
-        return beside
+        return known[self.patterns.of_vertex[self.patterns.hidden[shape]]] + self.noise  # C28
 
 
 @dataclass(frozen=True, eq=False)
 class Patterns:
-    """Which vertices are missing in which shapes, those of one pattern taken together.
+    """Patterns of missing vertices: vertices that are missing in the same shapes have one pattern.
 
     Args:
         missing: (P, N) True where the vertices of a pattern are missing in a shape.
@@ -88,13 +86,13 @@ class Patterns:
     hidden: tuple[IntArray, ...]
 
     @staticmethod
-    def of(shown: BoolArray) -> Patterns:
-        """Return those of shapes of which the vertices `shown` (N, V) are there."""
+    def of(observed: BoolArray) -> Patterns:
+        """Return the patterns of shapes whose vertices `observed` (N, V) are known."""
         packed, of_vertex, count = np.unique(
-            np.packbits(~shown, axis=0).T, axis=0, return_inverse=True, return_counts=True
+            np.packbits(~observed, axis=0).T, axis=0, return_inverse=True, return_counts=True
         )
-        missing = np.unpackbits(packed, axis=1, count=len(shown)).astype(np.bool_)
-        hidden = tuple(np.flatnonzero(~there).astype(np.int32) for there in shown)
+        missing = np.unpackbits(packed, axis=1, count=len(observed)).astype(np.bool_)
+        hidden = tuple(np.flatnonzero(~own).astype(np.int32) for own in observed)
         return Patterns(missing, of_vertex.reshape(-1).astype(np.int32), count.astype(np.int32), hidden)
 
     @cached_property
@@ -105,39 +103,49 @@ class Patterns:
 
 def ppca(
     shapes: FloatArray,
-    shown: BoolArray,
+    observed: BoolArray,
     modes: int,
     on_round: Callable[[int, float], None] | None = None,
 ) -> Ppca:
     """Return the probabilistic principal components of aligned `shapes`.
 
     Args:
-        shapes: (N, V, 3) mm, with a guess of what is not shown, such as the mean; it is no more than where to begin.
-        shown: (N, V), each vertex in at least one shape.
-        modes: K, below N; those for which nothing speaks vanish.
+        shapes: (N, V, 3) mm; missing vertices have an initial guess, such as the mean.
+        observed: (N, V), each vertex in at least one shape.
+        modes: K, below N; those without evidence vanish.
         on_round: called with the round and the bound of the log probability.
     """
-    patterns, n_shown = Patterns.of(shown), 3 * int(shown.sum())
+    patterns, n_observed = Patterns.of(observed), 3 * int(observed.sum())
     about = shapes.mean(axis=0)
-    centred = np.where(shown[:, :, None], shapes - about, 0.0)
+    centred = np.where(observed[:, :, None], shapes - about, 0.0)
     size = float((centred**2).sum())
     W, noise = _from_complete(shapes, modes)
-    width = np.maximum((W[:, :, :modes] ** 2).mean(axis=(0, 1)), _LEAST_NOISE * size / n_shown)
+    width = np.maximum((W[:, :, :modes] ** 2).mean(axis=(0, 1)), _LEAST_NOISE * size / n_observed)
     W_covariance = np.zeros((len(patterns.count), modes + 1, modes + 1))
     bounds: list[float] = []
     while True:
         y, y_covariance, of_y = _expect(centred, patterns, W, W_covariance, noise)
         ridge = np.append(noise / width, 0.0)
-        W, W_covariance, left, of_W = _maximise(centred, patterns, y, y_covariance, ridge, noise)
-        noise = max((size - left) / n_shown, _LEAST_NOISE * size / n_shown)
+        W, W_covariance, explained, of_W = _maximise(centred, patterns, y, y_covariance, ridge, noise)
+        noise = max((size - explained) / n_observed, _LEAST_NOISE * size / n_observed)  # C24
         spread = np.einsum("pkk,p->k", W_covariance[:, :modes, :modes], patterns.weight)
-        width = ((W[:, :, :modes] ** 2).sum(axis=(0, 1)) + spread) / (3 * len(about))
-        bounds.append(of_y + of_W - 0.5 * (n_shown * np.log(noise) + 3 * len(about) * float(np.log(width).sum())))
+        width = ((W[:, :, :modes] ** 2).sum(axis=(0, 1)) + spread) / (3 * len(about))  # C25
+        bounds.append(of_y + of_W - 0.5 * (n_observed * np.log(noise) + 3 * len(about) * float(np.log(width).sum())))
         if on_round is not None:
             on_round(len(bounds), bounds[-1])
-        if len(bounds) == _MOST_ROUNDS or (len(bounds) > 1 and bounds[-1] - bounds[-2] <= _STILL * n_shown):
+        converged = len(bounds) > 1 and bounds[-1] - bounds[-2] <= _CONVERGED * n_observed  # C26
+        if converged or len(bounds) == _MOST_ROUNDS:
             W[:, :, modes] += about
-            return Ppca(W, W_covariance, noise, y, y_covariance, width, patterns, np.array(bounds))
+            return Ppca(
+                W=W,
+                W_covariance=W_covariance,
+                noise=noise,
+                y=y,
+                y_covariance=y_covariance,
+                width=width,
+                patterns=patterns,
+                bounds=np.array(bounds),
+            )
 
 
 def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
@@ -147,8 +155,8 @@ def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
     values, vectors = np.linalg.eigh(flat @ flat.T)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     noise = max(float(values[modes:].sum()), _FIRST_NOISE * float(values.sum())) / (n * (flat.shape[1] - modes))
-    kept = np.maximum(values[:modes], 2 * n * noise)
-    W = (flat.T @ vectors[:, :modes]) * np.sqrt((kept / n - noise) / kept)
+    floored = np.maximum(values[:modes], 2 * n * noise)
+    W = (flat.T @ vectors[:, :modes]) * np.sqrt((floored / n - noise) / floored)
     return np.column_stack([W, np.zeros(len(W))]).reshape(vertices, 3, modes + 1), noise
 
 
@@ -159,11 +167,7 @@ def _expect(
     W_covariance: FloatArray,
     noise: float,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return mean (N, K + 1) and covariance of y given what each shape shows, and its part of the bound.
-
-    With P Lambda^1/2 for W these are the systems (P_o^T P_o + noise Lambda^-1) b = P_o^T (x_o - mean_o), with the
-    covariance of W added to its square.
-    """
+    """Return mean (N, K + 1) and covariance of y given the observed vertices (C22), and its part of the bound."""
     n, k = len(centred), W.shape[-1] - 1
     flat = W.reshape(-1, k + 1)
     weighted = W_covariance.reshape(len(patterns.count), -1) * patterns.weight[:, None]
@@ -182,7 +186,7 @@ def _expect(
             solved = square, half.T @ half, float(np.log(root.diagonal()).sum())
             of_whole = of_whole if len(patterns.hidden[i]) else solved
         square, inverse, log_root = solved
-        y[i, :k] = inverse @ (flat[:, :k].T @ centred[i].reshape(-1) - square[:k, k])
+        y[i, :k] = inverse @ (flat[:, :k].T @ centred[i].reshape(-1) - square[:k, k])  # C22
         covariance[i, :k, :k] = noise * inverse
         bound += 0.5 * k * np.log(noise) - log_root
         bound -= 0.5 * float(y[i, :k] @ y[i, :k] + covariance[i].trace())
@@ -197,12 +201,12 @@ def _maximise(
     ridge: FloatArray,
     noise: float,
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Return W (V, 3, K + 1) and its covariance by pattern, what it explains, and its part of the bound.
+    """Return W (V, 3, K + 1) and its covariance by pattern (C23), the explained squares, and its part of the bound.
 
-    A vertex has its own normal equations, over the shapes that show it; they differ by the pattern of missing ones.
+    A vertex has its own normal equations, over the shapes that observe it; they differ by the pattern of missing ones.
 
     Args:
-        centred: (N, V, 3), zero where nothing is shown.
+        centred: (N, V, 3), zero at missing vertices.
         patterns: which vertices are missing where.
         y: (N, K + 1).
         y_covariance: (N, K + 1, K + 1).
@@ -214,7 +218,7 @@ def _maximise(
     total = products.sum(axis=0) + np.diag(ridge).reshape(-1)
     right = (y.T @ centred.reshape(n, -1)).T.reshape(-1, 3, k1)
     W, covariance = np.empty_like(right), np.empty((len(patterns.count), k1, k1))
-    left, bound = 0.0, 0.0
+    explained, bound = 0.0, 0.0
     for start in range(0, len(patterns.count), _BLOCK):
         part = slice(start, start + _BLOCK)
         systems = (total - patterns.missing[part].astype(np.float64) @ products).reshape(-1, k1, k1)
@@ -222,11 +226,11 @@ def _maximise(
         covariance[part] = noise * inverse
         weight = patterns.weight[part]
         # Of these coordinates the trace of W's covariance times the products of y.
-        left -= noise * float(weight @ (k1 - np.einsum("pkk,k->p", inverse, ridge)))
+        explained -= noise * float(weight @ (k1 - np.einsum("pkk,k->p", inverse, ridge)))
         bound += 0.5 * float(weight @ (k1 * np.log(noise) - np.linalg.slogdet(systems)[1]))
     for start in range(0, len(W), _BLOCK):
         part = slice(start, start + _BLOCK)
-        W[part] = right[part] @ (covariance[patterns.of_vertex[part]] / noise)
+        W[part] = right[part] @ (covariance[patterns.of_vertex[part]] / noise)  # C23
     # What the likeliest plane explains, with the pull of the prior taken off again.
-    left += float((W * right).sum() + (W**2 @ ridge).sum())
-    return W, covariance, left, bound
+    explained += float((W * right).sum() + (W**2 @ ridge).sum())
+    return W, covariance, explained, bound

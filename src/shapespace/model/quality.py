@@ -25,7 +25,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_vertices, part_of, without_estimates
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.lazy import lazy_import
-from shapespace.model.missing import MIN_SEEN, Kept
+from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
@@ -127,10 +127,10 @@ class ModelQuality:
     left_out_vertices: int = 0
 
     def __repr__(self) -> str:
-        told = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
+        parts = [f"compactness {self.compactness.mean[-1]:.3f} with {self.compactness.at[-1]} modes"]
         for name, curve in (("generalisation", self.generalisation), ("specificity", self.specificity)):
-            told += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
-        return f"<ModelQuality of {self.shapes} shapes: {', '.join(told)}>"
+            parts += [] if curve is None else [f"{name} {curve.mean[-1]:.3g} mm with {curve.at[-1]}"]
+        return f"<ModelQuality of {self.shapes} shapes: {', '.join(parts)}>"
 
     def plot(self, **options: Any) -> Figure:
         """Return a matplotlib figure of all measures that there are, over the number of modes.
@@ -148,16 +148,16 @@ class ModelQuality:
 
     def sentences(self) -> tuple[str, ...]:
         """Return how many modes the shapes support, and whether more shapes would help."""
-        told: list[str] = []
+        sentences: list[str] = []
         if self.supported_modes is not None:
-            what = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
-            told.append(
-                f"These {self.shapes} shapes support {what}: with more, hidden vertices of unseen shapes are foretold "
+            modes = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
+            sentences.append(
+                f"These {self.shapes} shapes support {modes}: with more, hidden vertices of unseen shapes are foretold "
                 "no better."
             )
         if self.by_shapes is not None and len(self.by_shapes.at) > 1:
-            told.append(_more_shapes(self.by_shapes, self.seed))
-        return tuple(told)
+            sentences.append(_more_shapes(self.by_shapes, self.seed))
+        return tuple(sentences)
 
     def differences(self, other: ModelQuality) -> dict[str, Curve]:
         """Return what `other` has less what this has, shape by shape, by the names of the measures.
@@ -220,7 +220,7 @@ class QualitySettings:
         """Return the shape space of `meshes`, of the vertices that at least two of them show."""
         kept = np.ones(len(meshes[0].vertices), dtype=np.bool_)
         if not representation_named(self.representation, self.control_points).takes_holes:
-            kept = Kept.of(meshes, _ANY).vertices
+            kept = ObservedMeshes.of(meshes, _ANY).vertices
         model = ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
@@ -269,11 +269,11 @@ class _Target:
                 )
         return _Target(shape, seen, surface, engine, scan is not None)
 
-    def cut_to(self, kept: BoolArray) -> _Target:
-        """Return the same of the vertices `kept` (V,) alone."""
-        if kept.all():
+    def cut_to(self, used: BoolArray) -> _Target:
+        """Return the same with the vertices `used` (V,) only."""
+        if used.all():
             return self
-        shape = part_of(self.shape, kept)
+        shape = part_of(self.shape, used)
         seen = np.flatnonzero(np.isfinite(shape.vertices).all(axis=1)).astype(np.int32)
         if self.is_scan:
             return _Target(shape, seen, self.surface, self.engine, True)
@@ -285,9 +285,9 @@ def _shown(shape: Mesh, seen: IntArray) -> Mesh:
     """Return what of a shape is there."""
     if len(seen) == len(shape.vertices):
         return shape
-    kept = np.zeros(len(shape.vertices), dtype=np.bool_)
-    kept[seen] = True
-    return part_of(shape, kept)
+    used = np.zeros(len(shape.vertices), dtype=np.bool_)
+    used[seen] = True
+    return part_of(shape, used)
 
 
 @dataclass(frozen=True)
@@ -376,7 +376,9 @@ class Shapes:
             order = tuple(int(i) for i in rng.permutation(n) if i not in fold)
             folds.append(Part(tuple(fold.tolist()), order))
         samples = range(self.settings.samples)
-        return folds + [Part(drawn=tuple(samples[at : at + _DRAWN_AT_ONCE])) for at in samples[::_DRAWN_AT_ONCE]]
+        return folds + [
+            Part(drawn=tuple(samples[start : start + _DRAWN_AT_ONCE])) for start in samples[::_DRAWN_AT_ONCE]
+        ]
 
     def do(self, part: Part) -> FloatArray:
         """Return errors, mm: of shapes left out (H, n + m, 2), the last m of models of fewer shapes; or of random ones.
@@ -475,7 +477,7 @@ def measure_quality(
     if isinstance(target, ShapeModel):
         return _of_model(target, new, settings, on_step)
     whole = representation_named(settings.representation, settings.control_points).takes_holes
-    kept = np.ones(vertices, dtype=np.bool_) if whole else Kept.of(meshes, MIN_SEEN).vertices
+    kept = np.ones(vertices, dtype=np.bool_) if whole else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not kept.all():
         meshes, new = [part_of(mesh, kept) for mesh in meshes], [part_of(mesh, kept) for mesh in new]
     shapes = Shapes(meshes, scans, settings)
@@ -488,11 +490,11 @@ def _of_model(
     counts = _counts(min(settings.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
     space = _Space(model, np.ones(model.n_vertices, dtype=np.bool_))
-    told = _unseen(space, unseen, counts, settings, _Steps(len(unseen), on_step))
+    of_unseen = _unseen(space, unseen, counts, settings, _Steps(len(unseen), on_step))
     return ModelQuality(
         Curve(counts, share, share, share),
-        reconstruction=told[0],
-        reconstruction_vertices=told[1],
+        reconstruction=of_unseen[0],
+        reconstruction_vertices=of_unseen[1],
         points=_points(model.n_vertices),
         seed=settings.seed,
     )
@@ -505,13 +507,13 @@ def _of_meshes(
     steps = _Steps(len(meshes) + len(unseen) + settings.samples, on_step)
     errors = np.zeros((len(meshes), len(counts) + len(shapes.sizes), 2))
     drawn = np.zeros((settings.samples, len(few), 2))
-    for part, found in run(shapes, shapes.parts()):
-        (errors if part.held else drawn)[list(part.held or part.drawn)] = found
-        steps.step(len(found))
+    for part, part_result in run(shapes, shapes.parts()):
+        (errors if part.held else drawn)[list(part.held or part.drawn)] = part_result
+        steps.step(len(part_result))
     general = _curves(errors[:, : len(counts)], counts, settings.seed)
     specific = _curves(drawn, few, settings.seed)
     space = shapes.space
-    told = _unseen(space, unseen, counts, settings, steps)
+    of_unseen = _unseen(space, unseen, counts, settings, steps)
     there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
         _compactness(space.model, shapes.trained, counts, settings),
@@ -519,8 +521,8 @@ def _of_meshes(
         generalisation_vertices=general[1],
         specificity=specific[0],
         specificity_vertices=specific[1],
-        reconstruction=told[0],
-        reconstruction_vertices=told[1],
+        reconstruction=of_unseen[0],
+        reconstruction_vertices=of_unseen[1],
         by_shapes=Curve.over(errors[:, len(counts) :, 0], shapes.sizes, settings.seed),
         supported_modes=settings.space(meshes, "auto").model.n_modes if len(meshes) >= _FEWEST_TO_CHOOSE else None,
         shapes=len(meshes),
@@ -599,8 +601,8 @@ def _told(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
     T_model_shape = _onto_mean(model, target)
     for column, k in enumerate(counts):
-        told, T_model_shape = _in_best_pose(model, target, int(k), T_model_shape)
-        fitted = T_model_shape.inverse().apply(told)
+        reconstructed, T_model_shape = _in_best_pose(model, target, int(k), T_model_shape)
+        fitted = T_model_shape.inverse().apply(reconstructed)
         out[column, 0] = np.linalg.norm(fitted[target.seen] - there, axis=1).mean()
         if surface:
             out[column, 1] = _apart(target.shape.with_vertices(fitted), target)
@@ -625,14 +627,14 @@ def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> 
         variance = model.stddev[:k] ** 2
         left = max(model.total_variance - float(variance.sum()), _LEAST_NOISE * model.total_variance)
         precision = heard @ heard.T + np.diag(left / (3 * len(mean)) / variance)
-    told = mean
+    reconstructed = mean
     for _ in range(_POSE_ROUNDS):
         b = heard @ (T.apply(there) - mean[seen]).reshape(-1)
         if precision is not None:
             b = np.asarray(np.linalg.solve(precision, b))
-        told = mean + (b @ modes).reshape(-1, 3)
-        T = fit_similarity(there, told[seen], with_scale=model.gauge == "shape")
-    return told, T
+        reconstructed = mean + (b @ modes).reshape(-1, 3)
+        T = fit_similarity(there, reconstructed[seen], with_scale=model.gauge == "shape")
+    return reconstructed, T
 
 
 def _apart(fitted: Mesh, target: _Target) -> float:
@@ -693,22 +695,22 @@ def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray
     posed = [mesh.vertices for mesh in _posed(model, targets, settings)]
     for i, target in enumerate(targets):
         if len(target.seen) < model.n_vertices:
-            told = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
-            posed[i] = np.where(np.isnan(posed[i]), told, posed[i])
+            reconstructed = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
+            posed[i] = np.where(np.isnan(posed[i]), reconstructed, posed[i])
     flat = np.stack(posed).reshape(len(targets), -1) - model.mean_vertices.reshape(-1)
     gram = flat @ flat.T
     share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
-    n, kept = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
+    n, count = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
     rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
-    without = np.stack([_shares(gram[np.ix_(some, some)], counts, kept) for some in rest])
+    without = np.stack([_shares(gram[np.ix_(some, some)], counts, count) for some in rest])
     spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     return Curve(counts, share, np.maximum(share - spread, 0.0), np.minimum(share + spread, 1.0))
 
 
-def _shares(gram: FloatArray, counts: IntArray, kept: int) -> FloatArray:
+def _shares(gram: FloatArray, counts: IntArray, count: int) -> FloatArray:
     centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
     values = np.maximum(np.linalg.eigvalsh(centred)[::-1], 0.0)
-    return np.cumsum(values)[np.minimum(counts, min(kept, len(values))) - 1] / values.sum()
+    return np.cumsum(values)[np.minimum(counts, min(count, len(values))) - 1] / values.sum()
 
 
 def _more_shapes(by_shapes: Curve, seed: int) -> str:
@@ -723,10 +725,10 @@ def _more_shapes(by_shapes: Curve, seed: int) -> str:
     now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
     low, high = 100 * np.percentile(fell, [2.5, 97.5])
     changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
-    said = f"From {at[few]} to {at[-1]} training shapes the error on unseen ones {changed} "
-    said += f"(95 %: {low:.0f} to {high:.0f} %), "
+    sentence = f"From {at[few]} to {at[-1]} training shapes the error on unseen ones {changed} "
+    sentence += f"(95 %: {low:.0f} to {high:.0f} %), "
     if low > 0 and now >= 5:
-        return said + "so more shapes would help."
-    return said + (
+        return sentence + "so more shapes would help."
+    return sentence + (
         "so more shapes would help little." if high < 10 else "so these shapes do not show whether more would help."
     )

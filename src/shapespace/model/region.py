@@ -91,11 +91,11 @@ def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
             raise InputError("No triangle of the model lies in the region; give one with whole triangles.")
     rows = whole.vertex_basis.reshape(whole.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
     basis, stddev, lift = np.linalg.svd(rows * whole.stddev, full_matrices=False)
-    kept = stddev > _FAINTEST * stddev[0]
+    significant = stddev > _FAINTEST * stddev[0]
     model = ShapeModel(
         mean=mean.ravel(),
-        basis=basis[:, kept],
-        stddev=stddev[kept],
+        basis=basis[:, significant],
+        stddev=stddev[significant],
         total_variance=float((stddev**2).sum() * whole.total_variance / (whole.stddev**2).sum()),
         n_training=whole.n_training,
         faces=faces,
@@ -103,4 +103,4 @@ def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
         landmarks=whole.landmarks.renumbered(inside),
         held_out=whole.held_out,
     )
-    return Part(model, inside, lift[kept].T)
+    return Part(model, inside, lift[significant].T)

@@ -191,12 +191,12 @@ class BSplineSurface:
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
         """Return `uv` (V, 2), `control_counts` (2,) and `degree` (), and `detail` (V, 3) where it is kept."""
-        found: dict[str, npt.NDArray[Any]] = {
+        arrays: dict[str, npt.NDArray[Any]] = {
             "uv": self.spline.uv,
             "control_counts": np.array(self.spline.counts, dtype=np.int32),
             "degree": np.array(DEGREE, dtype=np.int32),
         }
-        return found if self.detail is None else {**found, "detail": self.detail}
+        return arrays if self.detail is None else {**arrays, "detail": self.detail}
 
     def encode(self, vertices: FloatArray) -> FloatArray:
         """Return (..., 3mn) from vertices (..., V, 3), of which some may be not-a-number."""

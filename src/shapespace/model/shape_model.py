@@ -26,7 +26,7 @@ from shapespace.model import model_file
 from shapespace.model.choose_modes import choose_modes
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.holes import fill_holes
-from shapespace.model.missing import MIN_SEEN, Kept, complete
+from shapespace.model.missing import MIN_SEEN, CompletedShapes, ObservedMeshes, complete
 from shapespace.model.pca import PrincipalComponents, principal_components
 from shapespace.model.representation import REPRESENTATIONS, Representation, Vertices, representation_named
 from shapespace.model.spurious import below_precision, made_by_alignment, rounding_mm
@@ -144,7 +144,9 @@ class ShapeModel:
         _refuse_impossible(stddev, checked.vertices)
         object.__setattr__(self, "faces", checked.faces)
         self.landmarks.check(len(checked.vertices))
-        regions = {str(name): region_vertices(at, len(checked.vertices), name) for name, at in self.regions.items()}
+        regions = {
+            str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
+        }
         object.__setattr__(self, "regions", MappingProxyType(regions))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -240,23 +242,12 @@ class ShapeModel:
         meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
         faces = common_faces(meshes)
         if not kind.takes_holes and len(meshes) > 1:
-            kept = Kept.of(meshes, min_seen)
-            meshes, landmarks = kept.meshes, kept.landmarks(landmarks or {})
-            faces, alignment_vertices = meshes[0].faces, kept.indices(alignment_vertices)
+            observed = ObservedMeshes.of(meshes, min_seen)
+            meshes, landmarks = observed.meshes, observed.landmarks(landmarks or {})
+            faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
         shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
         rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
-        if align:
-            for shape, name in zip(shapes, names, strict=True):
-                refuse_without_extent(shape, name)
-        completed = None
-        if np.isnan(shapes).any():
-            completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
-            shapes = completed.shapes
-        elif align:
-            align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-            # Where only some vertices carried the alignment, the size of the others is shape.
-            if gauge == "shape" and alignment_vertices is None:
-                scale_to_tangent(shapes)
+        shapes, completed = _aligned(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
         coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), control_points)
         if completed is not None:
             pc = completed.components(modes, seed)
@@ -312,21 +303,21 @@ class ShapeModel:
             InputError: shapes of another model, or what `fit` refuses.
             FileError: there are no shapes, or the disk is full.
         """
-        kept = KeptShapes.load(shapes)
-        if kept.model_hash != self.content_hash:
+        training = KeptShapes.load(shapes)
+        if training.model_hash != self.content_hash:
             raise InputError(
                 f"The shapes in {shapes} are those of another model; give the model that was built with them."
             )
         if not len(meshes):
             raise InputError("There are no meshes to be added; give at least one.")
-        kept.check()
+        training.check()
         stream = aligned_on_disk(
             meshes,
-            kept.gauge,
-            align=kept.align,
-            alignment_vertices=kept.alignment_vertices,
+            training.gauge,
+            align=training.align,
+            alignment_vertices=training.alignment_vertices,
             scratch=scratch,
-            onto=kept,
+            onto=training,
             modes=modes,
             tell=tell,
         )
@@ -348,15 +339,15 @@ class ShapeModel:
         about: Mapping[str, Any],
     ) -> ShapeModel:
         with stream as aligned:
-            told = aligned.kept
+            training = aligned.kept
             model = cls._of_components(
                 aligned.components(modes, seed, tell),
                 Vertices(),
-                rounding=told.rounding,
-                align=told.align,
-                alignment_vertices=told.alignment_vertices,
-                faces=told.faces,
-                gauge=told.gauge,
+                rounding=training.rounding,
+                align=training.align,
+                alignment_vertices=training.alignment_vertices,
+                faces=training.faces,
+                gauge=training.gauge,
                 **about,
             )
             if keep_shapes is not None:
@@ -438,8 +429,8 @@ class ShapeModel:
 
         Tipping and Bishop, JRSS B 61(3), 1999. It counts what a representation cannot hold of how shapes vary.
         """
-        kept = float((self.stddev**2).sum())
-        return max(self.total_variance - kept, 0.0) / max(3 * self.n_vertices - self.n_modes, 1)
+        of_modes = float((self.stddev**2).sum())
+        return max(self.total_variance - of_modes, 0.0) / max(3 * self.n_vertices - self.n_modes, 1)
 
     @cached_property
     def cumulative_variance(self) -> FloatArray:
@@ -587,8 +578,10 @@ class ShapeModel:
             with np.errstate(all="ignore"):  # huge numbers overflow on the way to being refused
                 model = cls(**fields)
         except InputError as error:
-            said = str(error)[:_TOLD]
-            raise ModelFileError(f"{path} is a shapespace model whose parts do not belong together: {said}") from error
+            message = str(error)[:_TOLD]
+            raise ModelFileError(
+                f"{path} is a shapespace model whose parts do not belong together: {message}"
+            ) from error
         _FILES[model] = Path(path).absolute()
         return model
 
@@ -645,6 +638,28 @@ class ShapeModel:
         return array
 
 
+def _aligned(
+    shapes: FloatArray, names: Sequence[str], gauge: Gauge, *, align: bool, alignment_vertices: IntArray | None
+) -> tuple[FloatArray, CompletedShapes | None]:
+    """Return the training shapes (N, V, 3) aligned and complete, and how they were completed; `shapes` is overwritten.
+
+    Raises:
+        InputError: a shape has no extent, or too little of it is observed.
+    """
+    if align:
+        for shape, name in zip(shapes, names, strict=True):
+            refuse_without_extent(shape, name)
+    if np.isnan(shapes).any():
+        completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
+        return completed.shapes, completed
+    if align:
+        align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
+        # Where only some vertices carried the alignment, the size of the others is shape.
+        if gauge == "shape" and alignment_vertices is None:
+            scale_to_tangent(shapes)
+    return shapes, None
+
+
 def _components(data: FloatArray, modes: int | float | Literal["auto"] | None, seed: int) -> PrincipalComponents:
     return principal_components(data, choose_modes(data, seed=seed).modes if modes == "auto" else modes)
 
@@ -675,12 +690,12 @@ def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntA
     Raises:
         InputError: there are none, or one that a model of `n_vertices` does not have.
     """
-    found = np.unique(np.asarray(vertices, dtype=np.int64))
-    if found.ndim != 1 or not len(found) or found[0] < 0 or found[-1] >= n_vertices:
+    unique = np.unique(np.asarray(vertices, dtype=np.int64))
+    if unique.ndim != 1 or not len(unique) or unique[0] < 0 or unique[-1] >= n_vertices:
         raise InputError(
             f"The region {name!r} needs vertices from 0 to {n_vertices - 1}, which the model has; give some of those."
         )
-    region = found.astype(np.int32)
+    region = unique.astype(np.int32)
     region.setflags(write=False)
     return region
 

@@ -51,17 +51,19 @@ def rounding_mm(vertices: FloatArray) -> float:
 
     They may have been written in any unit, as decimals or in single precision.
     """
-    found = 0.0
+    rounding = 0.0
     for mm in MM_PER_UNIT.values():
         y = vertices / mm
         near = np.maximum(np.abs(y), 1e-300) * _ROUNDING
         for decimals in range(_MOST_DECIMALS + 1):
             step = 10.0**-decimals
             if (np.abs(y - np.rint(y / step) * step) <= near + _ROUNDING).all():
-                found = max(found, step * mm / np.sqrt(12.0))
+                rounding = max(rounding, step * mm / np.sqrt(12.0))
                 break
         with np.errstate(over="ignore"):  # absurd coordinates are in no single precision
             single = y.astype(np.float32)
         if (np.abs(y - single) <= near).all():
-            found = max(found, float(np.sqrt((np.spacing(np.abs(single)).astype(np.float64) ** 2).mean() / 12.0)) * mm)
-    return found
+            rounding = max(
+                rounding, float(np.sqrt((np.spacing(np.abs(single)).astype(np.float64) ** 2).mean() / 12.0)) * mm
+            )
+    return rounding

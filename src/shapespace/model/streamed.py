@@ -119,22 +119,22 @@ class KeptShapes:
             )
         try:
             arrays = read_arrays(path) or {}
-            told = json.loads(str(arrays["told"]))
+            header = json.loads(str(arrays["told"]))
             shape = arrays["template"].shape
             if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
                 raise ValueError
             return KeptShapes(
                 folder=folder,
-                model_hash=str(told["model_hash"]),
-                digest=str(told["digest"]),
+                model_hash=str(header["model_hash"]),
+                digest=str(header["digest"]),
                 faces=arrays.get("faces"),
                 template=arrays["template"],
                 reference=arrays["reference"],
                 sizes=arrays["sizes"],
-                gauge=cast(Gauge, told["gauge"]),
-                align=bool(told["align"]),
+                gauge=cast(Gauge, header["gauge"]),
+                align=bool(header["align"]),
                 alignment_vertices=arrays.get("alignment_vertices"),
-                rounding=float(told["rounding"]),
+                rounding=float(header["rounding"]),
             )
         except (ValueError, KeyError, TypeError) as error:
             raise FileFormatError(
@@ -147,11 +147,11 @@ class KeptShapes:
         Raises:
             FileError: the disk is full.
         """
-        told = {name: getattr(self, name) for name in ("model_hash", "digest", "gauge", "align", "rounding")}
+        header = {name: getattr(self, name) for name in ("model_hash", "digest", "gauge", "align", "rounding")}
         arrays = {"template": self.template, "reference": self.reference, "sizes": self.sizes}
         optional = {"faces": self.faces, "alignment_vertices": self.alignment_vertices}
         there = {name: array for name, array in optional.items() if array is not None}
-        write_arrays(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(told))})
+        write_arrays(self.folder / _KEPT, {**arrays, **there, "told": np.array(json.dumps(header))})
 
     def check(self) -> None:
         """Refuse shapes that have changed since they were kept.
@@ -275,7 +275,7 @@ def aligned_on_disk(
         FileError: a mesh cannot be read, the disk is full, or another build uses the folder.
     """
     with _folder(scratch) as folder:
-        work = _Work(folder, meshes, gauge, align, alignment_vertices, onto, tell)
+        work = _Work(folder, meshes, gauge, align, alignment_vertices, onto=onto, tell=tell)
         if modes != "auto":
             checked_large_modes(modes, work.count, work.first.vertices.size)
         path = folder / _SHAPES
@@ -477,7 +477,7 @@ class _Work:
         poses = Poses(np.broadcast_to(np.eye(3), (self.count, 3, 3)).copy(), np.zeros((self.count, 3)))
         if self.align:
             source = Streamed(shapes.row_blocks, self.count, template, near["posed"])
-            found, poses = align_streamed(
+            alignment, poses = align_streamed(
                 source,
                 self.gauge,
                 size=float(near["sizes"].mean()),
@@ -485,7 +485,7 @@ class _Work:
                 alignment_vertices=self.alignment_vertices,
                 on_iteration=lambda n, moved: self.tell(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
             )
-            mean = found.mean
+            mean = alignment.mean
             if self.gauge == "shape" and self.alignment_vertices is None:
                 self.tell("scaling to the tangent")
                 mean = scale_to_tangent_streamed(source, mean, poses)
@@ -498,9 +498,9 @@ class _Work:
 
     def _move(self, shapes: Spill, template: FloatArray, poses: Poses) -> None:
         """Turn differences from `template` in the file into those of the posed shapes from their mean."""
-        for at, block in shapes.row_blocks():
+        for start, block in shapes.row_blocks():
             vertices = block.reshape(len(block), -1, 3) + template
-            shapes.write_rows(at, (poses.apply(at, vertices) - self.template).reshape(len(block), -1))
+            shapes.write_rows(start, (poses.apply(start, vertices) - self.template).reshape(len(block), -1))
 
 
 class _Spread:

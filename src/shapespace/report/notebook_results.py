@@ -18,7 +18,7 @@ from shapespace.types import Mesh
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
-    from shapespace.correspondence.rounds import Correspondence
+    from shapespace.correspondence.result import Correspondence
     from shapespace.geometry.volume_surface import VolumeSurface
     from shapespace.model.additive import AdditiveModel
     from shapespace.statistics.answer import Answer

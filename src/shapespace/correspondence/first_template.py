@@ -1,0 +1,117 @@
+"""The template of the first round: a mesh that the user gives, the mean of a model, or one of the scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapespace.correspondence.landmarks import contradicts_most, without_stray_landmarks
+from shapespace.correspondence.scans import copies
+from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondSettings
+from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
+from shapespace.errors import InputError, MeshError
+from shapespace.geometry.doctor import repair
+from shapespace.geometry.surface import rms_size
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import Mesh, Similarity
+
+
+@dataclass(frozen=True, eq=False)
+class FirstTemplate:
+    """The input of the first round.
+
+    Args:
+        mesh: the template, of the size `SIZE`, about the origin.
+        origin: where it comes from, in a sentence.
+        repaired: the scans that can be used, by their number.
+        broken: why the others cannot.
+        guide: a model whose mean is the template, of the same size and place.
+    """
+
+    mesh: Mesh
+    origin: str
+    repaired: Mapping[int, Mesh]
+    broken: Mapping[int, str]
+    guide: ShapeModel | None = None
+
+
+def first_template(
+    scans: Sequence[Mesh],
+    template: Mesh | None,
+    settings: CorrespondSettings,
+    model: ShapeModel | None = None,
+) -> FirstTemplate:
+    """Return the input of the first round: `template` as it is, the mean of `model`, or the scan nearest to the others.
+
+    Raises:
+        InputError: fewer than two scans, scans that are all equal, or both a template and a model.
+        MeshError: no scan can be a template, or the template or model has no triangles.
+    """
+    if len(scans) < FEWEST:
+        raise InputError(f"A correspondence needs at least {FEWEST} scans, not {len(scans)}; give more.")
+    if not 0 < settings.landmark_uncertainty < np.inf:
+        raise InputError(f"Landmarks have an uncertainty above 0, not {settings.landmark_uncertainty}; give another.")
+    if template is not None and model is not None:
+        raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
+    repaired, broken = _repaired(scans)
+    if len(repaired) < FEWEST:
+        raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
+    if len(copies(list(repaired.values()))) == len(repaired) - 1:
+        raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different ones.")
+    if model is not None:
+        mesh, origin = _mean_of(model), "The template is the mean of the model given."
+    elif template is not None:
+        mesh = without_stray_landmarks(check_template(template))
+        origin = f"{template.name} was given as the template."
+    else:
+        mesh, origin = _chosen_scan(repaired, settings)
+    scale = SIZE / rms_size(mesh.vertices)
+    T = Similarity(scale, np.eye(3), -scale * mesh.vertices.mean(axis=0))
+    mesh = mesh.with_vertices(T.apply(mesh.vertices), {name: T.apply(point) for name, point in mesh.landmarks.items()})
+    if contradicts_most(mesh, repaired.values(), settings.landmark_uncertainty):
+        mesh = mesh.with_vertices(mesh.vertices, {})
+        origin += " Its landmarks contradict those of most scans, so the first round goes without them."
+    return FirstTemplate(mesh, origin, repaired, broken, None if model is None else _transformed(model, T))
+
+
+def _repaired(scans: Sequence[Mesh]) -> tuple[dict[int, Mesh], dict[int, str]]:
+    repaired: dict[int, Mesh] = {}
+    broken: dict[int, str] = {}
+    for i, scan in enumerate(scans):
+        try:
+            repaired[i] = without_stray_landmarks(repair(scan)[0])
+        except MeshError as error:
+            broken[i] = f"broken: {error}"
+    return repaired, broken
+
+
+def _mean_of(model: ShapeModel) -> Mesh:
+    if model.faces is None:
+        raise MeshError("The model has no triangles, and a template needs them; leave it out, or give another.")
+    return Mesh(model.mean_vertices, model.faces, model.landmarks.positions(model.mean_vertices), "mean")
+
+
+def _chosen_scan(scans: Mapping[int, Mesh], settings: CorrespondSettings) -> tuple[Mesh, str]:
+    """Return the scan nearest to the others, meshed evenly, and why it is that one."""
+    choice = choose_template(list(scans.values()), settings.seed)
+    chosen = scans[list(scans)[choice.index]]
+    mesh = resample(clean_scan(chosen), settings.vertices)
+    origin = (
+        f"{chosen.name} is the first template: of {np.isfinite(choice.nearness).sum()} candidates it lies nearest "
+        f"to the others, {100 * choice.nearness[choice.index]:.1f} % of its size off after a smooth change."
+    )
+    return mesh.with_vertices(mesh.vertices, chosen.landmarks), origin
+
+
+def _transformed(model: ShapeModel, T: Similarity) -> ShapeModel:
+    """Return `model` with its frame moved by `T`, which does not rotate."""
+    return ShapeModel(
+        mean=T.apply(model.mean_vertices).ravel(),
+        basis=model.vertex_basis,
+        stddev=T.scale * model.stddev,
+        total_variance=T.scale**2 * model.total_variance,
+        n_training=model.n_training,
+        faces=model.faces,
+    )

@@ -1,0 +1,82 @@
+"""The result of a correspondence: one surface for each scan, or the reason why the scan is excluded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shapespace.lazy import lazy_import
+from shapespace.reprs import short_repr
+from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
+
+
+@dataclass(frozen=True, eq=False)
+class Corresponding:
+    """One scan after the last round.
+
+    Args:
+        name: of the scan.
+        reason: why it is excluded; empty where it is not.
+        vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
+            estimates, the conditional means given the observed vertices; None if excluded.
+        T_scan_template: to the scan's own frame; None where no pose was found.
+        seen: share of the template's vertices that the scan observes.
+        covered: share of the scan that the template covers.
+        distance: (4,) mean, 95 %, 99 % and largest distance both ways over the overlap, in the scan's unit.
+        moved: RMS by which its vertices moved in each round, shares of its size.
+        seconds: CPU time of each round.
+        landmarks: RMS distance of the scan's landmarks from their places on the surface, in the scan's unit;
+            not-a-number where it has none.
+        observed: (V,) bool, False where `vertices` are estimates; None if excluded.
+    """
+
+    name: str
+    reason: str
+    vertices: FloatArray | None = None
+    T_scan_template: Similarity | None = None
+    seen: float = 0.0
+    covered: float = 0.0
+    distance: tuple[float, float, float, float] = (np.nan, np.nan, np.nan, np.nan)
+    moved: tuple[float, ...] = ()
+    seconds: tuple[float, ...] = ()
+    landmarks: float = np.nan
+    observed: BoolArray | None = None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """Scans in correspondence.
+
+    Args:
+        template: the mean shape of the last round, in mm of `SIZE`, with the landmarks that scans have.
+        scans: in the order given.
+        why: where the first template came from, in a sentence.
+        moved: RMS movement in each round, share of the size.
+        landmarks: the landmarks that scans have, on each of the surfaces.
+    """
+
+    template: Mesh
+    scans: tuple[Corresponding, ...]
+    why: str
+    moved: tuple[float, ...]
+    landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        return lazy_import("html_of_correspondence")(self)
+
+    def meshes(self) -> list[Mesh]:
+        """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.
+
+        They have the landmarks in whose triangles all vertices are observed.
+        """
+        return [self._mesh(scan, scan.vertices) for scan in self.scans if scan.vertices is not None]
+
+    def _mesh(self, scan: Corresponding, vertices: FloatArray) -> Mesh:
+        observed = np.ones(len(vertices), dtype=np.bool_) if scan.observed is None else scan.observed
+        landmarks = self.landmarks.within(observed).positions(vertices)
+        return Mesh(vertices, self.template.faces, landmarks, scan.name, observed=scan.observed)

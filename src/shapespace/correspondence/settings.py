@@ -1,0 +1,50 @@
+"""Settings of a correspondence, and the unit of its lengths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from shapespace.correspondence.register import ElasticSettings
+
+SIZE = 100.0
+"""The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
+FEWEST = 2
+"""Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
+
+
+@dataclass(frozen=True)
+class CorrespondSettings:
+    """How scans are brought into correspondence; lengths are shares of the object's size (RMS from its centroid).
+
+    Args:
+        vertices: approximate number of vertices of the template, if it is one of the scans.
+        rounds: maximum number of rounds.
+        settled: a round that moves vertices by less (RMS over all) is the last.
+        first: settings of the elastic registration in round 1.
+        next: the same in later rounds, which begin at the leave-one-out predictions.
+        guided: whether later rounds begin at the leave-one-out predictions, or at the mean.
+        noise_share: noise variance of a prediction, as a share of a mode's mean variance.
+        fewest_seen: smallest share of the template that a scan must observe.
+        fewest_covered: smallest share of a scan that the template must cover.
+        outlier_threshold: scans whose distance from their leave-one-out prediction is beyond this many times the median
+            are excluded as other objects.
+        symmetric: the object is its own mirror image: the template is made symmetric, and a scan is also predicted from
+            the mirror images of the other scans.
+        landmark_uncertainty: standard deviation of the landmarks, as a share of the object's size (RMS distance from
+            its centre).
+        seed: random seed.
+    """
+
+    vertices: int = 10_000
+    rounds: int = 3
+    settled: float = 0.002
+    first: ElasticSettings = field(default_factory=ElasticSettings)
+    next: ElasticSettings = field(default_factory=ElasticSettings)
+    guided: bool = True
+    noise_share: float = 1.0
+    fewest_seen: float = 0.4
+    fewest_covered: float = 0.6
+    outlier_threshold: float = 3.0
+    symmetric: bool = False
+    landmark_uncertainty: float = 0.02
+    seed: int = 0
