@@ -51,7 +51,7 @@ MOST_ANALYSES = 12
 _MOST_PARTS, _MOST_TEXT = 120, 400
 _PART_BYTES = 700_000
 _MOST_NOTES = 40
-_BESIDE = ("confusion", "calibration", "learning_curve", "modes", "face_map", "curve", "histogram")
+_BESIDE = ("confusion", "calibration", "learning_curve", "curve", "histogram")
 """Kinds of parts that share the page's width with their neighbour; the views of a surface map need all of it."""
 _CHAPTER = 2
 _T = TypeVar("_T")

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
-from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.report import sections
-from shapespace.report.blocks import Block, Cell, Column, Figure, Folded, Notice, Table, Text, length
+from shapespace.errors import FileFormatError
+from shapespace.report.blocks import Block, Cell, Column, Figure, Folded, Table, Text, length
 from shapespace.report.page import Page
 from shapespace.report.saved import Folder
 from shapespace.report.wording import DASH, counted, listed, percent
@@ -24,17 +23,11 @@ from shapespace.schemas import (
     CalibrationPart,
     ConfusionPart,
     CurvePart,
-    FaceMapPart,
     HistogramPart,
     LearningCurvePart,
-    LinesPart,
-    MeshesPart,
-    ModesPart,
     MorphPart,
     Part,
-    Point,
     Recognition,
-    Still,
     SurfaceMapPart,
     TableColumn,
     TablePart,
@@ -44,7 +37,7 @@ from shapespace.schemas import (
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
-    from shapespace.report.figures import Coefficients
+    pass
 
 
 @dataclass(frozen=True)
@@ -88,10 +81,6 @@ TITLES = {
     "confusion": "Confusion matrix",
     "calibration": "Calibration",
     "learning_curve": "Learning curve",
-    "modes": "Modes that carry the decision",
-    "face_map": "Regions of the face that carry the decision",
-    "lines": "Lines through neutral",
-    "meshes": "Meshes",
     "curve": "Curve",
     "surface_map": "Map",
     "morph": "From one shape to the other",
@@ -212,77 +201,6 @@ class StudyParts:
         about = "Accuracy on subjects who were not in the training set, by the number of training subjects."
         return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
 
-    def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
-        """Return how much each mode carries of the decision."""
-        from shapespace.report import figures
-
-        values, unit = part.importance, part.unit
-        figure = figures.importance_figure(values, part.names, unit=unit)
-        called = part.names or [f"mode {k + 1}" for k in range(len(values))]
-        ranked = sorted(zip(values, called, strict=True), key=lambda pair: -pair[0])
-        told = listed([f"{name} {value:.3g}" for value, name in ranked[:10]])
-        alt = f"Importance of {counted(len(values), 'mode')} in {unit}, the largest: {told}"
-        return [self.drawn((figure, f"How much each mode carries of the decision, in {unit}.", alt), note)]
-
-    def face_map(self, part: FaceMapPart, title: str, note: str) -> list[Block]:
-        """Return where on the face the decision lies, and the share of each region."""
-        from shapespace.report import figures
-
-        vertices, faces, values = self._arrays(part.arrays, (part.vertices, part.faces, part.values))
-        numbers = all(array.dtype.kind in "iuf" for array in (vertices, values))
-        if not numbers or faces.dtype.kind not in "iu" or vertices.ndim != 2 or not np.isfinite(vertices).all():
-            raise self.kept.wrong("the arrays of a map are no places, triangles and numbers")
-        shares = sorted(part.regions.items(), key=lambda item: -item[1])
-        figure = figures.face_map_figure(vertices.astype(float), faces, values, unit=part.unit, regions=dict(shares))
-        told = listed([f"{name} {percent(share)}" for name, share in shares], 30)
-        alt = f"The face from the front and from aside, coloured by {part.unit}{f'; by region: {told}' if told else ''}"
-        out: list[Block] = [
-            self.drawn((figure, f"Where on the face the decision lies: {part.unit}.", alt), note, chart=False)
-        ]
-        if shares:
-            rows = [[Cell(name), Cell(f"{100 * share:.1f} %", share)] for name, share in shares[:MOST_ROWS]]
-            heads = [Column("Region"), Column("Share of the decision", "number")]
-            out.append(Folded("The shares as a table", [Table(heads, rows, title)]))
-        return out
-
-    def lines(self, part: LinesPart, title: str, note: str) -> list[Block]:
-        """Return the lines of the expressions in the first coefficients (figures 9 and 10 of the paper)."""
-        points = [_coefficients(point, self.kept) for point in part.points]
-        neutral = _coefficients(part.neutral, self.kept) if part.neutral else None
-        if not points or len({len(point.b) for point in (*points, *([neutral] if neutral else []))}) != 1:
-            raise self.kept.wrong(
-                "the points of lines must be one or more, all with as many coefficients as the neutral face"
-            )
-        lines = sections.lines_through_neutral(self.page, points, neutral)
-        return [*([Text(note)] if note else []), lines]
-
-    def meshes(self, part: MeshesPart, title: str, note: str) -> list[Block]:
-        """Return stills of meshes in rows; one that cannot be read leaves a grey field and says why."""
-        from shapespace.report import figures
-
-        problems: list[str] = []
-
-        def mesh(entry: Still) -> Mesh | None:
-            try:
-                found = self.folder.mesh(entry.file)
-                if not len(found.vertices) or not np.isfinite(found.vertices).all():
-                    raise self.kept.wrong(f"the mesh {entry.file!r} has no vertices, or some that are not finite")
-                return found
-            except ShapespaceError as error:
-                problems.append(f"{entry.label}: {error}")
-                return None
-
-        rows = [(row.label, [(entry.label, mesh(entry)) for entry in row.meshes]) for row in part.rows]
-        if problems and len(problems) == sum(len(pictures) for _, pictures in rows):
-            return [Notice("None of these meshes can be shown", problems, "broken")]
-        told = [f"{heading}: {listed([label for label, _ in pictures])}" for heading, pictures in rows]
-        drawing = (
-            figures.mesh_rows_figure(rows, title=title),
-            "One camera, one light and one scale for all.",
-            "; ".join(told)[:MOST_PARAGRAPH] or title,
-        )
-        return [self.drawn(drawing, note, chart=False), Notice("Not in the picture", problems, "broken")]
-
     def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
         """Return one measure against another."""
         from shapespace.report import figures
@@ -395,16 +313,6 @@ def paragraphs(said: str | tuple[str, ...]) -> list[Block]:
 
 def _known(values: Sequence[float | None]) -> list[float]:
     return [float("nan") if value is None else value for value in values]
-
-
-def _coefficients(point: Point, kept: Kept) -> Coefficients:
-    from shapespace.report.figures import Coefficients
-
-    if len(point.b) != len(point.z):
-        raise kept.wrong(
-            f"a point of lines has {len(point.b)} coefficients in mm but {len(point.z)} in standard deviations"
-        )
-    return Coefficients(point.label, point.expression, point.intensity or 0.0, np.array(point.b), np.array(point.z))
 
 
 def _cell(value: object, column: TableColumn, kept: Kept) -> Cell:
