@@ -198,7 +198,7 @@ def where(maker: Maker) -> None:
     t: FloatArray = np.concatenate([np.zeros(a.shape), e], axis=1)
     basis = _basis_of_codes(model)
     decision = evaluate.decision_map(basis, np.ones(model.shape.n_modes), t, training.expression.tolist())
-    regions = _regions(study)
+    shares = evaluate.region_shares(decision, _regions(study))
     faces: IntArray = model.shape.faces if model.shape.faces is not None else np.zeros((0, 3), dtype=np.int32)
     memory = io.BytesIO()
     np.savez(memory, vertices=model.shape.mean_vertices, faces=faces, decision=decision)
@@ -217,7 +217,7 @@ def where(maker: Maker) -> None:
         parts.table(
             "Share of the decision by region",
             [("Region", "text"), ("Share", "percent")],
-            sorted(evaluate.region_shares(decision, regions).items(), key=lambda item: -item[1]),
+            [(name, shares[name]) for name in sorted(shares, key=lambda name: -shares[name])],
         ),
     ]  # fmt: skip
 

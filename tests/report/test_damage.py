@@ -71,7 +71,10 @@ def test_a_demo_or_a_study_damaged_anywhere_ends_in_a_page_or_one_sentence(
     for key in ("experiment1", "experiment2"):
         shutil.copytree(demo_template / key, tmp_path / key, ignore=shutil.ignore_patterns("*.npz", "*.h5", "*.ply"))
     (tmp_path / "demo.json").write_text(json.dumps(damaged(damaged(demo, rng), rng)))
-    assert "Experiment 1" in Page(write_report(tmp_path).read_text(encoding="utf-8")).headings
+    try:
+        assert "Experiment 1" in Page(write_report(tmp_path).read_text(encoding="utf-8")).headings
+    except ShapespaceError as error:
+        assert "demo.json" in str(error)
     study = tmp_path / "study"
     study.mkdir()
     content = {key: value for key, value in contents().items() if key != "parts"}
