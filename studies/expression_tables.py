@@ -16,7 +16,7 @@ from shapespace.model.additive import AdditiveModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.hierarchy import FaceTypes
-from shapespace.schemas import FaceMapPart, ModesPart
+from shapespace.schemas import SurfaceMapPart
 from shapespace.study import parts
 from shapespace.study.parts import target, words
 from shapespace.types import FloatArray, IntArray
@@ -198,22 +198,26 @@ def where(maker: Maker) -> None:
     t: FloatArray = np.concatenate([np.zeros(a.shape), e], axis=1)
     basis = _basis_of_codes(model)
     decision = evaluate.decision_map(basis, np.ones(model.shape.n_modes), t, training.expression.tolist())
-    regions = _regions(study)
+    shares = evaluate.region_shares(decision, _regions(study))
     faces: IntArray = model.shape.faces if model.shape.faces is not None else np.zeros((0, 3), dtype=np.int32)
     memory = io.BytesIO()
     np.savez(memory, vertices=model.shape.mean_vertices, faces=faces, decision=decision)
     write_bytes(study.folder / "recognition.npz", memory.getvalue())
     maker.parts += [
-        ModesPart(
-            title="Which modes carry the decision",
-            importance=tuple(round(100 * float(x), 3) for x in loss),
-            names=tuple(f"e{k + 1}" for k in range(len(loss))),
-            unit="points of accuracy lost when the mode is shuffled",
-            note="Means over the folds, whose models number their modes alike only about.",
+        parts.table(
+            "Modes that carry the decision",
+            [("Mode", "text"), ("Points of accuracy lost when the mode is shuffled", "number")],
+            [(f"e{k + 1}", round(100 * float(loss[k]), 3)) for k in np.argsort(-loss)[:20]],
+            "Means over the folds, whose models number their modes alike only about; the 20 largest.",
         ),
-        FaceMapPart(
-            title="Which parts of the face carry the decision", arrays="recognition.npz", values="decision",
-            unit="variance between expressions over variance within", regions=evaluate.region_shares(decision, regions),
+        SurfaceMapPart(
+            title="Parts of the face that carry the decision", arrays="recognition.npz", values="decision",
+            unit="variance between expressions over variance within", signed=False,
+        ),
+        parts.table(
+            "Share of the decision by region",
+            [("Region", "text"), ("Share", "percent")],
+            [(name, shares[name]) for name in sorted(shares, key=lambda name: -shares[name])],
         ),
     ]  # fmt: skip
 

@@ -13,7 +13,7 @@ from shapespace.io.files import make_folder
 from shapespace.io.meshes import write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.recognise import evaluate
-from shapespace.schemas import MeshesPart, Part, RowOfMeshes, Still
+from shapespace.schemas import Part, TextPart
 from shapespace.study import parts
 from shapespace.study.parts import target, words
 from shapespace.types import FloatArray
@@ -208,28 +208,18 @@ def transfer(maker: Maker) -> None:
     usable = faces.usable
     names = np.unique(faces.subject[usable])[:3]
     folder = make_folder(study.folder / "transfer")
-    rows: list[RowOfMeshes] = []
     source = str(names[0])
+    files: list[str] = []
     for expression in ("smile", "surprise"):
-        meshes: list[Still] = []
-        taken = (faces.subject == source) & (faces.expression == expression) & (level == level.max()) & usable
-        if not taken.any():
-            continue
+        strongest = (faces.subject == source) & (faces.expression == expression) & (level == level.max()) & usable
         for name in names:
-            own = (faces.subject == name) & (faces.expression == "neutral") & usable
-            if not own.any():
-                continue
-            path = folder / f"{expression}_on_{name}.ply"
-            write_mesh(path, model.transfer(faces.z[own][0], faces.z[taken][0]))
-            meshes.append(Still(label=str(name), file=f"transfer/{path.name}"))
-        rows.append(RowOfMeshes(label=f"{expression} of {source}", meshes=tuple(meshes)))
-    maker.parts.append(
-        MeshesPart(
-            title="One person's expression put on others",
-            rows=tuple(rows),
-            note="From fits of raw scans: identity of one, expression of another.",
-        )
-    )
+            neutral = (faces.subject == name) & (faces.expression == "neutral") & usable
+            if strongest.any() and neutral.any():
+                path = folder / f"{expression}_on_{name}.ply"
+                write_mesh(path, model.transfer(faces.z[neutral][0], faces.z[strongest][0]))
+                files.append(f"transfer/{path.name}")
+    text = f"From fits of raw scans: the identity of one person, the expression of {source}: {', '.join(files)}."
+    maker.parts.append(TextPart(title="One person's expression put on others", text=text))
 
 
 def _unit(codes: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from shapespace.recognise.line_structure import (
     line_scores,
     pooled_line_scores,
 )
-from shapespace.schemas import LinesPart, Part, Point, TextPart
+from shapespace.schemas import CurvePart, Part, Series, TextPart
 from shapespace.study import parts
 from shapespace.study.parts import target, words
 from shapespace.types import IntArray
@@ -209,14 +209,15 @@ def paper(maker: Maker) -> None:
     maker.parts += [
         _of_lines(lines, pooled, status),
         _of_apartness(apart),
-        LinesPart(
-            title="The lines of figures 9 and 10",
-            points=tuple(
-                Point(label=f"{name} {100 * level:.0f} %", expression=name, intensity=level, b=own.tolist(),
-                      z=(own / stddev).tolist())
-                for (name, level), own in zip(shown, b[1:], strict=True)
+        CurvePart(
+            title="The lines of figure 9",
+            x="first coefficient (mm)",
+            y="second coefficient (mm)",
+            series=tuple(
+                Series(label=name, x=line[:, 0].tolist(), y=line[:, 1].tolist())
+                for name in PAPER_EXPRESSIONS
+                for line in (np.concatenate([b[:1], b[1:][[x == name for x in labels]]]),)
             ),
-            neutral=Point(b=b[0].tolist(), z=(b[0] / stddev).tolist()),
         ),
     ]  # fmt: skip
 

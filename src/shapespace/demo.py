@@ -87,8 +87,8 @@ class _Clock:
         self.seconds: dict[str, float] = {}
         self._since = time.perf_counter()
 
-    def step(self, what: str) -> None:
-        self.bar.set_description(what)
+    def step(self, description: str) -> None:
+        self.bar.set_description(description)
         self.bar.update()
 
     def lap(self, part: str) -> None:
@@ -464,10 +464,10 @@ def _claim(folder: Path, case: Case) -> Claim:
 
 def _to_scan(folder: Path, fit: FitEntry) -> dict[str, VertexErrors]:
     """Return the distances from the model to the scan by stage, mm."""
-    found = {stage: both.model_to_scan for stage, both in _record(folder, fit).distances_mm.items()}
+    distances = {stage: both.model_to_scan for stage, both in _record(folder, fit).distances_mm.items()}
     return {
         stage: VertexErrors(mean=one.mean or 0.0, rms=one.rms or 0.0, max=one.max or 0.0)
-        for stage, one in found.items()
+        for stage, one in distances.items()
     }
 
 
@@ -476,10 +476,10 @@ def _truth(error_mm: float | np.floating, floor_mm: float | np.floating) -> str:
 
 
 def _versions(packages: Sequence[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for package in packages:
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "absent"
-    return found
+            versions[package] = "absent"
+    return versions

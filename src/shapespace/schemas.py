@@ -640,62 +640,6 @@ class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
     ceiling: float | None = None
 
 
-class ModesPart(Part, frozen=True, kw_only=True, tag="modes"):
-    """How much each mode carries of the decision, in `unit`."""
-
-    importance: tuple[float, ...]
-    names: tuple[str, ...] = ()
-    unit: str = "importance"
-
-
-class FaceMapPart(Part, frozen=True, kw_only=True, tag="face_map"):
-    """A surface in an .npz file with a value a vertex, and the share of each region."""
-
-    arrays: str
-    vertices: str = "vertices"
-    faces: str = "faces"
-    values: str = "values"
-    unit: str = "share of the decision"
-    regions: Mapping[str, float] = {}
-
-
-class Point(Struct, frozen=True, kw_only=True):
-    """Coefficients of one scan, in mm and in standard deviations."""
-
-    b: tuple[float, ...]
-    z: tuple[float, ...]
-    label: str = ""
-    expression: str = ""
-    intensity: float | None = None
-
-
-class LinesPart(Part, frozen=True, kw_only=True, tag="lines"):
-    """Expressions as lines through the neutral face."""
-
-    points: tuple[Point, ...]
-    neutral: Point | None = None
-
-
-class Still(Struct, frozen=True, kw_only=True):
-    """A mesh in a file."""
-
-    file: str
-    label: str = ""
-
-
-class RowOfMeshes(Struct, frozen=True, kw_only=True):
-    """Meshes that stand beside each other."""
-
-    meshes: tuple[Still, ...]
-    label: str = ""
-
-
-class MeshesPart(Part, frozen=True, kw_only=True, tag="meshes"):
-    """Stills of meshes in rows."""
-
-    rows: tuple[RowOfMeshes, ...]
-
-
 class Series(Struct, frozen=True, kw_only=True):
     """One line of a curve, with a band around it where there is one; `points` are dots without a line."""
 
@@ -785,8 +729,8 @@ class HistogramPart(Part, frozen=True, kw_only=True, tag="histogram"):
 
 
 _PARTS = (
-    TextPart | TablePart | ConfusionPart | CalibrationPart | LearningCurvePart | ModesPart | FaceMapPart | LinesPart
-    | MeshesPart | CurvePart | SurfaceMapPart | MorphPart | HistogramPart
+    TextPart | TablePart | ConfusionPart | CalibrationPart | LearningCurvePart | CurvePart | SurfaceMapPart | MorphPart
+    | HistogramPart
 )  # fmt: skip
 PARTS: Mapping[str, type[Part]] = {str(kind.__struct_config__.tag): kind for kind in get_args(_PARTS)}
 """What a part is, by its kind."""

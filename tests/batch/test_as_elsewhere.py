@@ -26,9 +26,6 @@ POSIX_ONLY = {
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
     ("model/streamed.py", "fcntl"): "Windows refuses to remove open files",
     ("viewer/fitting.py", "nice"): "elsewhere the process keeps its place",
-    ("viewer/scratch.py", "fcntl"): "without locks nothing is swept",
-    ("viewer/scratch.py", "getuid"): "only where there is fcntl",
-    ("viewer/scratch.py", "O_NOFOLLOW"): "only where there is fcntl",
 }
 """Each use of what Windows lacks, with what happens there."""
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"}

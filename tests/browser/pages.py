@@ -1,7 +1,14 @@
 """What the browser tests share by name: sizes of windows, and the world that the fixture `world` makes."""
 
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -39,3 +46,33 @@ class World:
     @property
     def broken(self) -> Path:
         return self.home / "scans" / "broken.ply"
+
+
+def hear_signals() -> None:
+    """Undo what nohup or a background shell hands down, so that the viewer is stopped as at a terminal."""
+    for one in (signal.SIGHUP, signal.SIGINT):
+        signal.signal(one, signal.SIG_DFL)
+
+
+@contextmanager
+def viewer(path: Path, how: signal.Signals = signal.SIGINT) -> Iterator[str]:
+    """Run `shapespace view`, yield its address, stop it by a signal, and check that it leaves nothing behind."""
+    # A short path, for there are sockets in it.
+    with TemporaryDirectory(prefix="view-") as temporary:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "shapespace", "view", str(path), "--no-open", "--quiet"],
+            stdout=subprocess.PIPE, text=True, preexec_fn=hear_signals,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "TMPDIR": temporary},
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert "http://127.0.0.1" in line, line
+            stores_scans = not (path / "correspondence.json").is_file()
+            assert len(list(Path(temporary).glob("shapespace-view-*"))) == stores_scans
+            yield line[line.index("http") :].strip()
+        finally:
+            process.send_signal(how)
+            process.communicate(timeout=20)
+        assert not list(Path(temporary).glob("shapespace-view-*"))
+        assert process.returncode in (0, 128 + signal.SIGINT, 128 + signal.SIGTERM)

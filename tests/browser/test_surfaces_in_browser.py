@@ -1,14 +1,12 @@
-"""A correspondence as a reader and a visitor meet it: the report, and the viewer that marks a vertex on all scans."""
+"""A correspondence as a reader and a user meet it: the report, and the viewer that marks a vertex on all scans."""
 
 import csv
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pages import WINDOWS
+from pages import WINDOWS, viewer
 from pictures import change, drawn_share
-from test_viewer_in_browser import end, serve
 
 from same_blobs import HIDDEN, NAMES, write_same
 from shapespace.cli import main
@@ -22,10 +20,8 @@ def same(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(same: Path) -> Iterator[str]:
-    process, found = serve(str(same))
-    yield found
-    end(process, signal.SIGINT)
-    assert process.returncode in (0, 130)
+    with viewer(same) as found:
+        yield found
 
 
 def ready(tab):

@@ -1,20 +1,17 @@
-"""The viewer as a visitor meets it: sliders, a dropped scan, a verdict, files to take away."""
+"""The viewer as a user meets it: sliders, a dropped scan, a verdict, files to take away."""
 
 import base64
 import csv
 import io
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import DESKTOP, PHONE, WINDOWS, World
+from pages import DESKTOP, PHONE, WINDOWS, World, viewer
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.batch.results import read_record
@@ -25,62 +22,15 @@ VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 
 
-def hear_signals() -> None:
-    """Undo what nohup or a background shell hands down, so that the viewer is stopped as at a terminal."""
-    for one in (signal.SIGHUP, signal.SIGINT):
-        signal.signal(one, signal.SIG_DFL)
-
-
-def serve(*arguments: str) -> tuple[subprocess.Popen, str]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "shapespace", "view", *arguments, "--no-open", "--quiet"],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}, preexec_fn=hear_signals,
-    )  # fmt: skip
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    assert "http://127.0.0.1" in line, line
-    return process, line[line.index("http") :].strip()
-
-
-def end(process: subprocess.Popen, how: signal.Signals) -> None:
-    process.send_signal(how)
-    process.communicate(timeout=20)
-
-
 @pytest.fixture(scope="module")
 def address(world: World) -> Iterator[str]:
-    process, found = serve(str(world.fits))
-    yield found
-    end(process, signal.SIGINT)
-    assert process.returncode in (0, 130)
+    with viewer(world.fits) as found:
+        yield found
 
 
-@pytest.mark.parametrize("how", ["SIGTERM", "SIGHUP", "SIGINT"])
-def test_a_stopped_viewer_leaves_nothing_behind(world: World, tmp_path: Path, monkeypatch, how: str) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    process, _ = serve(str(world.model))
-    assert list(tmp_path.glob("shapespace-view-*"))
-    end(process, signal.Signals[how])
-    assert not list(tmp_path.glob("shapespace-view-*"))
-
-
-def test_what_a_killed_viewer_left_goes_with_the_next_one(world: World, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    killed, _ = serve(str(world.model))
-    (left,) = tmp_path.glob("shapespace-view-*")
-    alive, _ = serve(str(world.model))
-    assert left.is_dir()  # its viewer still runs
-    end(killed, signal.SIGKILL)
-    assert left.is_dir()
-    foreign = tmp_path / "shapespace-view-of-something-else"
-    foreign.mkdir()
-    process, _ = serve(str(world.model))
-    found = set(tmp_path.glob("shapespace-view-*"))
-    assert left not in found
-    assert foreign in found and len(found) == 3  # without a lock nobody knows, and the living are left alone
-    for one in (alive, process):
-        end(one, signal.SIGTERM)
-    assert set(tmp_path.glob("shapespace-view-*")) == {foreign}
+def test_a_viewer_whose_terminal_is_closed_leaves_nothing_behind(world: World) -> None:
+    with viewer(world.model, signal.SIGHUP):
+        pass
 
 
 def ready(tab, part: str = "model"):
@@ -91,6 +41,8 @@ def ready(tab, part: str = "model"):
 
 def view(tab) -> bytes:
     # What is drawn coarsely while it moves is drawn finely at rest.
+    # A change takes effect in the next frame.
+    tab.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     tab.until("document.getElementById('loading').hidden && window.shapespaceStage.a.rests")
     return tab.page.get_by_test_id("view").screenshot()
 
@@ -223,8 +175,7 @@ def test_fits_without_stages_are_drawn_and_one_without_its_scan_says_so(open_tab
         shutil.copytree(world.home / name, tmp_path / name, ignore=ignored)
     shutil.copy(world.model, tmp_path)
     (tmp_path / "scans" / "holes.ply").unlink()
-    process, address = serve(str(tmp_path / "fits"))
-    try:
+    with viewer(tmp_path / "fits", signal.SIGTERM) as address:
         tab = ready(open_tab(address))
         tab.page.get_by_test_id("tab-fits").click()
         for name, alone in (("plain", False), ("holes", True)):
@@ -236,8 +187,6 @@ def test_fits_without_stages_are_drawn_and_one_without_its_scan_says_so(open_tab
             assert tab.page.locator("[data-testid=fit-colour] [data-value=regions]").count() == 0
         tab.shot("alone")
         assert tab.complaints == []
-    finally:
-        end(process, signal.SIGINT)
 
 
 def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
@@ -257,6 +206,8 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
     here, there = json.loads((tmp_path / "dropped.fit.json").read_text()), read_record(tmp_path / "cli/plain.fit.json")
     assert here["b"] == list(there.b)
     assert here["status"] == there.status
+    tab.page.get_by_test_id("scan-remove").click()
+    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
     assert tab.complaints == []
 
 
@@ -281,6 +232,8 @@ def test_of_several_files_a_broken_one_gives_one_sentence_and_the_others_go_on(
     tab.page.get_by_test_id("scan-remove").click()
     tab.until("!document.querySelector('[data-testid=own-scan]')")
     assert tab.page.get_by_test_id("scan-status").get_attribute("data-status") == "failed"
+    tab.page.get_by_test_id("scan-remove").click()
+    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
 
 
 def test_the_difference_is_told_by_what_it_moves(open_tab, address: str) -> None:
@@ -434,17 +387,17 @@ def test_the_names_of_files_keep_their_letters(open_tab, address: str) -> None:
     assert shown == ["a"]
 
 
-def test_a_reload_keeps_ones_own_scans_and_nobody_elses(open_tab, address: str, world: World) -> None:
-    tab, other = ready(open_tab(address)), ready(open_tab(address))
+def test_a_reload_keeps_the_scans(open_tab, address: str, world: World) -> None:
+    tab = ready(open_tab(address))
     drop(tab, world.scan)
     assert verdict(tab) == "converged"
     tab.page.reload()
     ready(tab)
     tab.page.get_by_test_id("tab-scan").click()
     assert verdict(tab) == "converged"
-    other.page.get_by_test_id("tab-scan").click()
-    other.page.wait_for_timeout(500)
-    assert "plain.ply" not in other.page.locator("body").inner_text()
+    tab.page.get_by_test_id("scan-remove").click()
+    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
+    assert tab.complaints == []
 
 
 @pytest.fixture(scope="module")
@@ -457,11 +410,11 @@ def people(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     meshes = [ict.mesh(c, name=f"{i}") for i, c in enumerate(ict.draw_people(200, seed=1))]
     path = tmp_path_factory.mktemp("ict") / "people.h5"
     ShapeModel.fit(meshes, modes=None, landmarks=landmark_vertices("face")).save(path)
-    process, found = serve(str(path))
-    yield found
-    end(process, signal.SIGINT)
+    with viewer(path) as found:
+        yield found
 
 
+@pytest.mark.long
 def test_james_is_dropped_and_judged(open_tab, people: str, shared_data: Path) -> None:
     tab = ready(open_tab(people, {"width": 1200, "height": 720}))
     drop(tab, shared_data / "james" / "james.obj")

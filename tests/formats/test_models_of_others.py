@@ -16,7 +16,7 @@ from shapespace.formats.registry import MODEL_FORMATS
 from shapespace.io.meshes import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.saved import Folder, find_fits, model_of
-from shapespace.viewer.shown import Shown
+from shapespace.viewer.model_view import ModelView
 
 MODELS = Path(os.environ.get("SHAPESPACE_DATA", "/nowhere")) / "models"
 FEMUR = MODELS / "femur_gp_model_50-components.h5"
@@ -83,6 +83,6 @@ def test_commands_take_a_file_as_it_is(tmp_path: Path, capsys: pytest.CaptureFix
     assert "compactness" in capsys.readouterr().out
     # What report and viewer begin with.
     assert model_of(Folder(out), find_fits(Folder(out))).content_hash == model.content_hash
-    assert Shown.open(out).model.content_hash == Shown.open(MODELS / file).model.content_hash
+    assert ModelView.open(out).model.content_hash == ModelView.open(MODELS / file).model.content_hash
     fitted = find_fits(Folder(out))[0]
     assert fitted.status == "converged"

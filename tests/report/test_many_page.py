@@ -15,8 +15,8 @@ from shapespace.report import figures, many_page, population
 from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
 from shapespace.report.population import Listed, Population
 from shapespace.store.results import Results
-from shapespace.viewer import shown as shown_module
-from shapespace.viewer.shown import Shown
+from shapespace.viewer import model_view
+from shapespace.viewer.model_view import ModelView
 from stored_fits import model, record, write_fit
 
 pytest.importorskip("pyarrow", reason="the extra `store` is not installed")
@@ -149,11 +149,11 @@ def test_a_folder_of_single_files_keeps_its_report(folder: Path, tmp_path: Path)
 
 
 def test_the_viewer_lists_the_fits_of_a_store(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    every = Shown.open(folder)
+    every = ModelView.open(folder)
     assert len(every.fit_list()) == COUNT
     assert every.fitted_mesh("scan001").vertices.shape == model().mesh().vertices.shape
-    monkeypatch.setattr(shown_module, "MOST_LISTED", 20)
-    rows = Shown.open(folder).fit_list()
+    monkeypatch.setattr(model_view, "MAX_LISTED", 20)
+    rows = ModelView.open(folder).fit_list()
     assert len(rows) == 20
     assert [row["status"] for row in rows] == ["failed"] * 8 + ["doubtful"] * 8 + ["converged"] * 4
     assert all(row["expected_error_mm"] > 0.9 for row in rows[16:])

@@ -124,10 +124,10 @@ def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path)
     for wanted in (
         "Six approaches, one classifier, the same folds", "Classifiers on the additive model's expressions",
         "All four intensities", "Whether the probabilities come true", "How many people it takes",
-        "Which modes carry the decision", "Which parts of the face carry the decision",
+        "Modes that carry the decision", "Parts of the face that carry the decision",
         "Whose face it is, from expressive scans", "How far identity and expression are apart",
         "Trained on ICT-FaceKit, tested on the bundled generator", "One person's expression put on others",
-        "The lines of figures 9 and 10",
+        "The lines of figure 9",
     ):  # fmt: skip
         assert wanted in titles
     approaches = next(part for part in made["parts"] if part["title"].startswith("Six approaches"))

@@ -17,7 +17,6 @@ from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, wri
 from shapespace.errors import FileFormatError, InputError
 from shapespace.viewer import surfaces as module
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
-from shapespace.viewer.limits import Limits
 from shapespace.viewer.serve import serve
 from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
@@ -25,8 +24,8 @@ from shapespace.viewer.surfaces_server import make_surfaces_app
 
 @contextmanager
 def opened(surfaces: Surfaces, token: str = "secret", *, known: bool = True) -> Iterator[httpx.Client]:
-    access = Access(Limits(), token)
-    app = make_surfaces_app(surfaces, access=access)
+    access = Access(token)
+    app = make_surfaces_app(surfaces, access)
     with served(app) as address, httpx.Client(base_url=address, timeout=60) as client:
         if known:
             enter(client, access)
@@ -68,7 +67,7 @@ def test_scans_are_listed_with_what_speaks_against_them_first(client: httpx.Clie
     assert rows[0]["name"] == ASIDE and {row["name"] for row in rows[1:4]} == {FAR, FOLDED, HIDDEN}
     assert [row["status"] for row in rows] == ["set aside", *["look"] * 3, *["corresponding"] * 3]
     assert "/home/somebody" not in client.get("/api/surfaces").text
-    assert all(row["told"].endswith(".") for row in rows)
+    assert all(row["reason"].endswith(".") for row in rows)
 
 
 def test_places_of_vertices_are_those_of_each_scans_own_file(client: httpx.Client) -> None:
@@ -132,7 +131,7 @@ def test_a_bad_record_is_listed_with_its_reason_and_hides_no_other(template: Pat
         assert one.get("/api/mean").status_code == 200
     assert {*NAMES, *bad} <= {*rows}
     for key in ("area_factor", "unit_ratio"):
-        assert rows[key]["status"] == "unreadable" and f"{key}.correspond.json" in rows[key]["told"]
+        assert rows[key]["status"] == "unreadable" and f"{key}.correspond.json" in rows[key]["reason"]
 
 
 def test_with_a_token_nothing_is_answered_without_it(template: Path) -> None:

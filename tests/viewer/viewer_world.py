@@ -1,31 +1,31 @@
-"""A viewer that really runs, in a thread, and visitors who talk to it."""
+"""A viewer that runs in a thread, and clients that talk to it."""
 
-import asyncio
 import json
 import socket
 import struct
+import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
 from shapespace.batch.workers import start_loading
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.viewer.connections import server_config
-from shapespace.viewer.fitting import Worker, fit_upload
+from shapespace.viewer.fitting import Upload, Worker, fit_upload
 from shapespace.viewer.guard import Access
-from shapespace.viewer.limits import Limits
+from shapespace.viewer.model_view import ModelView
+from shapespace.viewer.scans import Limits, Scans
+from shapespace.viewer.serve import make_server
 from shapespace.viewer.server import make_app
-from shapespace.viewer.sessions import Sessions
-from shapespace.viewer.shown import Shown
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 VERTICES = 400
@@ -58,25 +58,22 @@ class Running:
     """A viewer that runs."""
 
     address: str
-    sessions: Sessions
-    root: Path
+    scans: Scans
     access: Access
     clients: ExitStack = field(default_factory=ExitStack)
 
+    @property
+    def root(self) -> Path:
+        return self.scans.root
+
     def outsider(self) -> httpx.Client:
-        """Return a browser that does not know the token."""
+        """Return a browser without the token."""
         return self.clients.enter_context(httpx.Client(base_url=self.address, timeout=60))
 
-    def stranger(self) -> httpx.Client:
-        """Return a browser that has been let in, and has not opened the page."""
+    def user(self) -> httpx.Client:
+        """Return a browser that has exchanged the token for the cookie."""
         client = self.outsider()
         enter(client, self.access)
-        return client
-
-    def visitor(self) -> httpx.Client:
-        """Return a browser that has opened the page."""
-        client = self.stranger()
-        assert client.get("/").status_code == 200
         return client
 
 
@@ -89,31 +86,29 @@ Start = Callable[..., Running]
 
 
 @contextmanager
-def served(app: Any, limits: Limits | None = None) -> Iterator[str]:
-    """Serve an application in a thread, and give its address."""
-    server = uvicorn.Server(server_config(app, limits or Limits()))
-    listening = socket.socket()
-    listening.bind(("127.0.0.1", 0))
-    listening.listen()
-    thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])))
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join()
+def served(app: Any) -> Iterator[str]:
+    """Serve an application in a thread, and yield its address."""
+    server = make_server(app)
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 @contextmanager
-def running(shown: Shown, limits: Limits, worker: Worker, local: bool = True) -> Iterator[Running]:
-    access = Access(limits)
-    app, sessions = make_app(shown, limits=limits, access=access, local=local, worker=worker)
-    with served(app, limits) as address:
-        try:
-            with ExitStack() as clients:
-                yield Running(address, sessions, sessions.root, access, clients)
-        finally:
-            sessions.closing = True
+def running(view: ModelView, limits: Limits, worker: Worker, loopback: bool = True) -> Iterator[Running]:
+    access = Access()
+    with tempfile.TemporaryDirectory() as root, ExitStack() as clients:
+        scans = Scans(Path(root), view.model, view.model_name, limits, worker=worker)
+        clients.callback(scans.close)
+        with served(make_app(view, scans, access, loopback=loopback)) as address:
+            yield Running(address, scans, access, clients)
 
 
 @pytest.fixture(scope="session")
@@ -123,18 +118,19 @@ def model() -> ShapeModel:
 
 @pytest.fixture
 def start(model: ShapeModel) -> Iterator[Start]:
-    """Start a viewer of the model, or of what is given."""
+    """Start a viewer of `model` or of another view."""
     start_loading(tell=False)
     with ExitStack() as stack:
 
         def start(
-            shown: Shown | None = None,
+            view: ModelView | None = None,
             *,
             worker: Worker = fit_upload,
-            local: bool = True,
+            loopback: bool = True,
             **limits: Any,
         ) -> Running:
-            return stack.enter_context(running(shown or Shown(model, "blobs.h5"), Limits(**limits), worker, local))
+            view = view or ModelView(model, "blobs.h5")
+            return stack.enter_context(running(view, Limits(**limits), worker, loopback))
 
         yield start
 
@@ -148,18 +144,40 @@ def scan_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def drop(visitor: httpx.Client, content: bytes, name: str = "scan.ply") -> httpx.Response:
-    return visitor.put("/api/scans", params={"name": name}, content=content)
+def agrees(pipe: Connection, upload: Upload) -> None:
+    """Converge without a fit."""
+    pipe.send_bytes(json.dumps({"event": "verdict", "status": "converged", "reason": "It is good."}).encode())
+    time.sleep(60)
 
 
-def told(visitor: httpx.Client, key: str) -> list[dict[str, Any]]:
-    """Everything the page is told about a scan, until there is no more to come."""
-    with visitor.stream("GET", f"/api/scans/{key}/events") as answer:
-        assert answer.status_code == 200
-        return [json.loads(line[6:]) for line in answer.iter_lines() if line.startswith("data: ")]
+def waits(pipe: Connection, upload: Upload) -> None:
+    """Never end."""
+    time.sleep(60)
 
 
-def sentence(answer: httpx.Response) -> str:
-    text = answer.json()["error"]
+def upload(client: httpx.Client, content: bytes, name: str = "scan.ply") -> httpx.Response:
+    return client.put("/api/scans", params={"name": name}, content=content)
+
+
+def wait_for_events(client: httpx.Client, key: str) -> list[dict[str, Any]]:
+    """Return all messages of a fit once it is done, and then the state of the scan."""
+    until(lambda: progress(client, key)["state"] == "done", 60)
+    done = progress(client, key)
+    return [*done.pop("events"), done]
+
+
+def progress(client: httpx.Client, key: str) -> dict[str, Any]:
+    return client.get(f"/api/scans/{key}/progress").json()
+
+
+def until(condition: Callable[[], object], seconds: float = 15) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def sentence(response: httpx.Response) -> str:
+    text = response.json()["error"]
     assert isinstance(text, str) and text.endswith(".") and "Traceback" not in text
     return text

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from shapespace.report.blocks import Block, Facts, Figure, Folded, Notice, Table
 from shapespace.report.page import Chapter, Make, Page, Step
 from shapespace.report.saved import Folder, SavedFit, read_fit, staged_fit
 from shapespace.report.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
-from shapespace.schemas import DEMO_AGAIN, Case, Claim, DemoModel, ExpressionsOfOne, FitEntry, ManyPeople, read
+from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
 
 if TYPE_CHECKING:
     from shapespace.report.staged import StagedFit
@@ -25,45 +25,30 @@ _RESERVE_BYTES = 1_200_000
 _PICTURES = 30
 _MODES_OF_A_CASE = 4
 _NOTHING = Text("No fit kept its surfaces.", "broken")
-_T = TypeVar("_T")
 
 
 class DemoPage:
-    """The report of the demo in the making; each part of demo.json is read for itself, so that none costs another.
+    """The report of the demo.
 
     Args:
         folder: of the demo.
-        on_step: told of each picture.
+        on_step: called after each picture.
 
     Raises:
         FileError: demo.json cannot be read.
-        FileFormatError: it is no JSON object.
+        FileFormatError: demo.json is damaged.
     """
 
     def __init__(self, folder: Folder, on_step: Step | None = None) -> None:
         self.page = Page(_PICTURES, on_step)
         self.folder = folder
-        self.content = folder.json("demo.json")
-        self.problems: list[str] = []
-        self.first = self._part("experiment1", ExpressionsOfOne)
-        self.second = self._part("experiment2", ManyPeople)
-        head = {key: self._part(key, kind) for key, kind in (("version", str), ("created", str), ("machine", str))}
-        self.made = f"shapespace {head['version'] or ''}, {moment(head['created'] or '')}"
-        self.machine = head["machine"] or "not recorded"
-        self.quick = bool(self._part("quick", bool))
-        self.cases = self.second.cases if self.second else ()
-        self.entries = [*(self.first.fits if self.first else ()), *(case.fit for case in self.cases)]
+        self.demo = read(Demo, folder.json("demo.json"), "demo.json", DEMO_AGAIN)
+        self.provenance = f"shapespace {self.demo.version}, {moment(self.demo.created)}"
+        self.cases = self.demo.experiment2.cases
+        self.entries = [*self.demo.experiment1.fits, *(case.fit for case in self.cases)]
         self._fits: dict[str, SavedFit] = {}
         self._staged: dict[str, StagedFit] = {}
         self._models: dict[str, ShapeModel] = {}
-
-    def _part(self, key: str, kind: type[_T]) -> _T | None:
-        """Return one part of demo.json, or None where it is absent, or damaged, which is kept for the summary."""
-        try:
-            return read(kind, self.content[key], f"{key} in demo.json", DEMO_AGAIN) if key in self.content else None
-        except FileFormatError as error:
-            self.problems.append(str(error))
-            return None
 
     def html(self) -> str:
         """Return the page."""
@@ -73,8 +58,8 @@ class DemoPage:
                 "Shark and Ait-Boudaoud. All distances are in millimetres."
             ),
             Text(
-                f"{self.made}."
-                + (" This was the quick demo: coarser scans and an earlier stop." if self.quick else ""),
+                f"{self.provenance}."
+                + (" This was the quick demo: coarser scans and an earlier stop." if self.demo.quick else ""),
                 "soft",
             ),
         ]
@@ -85,13 +70,13 @@ class DemoPage:
             Chapter("Settings, versions and hashes", self.settings, "Settings"),
         ]
         title = "Low-dimensional surface parameterisation: the paper, run again"
-        return self.page.html(title, lead, f"Made by {self.made} from the files in its own folder.", chapters)
+        return self.page.html(title, lead, f"Made by {self.provenance} from the files in its own folder.", chapters)
 
-    def parted(self, parts: Mapping[str, Make], level: int = 3) -> list[Block]:
-        """Return parts under their headings."""
+    def with_headings(self, parts: Mapping[str, Make], level: int = 3) -> list[Block]:
+        """Return sections with their headings."""
         return [self.page.section(heading, make, level) for heading, make in parts.items()]
 
-    # What is read, once
+    # Cached files
 
     def fit(self, entry: FitEntry) -> SavedFit:
         """Return the fit of an entry of demo.json."""
@@ -101,7 +86,7 @@ class DemoPage:
         return self._fits[key]
 
     def staged(self, fit: SavedFit, label: str = "") -> StagedFit:
-        """Return what pictures of `fit` need, called `label`."""
+        """Return the surfaces of `fit` for its pictures, with the name `label`."""
         key = str(fit.entry.stages)
         if key not in self._staged:
             self._staged[key] = staged_fit(self.folder, fit)
@@ -118,25 +103,25 @@ class DemoPage:
         return sections.usable(entries, self.fit)
 
     def pictured(self, fits: Sequence[SavedFit]) -> tuple[list[tuple[SavedFit, StagedFit]], Notice]:
-        """Return the fits whose surfaces can be shown, and the names of the others."""
+        """Return the fits with surfaces, and a notice with the names of the others."""
 
         def both(fit: SavedFit) -> tuple[SavedFit, StagedFit]:
             if not fit.pictured:
                 raise FileFormatError(f"{fit.name}: {fit.reason or 'no surface was kept'}")
             return fit, self.staged(fit)
 
-        shown, absent = sections.usable(fits, both)
-        return shown, Notice("Not in the pictures", absent)
+        pictured, absent = sections.usable(fits, both)
+        return pictured, Notice("Not in the pictures", absent)
 
     # Summary
 
     def summary(self) -> list[Block]:
-        """Return the figures of the whole run, the main picture, and the paper beside it."""
+        """Return the key numbers, the main figure, and the comparison with the paper."""
         parts = {"Main figure": self.main_figure, "The paper beside this run": self.paper_table}
-        return [*self.tiles(), *self.parted(parts)]
+        return [*self.tiles(), *self.with_headings(parts)]
 
     def tiles(self) -> list[Block]:
-        """Return what was fitted and how much of it is to be trusted."""
+        """Return the number of fits by status, and their mean errors."""
         fits, problems = self.readable(self.entries)
         total, first = len(self.entries), len(self.entries) - len(self.cases)
         counts = Counter(fit.status for fit in fits)
@@ -146,46 +131,46 @@ class DemoPage:
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
         blind = "fits converged with nothing found against them; the plain method is blind to some errors"
-        modes = plain(self.first.modes_for_98_5 if self.first else None)
+        modes = plain(self.demo.experiment1.modes_for_98_5)
         tiles = [
             (str(counts["converged"]), f"of {total}", blind),
             (modes, "", "modes hold 98.5 % of the variance of one person's expressions"),
-            (*_parted(_mean(distances)), f"mean closest distance of the test faces, model to scan{where}"),
-            (*_parted(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
+            (*_number_and_unit(_mean(distances)), f"mean closest distance of the test faces, model to scan{where}"),
+            (*_number_and_unit(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
         ]
         rest = ", ".join(
             f"{counts[key]} {word}" for key, word in STATUS_WORDS.items() if counts[key] and key != "converged"
         )
-        told = (
+        text = (
             f"{total} fits are reported: {first} to simulated scans of one person's expressions, {total - first} to "
             f"scans of other people.{f' Besides those that converged: {rest}.' if rest else ''}"
         )
         doubts = [f"{fit.name}: {STATUS_WORDS[fit.status]}. {fit.reason}" for fit in fits if fit.status != "converged"]
         return [
-            Text(told),
+            Text(text),
             Tiles(tiles),
             Notice("Not to be trusted without a look", doubts),
-            Notice("Cannot be read", [*self.problems, *problems]),
+            Notice("Cannot be read", problems),
         ]
 
     def main_figure(self) -> list[Block]:
         """Return the middle test face and the scans of experiment 2 with their fits."""
         from shapespace.report import figures
 
-        fits, _ = self.readable(self.first.fits if self.first else ())
+        fits, _ = self.readable(self.demo.experiment1.fits)
         usable = [fit for fit in _tests(fits) if fit.pictured]
         usable.sort(key=lambda fit: fit.summary_mm("final", "model_to_scan", "mean"))
         wanted = [(fit.entry, f"{fit.label} (simulated)") for fit in usable[len(usable) // 2 :][:1]]
         for case in self.cases:
             both = ((case.fit, "paper"), (case.robust, "robust"))
             wanted += [(fit, f"{_short(case)}, {method}") for fit, method in both if fit and fit.stages]
-        shown, unread = sections.usable(wanted, lambda pair: self.staged(self.fit(pair[0]), pair[1]))
-        if not shown:
+        staged_fits, unread = sections.usable(wanted, lambda pair: self.staged(self.fit(pair[0]), pair[1]))
+        if not staged_fits:
             raise FileFormatError("No fit kept a surface to show; run the demo again.")
-        labels = [fit.label for fit in shown]
+        labels = [fit.label for fit in staged_fits]
         return [
             self.page.figure(
-                figures.portrait_figure(shown, labels, title="Raw scans and the models fitted to them"),
+                figures.portrait_figure(staged_fits, labels, title="Raw scans and the models fitted to them"),
                 "Rows: the test expression with the median distance, then each scan of experiment 2, fitted by the "
                 "method of the paper and by the robust method. The last column maps the distance of each model vertex "
                 f"to the scan, all rows on one scale.{self.true_errors()}",
@@ -208,8 +193,8 @@ class DemoPage:
         return "".join(sentences)
 
     def paper_table(self) -> Table:
-        """Return what the paper states beside what this run measured."""
-        claims = read(tuple[Claim, ...], self.content.get("paper_table"), "paper_table in demo.json", DEMO_AGAIN)
+        """Return the values of the paper and the values that this run measured."""
+        claims = self.demo.paper_table
         if not claims:
             raise FileFormatError("demo.json holds no comparison with the paper; run the demo again.")
         return text_table(
@@ -223,8 +208,8 @@ class DemoPage:
 
     def experiment_1(self) -> list[Block]:
         """Return one person's expressions: model, fits, recognition."""
-        one = self.first
-        if one is None:
+        one = self.demo.experiment1
+        if not one.model:
             raise FileFormatError("demo.json holds no experiment 1; run the demo again.")
         fits, problems = self.readable(one.fits)
         tests = _tests(fits)
@@ -233,8 +218,8 @@ class DemoPage:
             key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")),
         )
         intro = (
-            f"{one.title or 'Expressions of one person'}: {_told(one.n_training)} faces of one simulated person make "
-            f"the model, {_told(one.modes_for_98_5)} modes hold 98.5 % of their variance, and unseen expressions are "
+            f"{one.title or 'Expressions of one person'}: {_count(one.n_training)} faces of one simulated person make "
+            f"the model, {_count(one.modes_for_98_5)} modes hold 98.5 % of their variance, and unseen expressions are "
             "fitted as raw surfaces: triangulated anew, moved, turned, scaled, with 0.2 mm noise."
         )
         parts: dict[str, Make] = {
@@ -244,7 +229,7 @@ class DemoPage:
             "From far away, step by step": lambda: (
                 [
                     block
-                    for fit in farthest[: 1 if self.quick else 2]
+                    for fit in farthest[: 1 if self.demo.quick else 2]
                     for block in self.one_fit(fit, fit.label, one.population_z)
                 ]
                 or [_NOTHING]
@@ -254,41 +239,41 @@ class DemoPage:
             "Every fit in numbers": lambda: self.numbers(fits),
             "Expressions as directions": lambda: self.directions(one, fits),
         }
-        return [Text(intro), Notice("Cannot be read", problems), *self.parted(parts)]
+        return [Text(intro), Notice("Cannot be read", problems), *self.with_headings(parts)]
 
     def numbers(self, fits: Sequence[SavedFit]) -> Table:
         """Return the table of fits."""
         return tables.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
 
     def training(self, one: ExpressionsOfOne) -> Figure:
-        """Return some of the faces that the model is made of."""
+        """Return some of the training faces."""
         from shapespace.report import figures
 
-        examples = one.training_examples[: 8 if self.quick else 12]
+        examples = one.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
         labels = [example.label for example in examples]
         return self.page.figure(
             figures.faces_grid(meshes, labels, title="Training faces: one person, mixed expressions"),
-            f"Paper, figure 1. {len(meshes)} of the {_told(one.n_training)} faces that the model is made of.",
+            f"Paper, figure 1. {len(meshes)} of the {_count(one.n_training)} faces that the model is made of.",
             alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
         )
 
     def modes(self, owner: DemoModel, paper: str, to_move: int = sections.MODES_IN_WIDGET) -> list[Block]:
-        """Return what the model is and does."""
+        """Return the mean and the modes of a model."""
         return sections.model_part(self.page, self.model(owner), figure_of=paper, to_move=to_move)
 
     def test_faces(self, tests: Sequence[SavedFit]) -> list[Block]:
         """Return the scans of the test faces."""
         from shapespace.report import figures
 
-        shown, absent = self.pictured(tests)
-        if not shown:
+        pictured, absent = self.pictured(tests)
+        if not pictured:
             return [absent if absent.items else Text("No test face was fitted.", "broken")]
-        labels = [staged.label for _, staged in shown]
+        labels = [staged.label for _, staged in pictured]
         title = "Test faces: raw surfaces, none of them in the training set"
         return [
             self.page.figure(
-                figures.faces_grid([staged.scan for _, staged in shown], labels, title=title),
+                figures.faces_grid([staged.scan for _, staged in pictured], labels, title=title),
                 "Paper, figure 8. The scans, turned back to the front by the fitted pose; simulated.",
                 alt="Grid of test faces: " + ", ".join(labels),
             ),
@@ -296,7 +281,7 @@ class DemoPage:
         ]
 
     def one_fit(self, fit: SavedFit, label: str, population_z: Sequence[Sequence[float]] = ()) -> list[Block]:
-        """Return one fit to turn, with every picture, its coefficients beside those of the population (N, K)."""
+        """Return one fit with all its pictures, and its coefficients beside those of the population (N, K)."""
         if len({len(z) for z in population_z}) > 1:
             raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
         staged = self.staged(fit, label)
@@ -307,10 +292,10 @@ class DemoPage:
         """Return every test face with its fitted model."""
         from shapespace.report import figures
 
-        shown, absent = self.pictured(tests)
-        if not shown:
+        pictured, absent = self.pictured(tests)
+        if not pictured:
             return [absent]
-        chosen = _strongest(shown) if self.quick else [staged for _, staged in shown]
+        chosen = _strongest(pictured) if self.demo.quick else [staged for _, staged in pictured]
         return [
             self.page.figure(
                 figures.aligned_grid(chosen, title="Scan and fitted model over each other"),
@@ -341,11 +326,11 @@ class DemoPage:
         """Return threshold maps and distance maps of the test faces."""
         from shapespace.report import figures
 
-        shown, absent = self.pictured(tests)
-        if not shown:
+        pictured, absent = self.pictured(tests)
+        if not pictured:
             return [absent]
-        chosen = _strongest(shown)
-        every = chosen if self.quick else [staged for _, staged in shown]
+        chosen = _strongest(pictured)
+        every = chosen if self.demo.quick else [staged for _, staged in pictured]
         return [
             sections.in_columns(
                 self.page.figure(
@@ -389,41 +374,29 @@ class DemoPage:
         kind = "Simulated scan. " if case.simulated else "Real scan. "
         if case.note.lower().startswith(("simulated", "real", "a real")):
             kind = ""
-        told = f"The model is made of {_told(case.n_training)} people"
+        text = f"The model is made of {_count(case.n_training)} people"
         if case.modes_for_98_5:
-            told += f"; {case.modes_for_98_5} modes hold 98.5 % of the variance"
-            told += f", and {case.n_modes} are used." if case.n_modes else "."
+            text += f"; {case.modes_for_98_5} modes hold 98.5 % of the variance"
+            text += f", and {case.n_modes} are used." if case.n_modes else "."
         else:
-            told += f"; its {_told(case.n_modes)} modes hold less than 98.5 % of the variance."
-        out: list[Block] = [Text(kind + case.note, "notice" if case.simulated else ""), Text(told), self.numbers([fit])]
+            text += f"; its {_count(case.n_modes)} modes hold less than 98.5 % of the variance."
+        out: list[Block] = [Text(kind + case.note, "notice" if case.simulated else ""), Text(text), self.numbers([fit])]
         if not fit.pictured:
             return out
         parts: dict[str, Make] = {"Step by step": lambda: self.one_fit(fit, _short(case))}
-        if with_model and not self.quick:
+        if with_model and not self.demo.quick:
             parts["The model"] = lambda: self.modes(case, "", _MODES_OF_A_CASE)
-        return out + self.parted(parts, 4)
+        return out + self.with_headings(parts, 4)
 
     # The rest
 
     def settings(self) -> list[Block]:
         """Return settings, times, versions and hashes."""
-        problems: list[str] = []
-
-        def told(key: str, kind: type[_T], otherwise: _T) -> _T:
-            try:
-                return read(kind, self.content.get(key, otherwise), f"{key} in demo.json", DEMO_AGAIN)
-            except FileFormatError as error:
-                problems.append(str(error))
-                return otherwise
-
-        rows = [("Machine", self.machine), ("Seed", plain(self.content.get("seed")))]
-        rows += [
-            (f"Time, {words(key)}", f"{value:.1f} s") for key, value in told("seconds", dict[str, float], {}).items()
-        ]
-        rows += [
-            (f"Setting, {words(key)}", plain(value)) for key, value in told("settings", dict[str, object], {}).items()
-        ]
-        rows += [(f"Version, {key}", value) for key, value in told("versions", dict[str, str], {}).items()]
+        demo = self.demo
+        rows = [("Machine", demo.machine or "not recorded"), ("Seed", plain(demo.seed))]
+        rows += [(f"Time, {words(key)}", f"{value:.1f} s") for key, value in demo.seconds.items()]
+        rows += [(f"Setting, {words(key)}", plain(value)) for key, value in demo.settings.items()]
+        rows += [(f"Version, {key}", value) for key, value in demo.versions.items()]
         fits, unread = self.readable(self.entries)
         if fits:
             rows += [(f"Fit, {words(key)}", setting(value)) for key, value in fits[0].record.config.items()]
@@ -435,7 +408,7 @@ class DemoPage:
         return [
             Facts(rows, "Settings and versions"),
             Folded("Content hashes (SHA-256)", [hashes]),
-            Notice("Cannot be read", [*problems, *unread]),
+            Notice("Cannot be read", unread),
         ]
 
 
@@ -443,9 +416,9 @@ def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return [fit for fit in fits if fit.entry.intensity]
 
 
-def _strongest(shown: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit]:
+def _strongest(pictured: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit]:
     """Return the fit of the highest intensity of each expression."""
-    ranked = sorted(shown, key=lambda pair: pair[0].entry.intensity or 0)
+    ranked = sorted(pictured, key=lambda pair: pair[0].entry.intensity or 0)
     return list({fit.entry.expression: staged for fit, staged in ranked}.values())
 
 
@@ -454,7 +427,7 @@ def _short(case: Case) -> str:
     return case.short or case.fit.name
 
 
-def _told(count: int | None) -> str:
+def _count(count: int | None) -> str:
     return "?" if count is None else str(count)
 
 
@@ -463,6 +436,6 @@ def _mean(values: Sequence[float]) -> float:
     return sum(known) / len(known) if known else np.nan
 
 
-def _parted(value: float) -> tuple[str, str]:
+def _number_and_unit(value: float) -> tuple[str, str]:
     number, _, unit = mm(value).partition(" ")
     return number, unit

@@ -8,7 +8,7 @@ from pathlib import Path
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import write_text
 from shapespace.report.page import LARGEST_REPORT_BYTES, Step
-from shapespace.report.recognition import kept_alone, study_page
+from shapespace.report.recognition import standalone_file, study_page
 from shapespace.report.saved import Folder, find_fits
 from shapespace.schemas import CorrespondenceRecord
 from shapespace.store.results import Results
@@ -77,7 +77,7 @@ def write_report(
         if model is not None or labels is not None:
             raise InputError(f"{folder} is a correspondence without fits; leave out --model and --labels.")
         page = CorrespondencePage(results, on_step).html()
-    elif (kept := kept_alone(results)) is not None:
+    elif (kept := standalone_file(results)) is not None:
         if model is not None or labels is not None:
             raise InputError(f"{folder} holds {kept.article} without fits; leave out --model and --labels.")
         page = study_page(results, kept, on_step)

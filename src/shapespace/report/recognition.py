@@ -1,7 +1,6 @@
-"""What a study measured or an analysis found, from its file: a section of a report, or a report of its own.
+"""The report of a recognition study or an analysis: a section of a report, or a page of its own.
 
-The file names the parts in the order in which they are shown; what is absent is not shown, and what is damaged says so
-in its place.
+The file lists the parts in order. A damaged part is replaced by an error message.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from shapespace.report.study_parts import (
     MOST_ROWS,
     STUDY,
     TITLES,
-    Kept,
+    PartsFile,
     StudyParts,
     paragraphs,
 )
@@ -43,7 +42,7 @@ from shapespace.schemas import Target, check_format, read, read_part
 from shapespace.version import __version__
 
 SECTION_BYTES = 1_500_000
-"""How much of a report of fits is kept free for this section."""
+"""Bytes of a report of fits that are reserved for this section."""
 
 MOST_ANALYSES = 12
 """How many analyses a report of fits shows."""
@@ -51,75 +50,75 @@ MOST_ANALYSES = 12
 _MOST_PARTS, _MOST_TEXT = 120, 400
 _PART_BYTES = 700_000
 _MOST_NOTES = 40
-_BESIDE = ("confusion", "calibration", "learning_curve", "modes", "face_map", "curve", "histogram")
+_BESIDE = ("confusion", "calibration", "learning_curve", "curve", "histogram")
 """Kinds of parts that share the page's width with their neighbour; the views of a surface map need all of it."""
 _CHAPTER = 2
 _T = TypeVar("_T")
 
 
-def kept_alone(folder: Folder) -> Kept | None:
+def standalone_file(folder: Folder) -> PartsFile | None:
     """Return what `folder` holds where it holds no fit, so that there is nothing else to report; None for neither.
 
     A file without a format is a free collection of scores, which is no study.
     """
-    there = [kept for kept in (STUDY, ANALYSIS) if (folder.root / kept.file).is_file()]
+    there = [parts_file for parts_file in (STUDY, ANALYSIS) if (folder.root / parts_file.file).is_file()]
     if not there or has_fits(folder):
         return None
-    return next((kept for kept in there if "format" in _content(folder, kept)), None)
+    return next((parts_file for parts_file in there if "format" in _content(folder, parts_file)), None)
 
 
-def study_page(folder: Folder, kept: Kept, on_step: Step | None = None) -> str:
+def study_page(folder: Folder, parts_file: PartsFile, on_step: Step | None = None) -> str:
     """Return the report of a study or an analysis alone.
 
     Args:
         folder: with its file.
-        kept: which of them it is.
+        parts_file: which of them it is.
         on_step: told of each picture.
 
     Raises:
         FileError: the file cannot be read.
         FileFormatError: it is damaged, or no file of this format.
     """
-    content = _content(folder, kept)
+    content = _content(folder, parts_file)
     pictured = [part for part in _raw_parts(content) if _raw(part, "kind") not in ("table", "text")]
     page = Page(max(len(pictured), 1), on_step)
-    study = _Study(page, folder, kept, content)
+    study = _Study(page, folder, parts_file, content)
     name = folder.root.resolve().name
-    made = f"shapespace {study.head['version']}".strip()
+    provenance = f"shapespace {study.head['version']}".strip()
     if study.head["created"]:
-        made += f", {moment(study.head['created'])}"
+        provenance += f", {moment(study.head['created'])}"
     beside = ", beside the targets that were set for it" if content.get("targets") else ""
-    lead = [Text(f"{kept.lead}{beside}."), Text(f"{made}.", "soft")]
-    said = any(content.get(key) for key in ("summary", "targets", "notes"))
-    chapters = [Chapter("Summary", study.summary)] if said else []
+    lead = [Text(f"{parts_file.lead}{beside}."), Text(f"{provenance}.", "soft")]
+    has_summary = any(content.get(key) for key in ("summary", "targets", "notes"))
+    chapters = [Chapter("Summary", study.summary)] if has_summary else []
     for heading, make in study.chapters("Results", 3):
         chapters.append(Chapter(heading, make, heading if len(heading) <= 36 else f"{heading[:35]}…"))
     chapters.append(Chapter("Settings, versions and hashes", study.settings, "Settings"))
-    title = study.head["title"] or f"{kept.title} in {name}"
+    title = study.head["title"] or f"{parts_file.title} in {name}"
     return page.html(title, lead, f"Made by shapespace {__version__} from the files in {name}.", chapters)
 
 
-def study_section(page: Page, folder: Folder, kept: Kept = STUDY) -> list[Block]:
+def study_section(page: Page, folder: Folder, parts_file: PartsFile = STUDY) -> list[Block]:
     """Return what a study measured or an analysis found, as a section of the report of fits.
 
     Args:
         page: that it goes to.
         folder: with its file.
-        kept: which of them it is.
+        parts_file: which of them it is.
 
     Raises:
         FileError: the file cannot be read.
         FileFormatError: it is damaged, or no file of this format.
     """
-    content = _content(folder, kept)
-    if kept is STUDY and "format" not in content:
+    content = _content(folder, parts_file)
+    if parts_file is STUDY and "format" not in content:
         return tables.score_tables(content, many="Scores by class", single="Scores")
-    study = _Study(page, folder, kept, content)
+    study = _Study(page, folder, parts_file, content)
     out: list[Block] = [Text(study.head["title"])] if study.head["title"] else []
     out += page.tried(study.summary)
     for heading, make in study.chapters("", 4):
         out += [page.section(heading, make)] if heading else page.tried(make)
-    return [*out, Folded(f"Settings and versions of this {kept.word}", page.tried(study.settings))]
+    return [*out, Folded(f"Settings and versions of this {parts_file.word}", page.tried(study.settings))]
 
 
 def find_analyses(root: Path) -> list[Folder]:
@@ -131,23 +130,23 @@ def find_analyses(root: Path) -> list[Folder]:
     return [Folder(folder, ANALYSIS.again) for folder in (root, *inside) if (folder / ANALYSIS.file).is_file()]
 
 
-def analysis_chapters(page: Page, root: Path, found: Sequence[Folder]) -> list[Chapter]:
-    """Return a chapter for each of `found`, as `find_analyses` gives them, as far as there may be that many.
+def analysis_chapters(page: Page, root: Path, folders: Sequence[Folder]) -> list[Chapter]:
+    """Return a chapter for each of `folders` from `find_analyses`, up to MOST_ANALYSES.
 
     Args:
         page: that they go to.
         root: of the fits.
-        found: the folders.
+        folders: of the analyses.
     """
     out: list[Chapter] = []
-    for folder in found[:MOST_ANALYSES]:
+    for folder in folders[:MOST_ANALYSES]:
         name = folder.root.name if folder.root != root else ""
         heading = printable(f"Analysis {name}".strip())
         out.append(Chapter(heading, lambda folder=folder: _analysis(page, folder, root), heading[:36]))
-    rest = found[MOST_ANALYSES:]
+    rest = folders[MOST_ANALYSES:]
     if rest:
-        told = listed([printable(folder.root.name) for folder in rest], 40)
-        out.append(Chapter("Further analyses", lambda: Text(f"Not shown here, but each has its own report: {told}.")))
+        names = listed([printable(folder.root.name) for folder in rest], 40)
+        out.append(Chapter("Further analyses", lambda: Text(f"Not shown here, but each has its own report: {names}.")))
     return out
 
 
@@ -159,8 +158,8 @@ def _analysis(page: Page, folder: Folder, root: Path) -> list[Block]:
     return [*out, Text("This analysis in a report of its own:", "soft"), Command(f"shapespace report FOLDER/{name}")]
 
 
-def _content(folder: Folder, kept: Kept) -> dict[str, Any]:
-    return cast(dict[str, Any], _shortened(Folder(folder.root, kept.again).json(kept.file)))
+def _content(folder: Folder, parts_file: PartsFile) -> dict[str, Any]:
+    return cast(dict[str, Any], _shortened(Folder(folder.root, parts_file.again).json(parts_file.file)))
 
 
 def _shortened(value: object, most: int = _MOST_TEXT) -> object:
@@ -192,18 +191,18 @@ def _raw_parts(content: Mapping[str, object]) -> list[object]:
 class _Study:
     """A study or an analysis and the page that it goes to; each key of its file is read when it is shown."""
 
-    def __init__(self, page: Page, folder: Folder, kept: Kept, content: Mapping[str, Any]) -> None:
-        check_format(content, kept.struct, kept.file, kept.again)
+    def __init__(self, page: Page, folder: Folder, parts_file: PartsFile, content: Mapping[str, Any]) -> None:
+        check_format(content, parts_file.struct, parts_file.file, parts_file.again)
         self.page = page
-        self.kept = kept
-        self.folder = Folder(folder.root, kept.again)
-        self.kinds = StudyParts(page, self.folder, kept)
+        self.parts_file = parts_file
+        self.folder = Folder(folder.root, parts_file.again)
+        self.kinds = StudyParts(page, self.folder, parts_file)
         self.content = content
         texts = {key: content.get(key) for key in ("title", "version", "created")}
         self.head = {key: text if isinstance(text, str) else "" for key, text in texts.items()}
 
     def _read(self, key: str, kind: type[_T]) -> _T:
-        return read(kind, self.content.get(key), f"{self.kept.file}: {key}", self.kept.again)
+        return read(kind, self.content.get(key), f"{self.parts_file.file}: {key}", self.parts_file.again)
 
     def summary(self) -> list[Block]:
         """Return its sentences, what it aimed at beside what it reached, and who was left out."""
@@ -218,22 +217,22 @@ class _Study:
 
     def notes(self) -> Notice:
         """Return what should be known of it, such as who was left out."""
-        found = self._read("notes", tuple[str, ...])
-        rest = [f"{len(found) - _MOST_NOTES} more, in {self.kept.file}."] if len(found) > _MOST_NOTES else []
-        return Notice("To be known", [*map(without_folders, found[:_MOST_NOTES]), *rest])
+        notes = self._read("notes", tuple[str, ...])
+        rest = [f"{len(notes) - _MOST_NOTES} more, in {self.parts_file.file}."] if len(notes) > _MOST_NOTES else []
+        return Notice("To be known", [*map(without_folders, notes[:_MOST_NOTES]), *rest])
 
     def sentences(self) -> list[Block]:
         """Return its sentences."""
-        said = self.content["summary"]
-        return paragraphs(said if isinstance(said, str) else self._read("summary", tuple[str, ...]))
+        text = self.content["summary"]
+        return paragraphs(text if isinstance(text, str) else self._read("summary", tuple[str, ...]))
 
     def targets(self) -> Table:
         """Return the targets, each with what was reached."""
         targets = self._read("targets", tuple[Target, ...])
         met = [target.met for target in targets if target.met is not None]
-        told = f"{sum(met)} of {counted(len(met), 'target')} met" if met else "Targets, and what was reached"
+        caption = f"{sum(met)} of {counted(len(met), 'target')} met" if met else "Targets, and what was reached"
         if met and len(met) < len(targets):
-            told += f", {len(targets) - len(met)} without a verdict"
+            caption += f", {len(targets) - len(met)} without a verdict"
         verdicts = {None: Cell(DASH), True: Cell("met", status="converged"), False: Cell("missed", status="failed")}
         rows = [
             [
@@ -244,8 +243,8 @@ class _Study:
             for one in targets[:MOST_ROWS]
         ]
         columns = [Column(head) for head in ("What", "Target", "Reached", "Verdict", "Note")]
-        kept = 5 if any(one.note for one in targets) else 4
-        return Table(columns[:kept], [row[:kept] for row in rows], f"{told}.", stack=True)
+        shown_columns = 5 if any(one.note for one in targets) else 4
+        return Table(columns[:shown_columns], [row[:shown_columns] for row in rows], f"{caption}.", stack=True)
 
     def chapters(self, first: str, level: int) -> list[tuple[str, Make]]:
         """Return headings of chapters and what makes each; what stands before them goes under `first`.
@@ -282,7 +281,7 @@ class _Study:
 
     def no_parts(self) -> list[Block]:
         """Refuse parts that are no list."""
-        raise self.kept.wrong("its parts are no list")
+        raise self.parts_file.damaged("its parts are no list")
 
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
@@ -294,10 +293,10 @@ class _Study:
             beside.clear()
 
         for part in parts:
-            made = self.page.section(_title(part), lambda part=part: self.body(part), level)
+            section = self.page.section(_title(part), lambda part=part: self.body(part), level)
             if _raw(part, "kind") not in _BESIDE:
                 flush()
-            beside.append(made)
+            beside.append(section)
             if _raw(part, "kind") not in _BESIDE:
                 flush()
         flush()
@@ -309,22 +308,22 @@ class _Study:
         before = self.page.left
         if before < _PART_BYTES:
             return too_large
-        made = self.page.tried(lambda: self.made(part))
-        text = len(rendered(made).encode()) - (before - self.page.left)
+        blocks = self.page.tried(lambda: self.part(part))
+        text = len(rendered(blocks).encode()) - (before - self.page.left)
         if text > self.page.left - _PART_BYTES // 2:
             return too_large
         self.page.spend(text)
-        return made
+        return blocks
 
-    def made(self, part: object) -> list[Block]:
+    def part(self, part: object) -> list[Block]:
         """Return a part by its kind."""
-        return self.kinds.blocks(read_part(part, self.kept.file, self.kept.again), _title(part))
+        return self.kinds.blocks(read_part(part, self.parts_file.file, self.parts_file.again), _title(part))
 
     def settings(self) -> list[Block]:
         """Return with what the study was made."""
         rows = [("Report", f"shapespace {__version__}")]
         if self.head["version"]:
-            rows.append((self.kept.word.capitalize(), f"shapespace {self.head['version']}"))
+            rows.append((self.parts_file.word.capitalize(), f"shapespace {self.head['version']}"))
         if self.head["created"]:
             rows.append(("Made", moment(self.head["created"])))
         out: list[Block] = [Facts(rows, "Made with")]

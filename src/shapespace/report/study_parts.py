@@ -1,4 +1,4 @@
-"""Each kind of part of a recognition.json or an analysis.json as blocks of a page."""
+"""Blocks of a page for each kind of part of a recognition.json or an analysis.json."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import structs
 
-from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.report import sections
-from shapespace.report.blocks import Block, Cell, Column, Figure, Folded, Notice, Table, Text, length
+from shapespace.errors import FileFormatError
+from shapespace.report.blocks import Block, Cell, Column, Figure, Folded, Table, Text, length
 from shapespace.report.page import Page
 from shapespace.report.saved import Folder
 from shapespace.report.wording import DASH, counted, listed, percent
@@ -24,17 +23,11 @@ from shapespace.schemas import (
     CalibrationPart,
     ConfusionPart,
     CurvePart,
-    FaceMapPart,
     HistogramPart,
     LearningCurvePart,
-    LinesPart,
-    MeshesPart,
-    ModesPart,
     MorphPart,
     Part,
-    Point,
     Recognition,
-    Still,
     SurfaceMapPart,
     TableColumn,
     TablePart,
@@ -44,21 +37,21 @@ from shapespace.schemas import (
 from shapespace.types import Mesh
 
 if TYPE_CHECKING:
-    from shapespace.report.figures import Coefficients
+    pass
 
 
 @dataclass(frozen=True)
-class Kept:
+class PartsFile:
     """A kind of file with parts.
 
     Args:
         file: its name.
-        struct: what it holds.
-        again: what a reader can do about one that is wrong.
-        word: what it holds, in a word,
-        article: with its article,
-        title: of a page without one,
-        lead: and below it.
+        struct: its content.
+        again: the advice for a damaged file.
+        word: a noun for its content.
+        article: the same with its article.
+        title: default title of its page.
+        lead: first sentence of its page.
     """
 
     file: str
@@ -69,16 +62,16 @@ class Kept:
     title: str
     lead: str
 
-    def wrong(self, what: str) -> FileFormatError:
-        """Return the error that says `what` is wrong with the file."""
-        return FileFormatError(f"{self.file} is damaged: {what}; {self.again}.")
+    def damaged(self, reason: str) -> FileFormatError:
+        """Return the error of a damaged file."""
+        return FileFormatError(f"{self.file} is damaged: {reason}; {self.again}.")
 
 
-STUDY = Kept(
+STUDY = PartsFile(
     "recognition.json", Recognition, STUDY_AGAIN, "study", "a study", "Recognition study",
     "What a study of recognition measured",
 )  # fmt: skip
-ANALYSIS = Kept(
+ANALYSIS = PartsFile(
     Analysis.FILE, Analysis, ANALYSIS_AGAIN, "analysis", "an analysis", "Analysis", "What an analysis of shapes found"
 )
 MOST_ROWS, MOST_PARAGRAPH = 500, 2000
@@ -88,10 +81,6 @@ TITLES = {
     "confusion": "Confusion matrix",
     "calibration": "Calibration",
     "learning_curve": "Learning curve",
-    "modes": "Modes that carry the decision",
-    "face_map": "Regions of the face that carry the decision",
-    "lines": "Lines through neutral",
-    "meshes": "Meshes",
     "curve": "Curve",
     "surface_map": "Map",
     "morph": "From one shape to the other",
@@ -104,18 +93,18 @@ Drawn = tuple[Any, str, str]
 
 
 class StudyParts:
-    """What turns parts into blocks of a page.
+    """Converts parts into blocks of a page.
 
     Args:
         page: that they go to.
         folder: with the arrays and meshes that they name.
-        kept: the kind of file that they stand in.
+        parts_file: the kind of file that holds them.
     """
 
-    def __init__(self, page: Page, folder: Folder, kept: Kept) -> None:
+    def __init__(self, page: Page, folder: Folder, parts_file: PartsFile) -> None:
         self.page = page
         self.folder = folder
-        self.kept = kept
+        self.parts_file = parts_file
 
     def blocks(self, part: Part, title: str) -> list[Block]:
         """Return a part by its kind.
@@ -137,9 +126,11 @@ class StudyParts:
     def table(self, part: TablePart, title: str, note: str) -> list[Block]:
         """Return a table that sorts."""
         if not 1 <= len(part.columns) <= _MOST_COLUMNS:
-            raise self.kept.wrong(f"a table has {len(part.columns)} columns, not 1 to {_MOST_COLUMNS}")
+            raise self.parts_file.damaged(f"a table has {len(part.columns)} columns, not 1 to {_MOST_COLUMNS}")
         if any(len(row) != len(part.columns) for row in part.rows):
-            raise self.kept.wrong(f"a row of a table has another number of cells than its {len(part.columns)} columns")
+            raise self.parts_file.damaged(
+                f"a row of a table has another number of cells than its {len(part.columns)} columns"
+            )
         heads = [
             Column(
                 f"{column.name} (mm)"
@@ -150,7 +141,7 @@ class StudyParts:
             for column in part.columns
         ]
         cells = [
-            [_cell(value, column, self.kept) for value, column in zip(row, part.columns, strict=True)]
+            [_cell(value, column, self.parts_file) for value, column in zip(row, part.columns, strict=True)]
             for row in part.rows[:MOST_ROWS]
         ]
         out: list[Block] = [Table(heads, cells, note or title, sortable=len(cells) > 1)]
@@ -164,7 +155,7 @@ class StudyParts:
 
         classes = part.classes
         if {len(row) for row in part.counts} - {len(classes)}:
-            raise self.kept.wrong(f"a confusion matrix of {len(classes)} classes has rows of another length")
+            raise self.parts_file.damaged(f"a confusion matrix of {len(classes)} classes has rows of another length")
         figure = figures.confusion_figure(part.counts, classes)
         totals = [sum(row) for row in part.counts]
         right = [f"{name} {percent(part.counts[k][k] / totals[k])}" for k, name in enumerate(classes) if totals[k]]
@@ -183,105 +174,34 @@ class StudyParts:
         return [picture, Folded("The same as a table", [table])]
 
     def calibration(self, part: CalibrationPart, title: str, note: str) -> list[Block]:
-        """Return how well stated probabilities hold."""
+        """Return the reliability diagram."""
         from shapespace.report import figures
 
         bins = np.array([structs.astuple(one) for one in part.bins], dtype=np.float64).reshape(-1, 5)
         figure = figures.calibration_figure(bins, ece=part.ece, brier=part.brier)
-        told = [f"stated {percent(said)}, right {percent(right)}" for _, _, said, right, count in bins if count > 0]
-        said = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
+        points = [f"stated {percent(p)}, right {percent(right)}" for _, _, p, right, count in bins if count > 0]
+        error = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
         about = (
             "How often answers are right, against the probability stated for them: under the dashed line they are "
             "right less often than stated. Larger dots stand for more answers, which the bars count."
         )
-        alt = f"Calibration: {listed(told, 20)}{said}"
+        alt = f"Calibration: {listed(points, 20)}{error}"
         return [self.page.figure(figure, f"{note} {about}".strip(), alt=alt, chart=True)]
 
     def learning_curve(self, part: LearningCurvePart, title: str, note: str) -> list[Block]:
-        """Return the accuracy against how many people were learned from."""
+        """Return the accuracy against the number of training people."""
         from shapespace.report import figures
 
         low, high = (None if ends is None else np.array(ends, dtype=np.float64) for ends in (part.low, part.high))
         figure = figures.learning_curve_figure(
             part.subjects, part.mean, low=low, high=high, band=part.band or "interval", ceiling=part.ceiling
         )
-        told = [
+        points = [
             f"{100 * mean:.1f} % from {count:g} subjects" for count, mean in zip(part.subjects, part.mean, strict=True)
         ]
-        said = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
+        ceiling = "" if part.ceiling is None else f"; ceiling {100 * part.ceiling:.1f} %"
         about = "Accuracy on subjects who were not in the training set, by the number of training subjects."
-        return [self.drawn((figure, about, f"Learning curve: {listed(told, 20)}{said}"), note)]
-
-    def modes(self, part: ModesPart, title: str, note: str) -> list[Block]:
-        """Return how much each mode carries of the decision."""
-        from shapespace.report import figures
-
-        values, unit = part.importance, part.unit
-        figure = figures.importance_figure(values, part.names, unit=unit)
-        called = part.names or [f"mode {k + 1}" for k in range(len(values))]
-        ranked = sorted(zip(values, called, strict=True), key=lambda pair: -pair[0])
-        told = listed([f"{name} {value:.3g}" for value, name in ranked[:10]])
-        alt = f"Importance of {counted(len(values), 'mode')} in {unit}, the largest: {told}"
-        return [self.drawn((figure, f"How much each mode carries of the decision, in {unit}.", alt), note)]
-
-    def face_map(self, part: FaceMapPart, title: str, note: str) -> list[Block]:
-        """Return where on the face the decision lies, and the share of each region."""
-        from shapespace.report import figures
-
-        vertices, faces, values = self._arrays(part.arrays, (part.vertices, part.faces, part.values))
-        numbers = all(array.dtype.kind in "iuf" for array in (vertices, values))
-        if not numbers or faces.dtype.kind not in "iu" or vertices.ndim != 2 or not np.isfinite(vertices).all():
-            raise self.kept.wrong("the arrays of a map are no places, triangles and numbers")
-        shares = sorted(part.regions.items(), key=lambda item: -item[1])
-        figure = figures.face_map_figure(vertices.astype(float), faces, values, unit=part.unit, regions=dict(shares))
-        told = listed([f"{name} {percent(share)}" for name, share in shares], 30)
-        alt = f"The face from the front and from aside, coloured by {part.unit}{f'; by region: {told}' if told else ''}"
-        out: list[Block] = [
-            self.drawn((figure, f"Where on the face the decision lies: {part.unit}.", alt), note, chart=False)
-        ]
-        if shares:
-            rows = [[Cell(name), Cell(f"{100 * share:.1f} %", share)] for name, share in shares[:MOST_ROWS]]
-            heads = [Column("Region"), Column("Share of the decision", "number")]
-            out.append(Folded("The shares as a table", [Table(heads, rows, title)]))
-        return out
-
-    def lines(self, part: LinesPart, title: str, note: str) -> list[Block]:
-        """Return the lines of the expressions in the first coefficients (figures 9 and 10 of the paper)."""
-        points = [_coefficients(point, self.kept) for point in part.points]
-        neutral = _coefficients(part.neutral, self.kept) if part.neutral else None
-        if not points or len({len(point.b) for point in (*points, *([neutral] if neutral else []))}) != 1:
-            raise self.kept.wrong(
-                "the points of lines must be one or more, all with as many coefficients as the neutral face"
-            )
-        lines = sections.lines_through_neutral(self.page, points, neutral)
-        return [*([Text(note)] if note else []), lines]
-
-    def meshes(self, part: MeshesPart, title: str, note: str) -> list[Block]:
-        """Return stills of meshes in rows; one that cannot be read leaves a grey field and says why."""
-        from shapespace.report import figures
-
-        problems: list[str] = []
-
-        def mesh(entry: Still) -> Mesh | None:
-            try:
-                found = self.folder.mesh(entry.file)
-                if not len(found.vertices) or not np.isfinite(found.vertices).all():
-                    raise self.kept.wrong(f"the mesh {entry.file!r} has no vertices, or some that are not finite")
-                return found
-            except ShapespaceError as error:
-                problems.append(f"{entry.label}: {error}")
-                return None
-
-        rows = [(row.label, [(entry.label, mesh(entry)) for entry in row.meshes]) for row in part.rows]
-        if problems and len(problems) == sum(len(pictures) for _, pictures in rows):
-            return [Notice("None of these meshes can be shown", problems, "broken")]
-        told = [f"{heading}: {listed([label for label, _ in pictures])}" for heading, pictures in rows]
-        drawing = (
-            figures.mesh_rows_figure(rows, title=title),
-            "One camera, one light and one scale for all.",
-            "; ".join(told)[:MOST_PARAGRAPH] or title,
-        )
-        return [self.drawn(drawing, note, chart=False), Notice("Not in the picture", problems, "broken")]
+        return [self.drawn((figure, about, f"Learning curve: {listed(points, 20)}{ceiling}"), note)]
 
     def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
         """Return one measure against another."""
@@ -294,7 +214,7 @@ class StudyParts:
             bands=[None if low is None or high is None else (_known(low), _known(high)) for low, high in ends],
             dots=[one.points for one in part.series], scales=(part.x_scale, part.y_scale), diagonal=part.diagonal,
         )  # fmt: skip
-        told = [
+        ranges = [
             f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
             for one in part.series
             if one.x and one.y
@@ -303,7 +223,7 @@ class StudyParts:
         bands = " Bands: its interval." if any(low is not None for low, _ in ends) else ""
         dashes = " Dashed: where both are the same." if part.diagonal else ""
         about += bands + dashes
-        return [self.drawn((figure, about, f"{about} {listed(told)}"), note)]
+        return [self.drawn((figure, about, f"{about} {listed(ranges)}"), note)]
 
     def surface_map(self, part: SurfaceMapPart, title: str, note: str) -> list[Block]:
         """Return a number for each vertex on a surface, seen from several sides."""
@@ -314,7 +234,7 @@ class StudyParts:
         mesh = self._mesh(vertices, faces)
         mask = masks[0].astype(bool) if masks else None
         if values.dtype.kind not in "iuf" or (mask is not None and masks[0].dtype.kind not in "biu"):
-            raise self.kept.wrong("the values of a map are no numbers, or its mask is none")
+            raise self.parts_file.damaged("the values of a map are no numbers, or its mask is none")
         values = values.astype(np.float64)
         figure = figures.surface_map_figure(
             mesh, values, unit=part.unit, signed=part.signed, limit=part.limit, mask=mask, title=None
@@ -334,20 +254,20 @@ class StudyParts:
 
         low, high, faces = self._arrays(part.arrays, (part.low, part.high, part.faces))
         if low.shape != high.shape:
-            raise self.kept.wrong("the two shapes of a morph have different numbers of vertices")
+            raise self.parts_file.damaged("the two shapes of a morph have different numbers of vertices")
         first, last = self._mesh(low, faces), self._mesh(high, faces)
         turn, _ = figures.looked_at(first)
         both = first.with_vertices(first.vertices @ turn.T), last.with_vertices(last.vertices @ turn.T)
         labels = part.low_label or "low", part.high_label or "high"
         still = figures.encode_webp(figures.morph_figure(*both, labels, title=None))
-        told = f"{title}: {labels[0]}, and {labels[1]}"
+        alt = f"{title}: {labels[0]}, and {labels[1]}"
         times = ""
         if part.times != 1:
             times = f" The difference is drawn {part.times:g} times as large as it is."
         turning = self.page.turning(
-            "morph", pack_morph(*both, labels), self.page.image(still, told),
+            "morph", pack_morph(*both, labels), self.page.image(still, alt),
             f"{note or f'From {labels[0]} to {labels[1]}.'}{times}",
-            label=told, still="The still shows both, from the front and from the side.",
+            label=alt, still="The still shows both, from the front and from the side.",
         )  # fmt: skip
         return [turning]
 
@@ -371,15 +291,15 @@ class StudyParts:
         arrays = self.folder.arrays(name)
         absent = [one for one in names if one not in arrays]
         if absent:
-            raise FileFormatError(f"{name} holds no array {absent[0]!r}; {self.kept.again}.")
+            raise FileFormatError(f"{name} holds no array {absent[0]!r}; {self.parts_file.again}.")
         return [arrays[one] for one in names]
 
     def _mesh(self, vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> Mesh:
         """Return a surface of arrays; without triangles, points."""
         if vertices.dtype.kind not in "iuf" or faces.dtype.kind not in "iu" or vertices.ndim != 2:
-            raise self.kept.wrong("the arrays of a surface are no places and triangles")
+            raise self.parts_file.damaged("the arrays of a surface are no places and triangles")
         if not np.isfinite(vertices).all():
-            raise self.kept.wrong("some vertices of a surface are not finite")
+            raise self.parts_file.damaged("some vertices of a surface are not finite")
         return Mesh(vertices.astype(np.float64), faces if faces.size else None, name="the surface")
 
 
@@ -388,42 +308,32 @@ _MAKERS: Mapping[type[Part], Callable[[StudyParts, Any, str, str], list[Block]]]
 }
 
 
-def paragraphs(said: str | tuple[str, ...]) -> list[Block]:
+def paragraphs(text: str | tuple[str, ...]) -> list[Block]:
     """Return sentences as paragraphs."""
-    return [Text(text) for text in ((said,) if isinstance(said, str) else said)[:MOST_ROWS]]
+    return [Text(sentence) for sentence in ((text,) if isinstance(text, str) else text)[:MOST_ROWS]]
 
 
 def _known(values: Sequence[float | None]) -> list[float]:
     return [float("nan") if value is None else value for value in values]
 
 
-def _coefficients(point: Point, kept: Kept) -> Coefficients:
-    from shapespace.report.figures import Coefficients
-
-    if len(point.b) != len(point.z):
-        raise kept.wrong(
-            f"a point of lines has {len(point.b)} coefficients in mm but {len(point.z)} in standard deviations"
-        )
-    return Coefficients(point.label, point.expression, point.intensity or 0.0, np.array(point.b), np.array(point.z))
-
-
-def _cell(value: object, column: TableColumn, kept: Kept) -> Cell:
+def _cell(value: object, column: TableColumn, parts_file: PartsFile) -> Cell:
     """Return a cell of a table by the kind of its column."""
-    where = f"{kept.file}: the column {column.name!r}"
+    where = f"{parts_file.file}: the column {column.name!r}"
     if column.kind == "text":
         return Cell(DASH if value in (None, "") else str(value))
     if value is None:
         return Cell(DASH, float("nan"))
     if column.kind == "interval":
-        low, high = read(tuple[float, float], value, where, kept.again)
+        low, high = read(tuple[float, float], value, where, parts_file.again)
         return Cell(f"{100 * low:.1f} to {100 * high:.1f} %", low)
-    found = read(float, value, where, kept.again)
+    number = read(float, value, where, parts_file.again)
     if column.kind == "mm":
-        return length(found)
-    told = {
-        "percent": f"{100 * found:.1f} %",
-        "p": "< 0.001" if found < 0.001 else f"{found:.3f}",
-        "count": f"{found:,.0f}",
-        "number": f"{found:,.0f}" if abs(found) >= 1000 else f"{found:.3g}",
+        return length(number)
+    texts = {
+        "percent": f"{100 * number:.1f} %",
+        "p": "< 0.001" if number < 0.001 else f"{number:.3f}",
+        "count": f"{number:,.0f}",
+        "number": f"{number:,.0f}" if abs(number) >= 1000 else f"{number:.3g}",
     }
-    return Cell(told[column.kind], found)
+    return Cell(texts[column.kind], number)

@@ -1,4 +1,4 @@
-"""The same study on scans of one's own: fitted with a given model, classified with nobody tested who was trained on."""
+"""Classify the labelled scans of a folder: fit them by a given model, and cross-validate by subject."""
 
 from __future__ import annotations
 
@@ -69,25 +69,25 @@ def run_own_study(
     """
     require_report_extra()
     make_folder(folder)
-    found = scan_set(data)
-    _check(found.scans, data, folds)
+    labelled = scan_set(data)
+    _check(labelled.scans, data, folds)
     loaded = load_model(model_file)
     model, additive = (loaded, None) if isinstance(loaded, ShapeModel) else (loaded.shape, loaded)
-    with progress(len(found.scans), "fitting", "scan", quiet=quiet) as bar:
+    with progress(len(labelled.scans), "fitting", "scan", quiet=quiet) as bar:
 
         def fitted(job: Job, record: FitRecord) -> None:
             bar.update()
 
-        jobs = make_jobs([entry.path for entry in found.scans])
+        jobs = make_jobs([entry.path for entry in labelled.scans])
         records = fit_files(
             jobs, model, model_file, make_folder(folder / "fits"), FitConfig(),
             executor=execution.executor(len(jobs), quiet=quiet), resume=True, on_done=fitted,
         )  # fmt: skip
-    fits = OwnFits.of(found.scans, records, model, additive)
+    fits = OwnFits.of(labelled.scans, records, model, additive)
     settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}
-    made = _document(fits, found.summary(), settings)
-    write_text(folder / "recognition.json", json.dumps(made, indent=1, allow_nan=False) + "\n")
-    return write_report(folder), found.summary()
+    content = _document(fits, labelled.summary(), settings)
+    write_text(folder / "recognition.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return write_report(folder), labelled.summary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +200,12 @@ def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
 
 def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return recognition.json."""
-    rows, folds, found = _compared(fits, settings)
+    rows, folds, predictions = _compared(fits, settings)
     test = evaluate.permutation_test(folds, permutations=99, seed=settings["seed"])
-    accuracy, interval = fits.accuracy_of(found.predicted)
-    labels, classes = fits.labels.tolist(), found.classes
+    accuracy, interval = fits.accuracy_of(predictions.predicted)
+    labels, classes = fits.labels.tolist(), predictions.classes
     doubtful, failed = fits.status.count("doubtful"), fits.status.count("failed")
-    made: list[Part] = [
+    report_parts: list[Part] = [
         TextPart(title="What was tested", text=(
             *holds.splitlines(),
             f"{doubtful} of {len(fits.status)} fits are doubtful and {failed} failed. Doubtful fits are classified "
@@ -221,16 +221,16 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
             f"{settings['folds']} folds by subject. With labels shuffled within each person LDA gets "
             f"{parts.words(float(test.null.mean()))} (p = {test.p:.3f}).",
         ),
-        *_by_intensity(fits, found),
-        parts.confusion("Confusion", labels, found.predicted, classes,
+        *_by_intensity(fits, predictions),
+        parts.confusion("Confusion", labels, predictions.predicted, classes,
                         "Classifier chosen inside the training people, neutral face unknown."),
-        parts.per_class("Each expression", labels, found.predicted, classes),
-        parts.calibration("Whether the probabilities come true", labels, found.probabilities, classes),
+        parts.per_class("Each expression", labels, predictions.predicted, classes),
+        parts.calibration("Whether the probabilities come true", labels, predictions.probabilities, classes),
     ]  # fmt: skip
     taught = fits.people * (settings["folds"] - 1) // settings["folds"]
     counts = [count for count in _CURVE if count < taught]
     if counts:
-        made.append(parts.learning_curve("How many people it takes", folds, counts, ceiling=None))
+        report_parts.append(parts.learning_curve("How many people it takes", folds, counts, ceiling=None))
     summary = [
         f"{len(classes)} expressions of unseen people are classified with an accuracy of {parts.words(accuracy)} "
         f"(95 % interval over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
@@ -238,7 +238,7 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
         f"{doubtful + failed} of {len(fits.status)} fits are not to be trusted.",
     ]
     title = f"Expressions in {len(fits.status)} scans of {fits.people} people"
-    return parts.document(title, summary, [], made, settings=settings, model_hashes=[fits.model_hash])
+    return parts.document(title, summary, [], report_parts, settings=settings, model_hashes=[fits.model_hash])
 
 
 def _compared(
@@ -267,7 +267,7 @@ def _compared(
     return rows, *last
 
 
-def _by_intensity(fits: OwnFits, found: evaluate.Predictions) -> list[Part]:
+def _by_intensity(fits: OwnFits, predictions: evaluate.Predictions) -> list[Part]:
     level = fits.level[fits.tested]
     levels = sorted(set(level.tolist()))
     if len(levels) < 2:
@@ -276,7 +276,10 @@ def _by_intensity(fits: OwnFits, found: evaluate.Predictions) -> list[Part]:
         parts.table(
             "By intensity",
             [("Intensity", "percent"), ("Macro accuracy", "percent"), ("Scans", "count")],
-            [(one, fits.accuracy_of(found.predicted, level == one)[0], int((level == one).sum())) for one in levels],
+            [
+                (one, fits.accuracy_of(predictions.predicted, level == one)[0], int((level == one).sum()))
+                for one in levels
+            ],
         )
     ]
 

@@ -64,13 +64,13 @@ def calibration(
     title: str, labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]
 ) -> CalibrationPart:
     """Return how often probabilities come true."""
-    found = evaluate.calibration(labels, probabilities, classes)
-    low = np.minimum(np.floor(10 * np.asarray(found.confidence)) / 10, 0.9)
+    curve = evaluate.calibration(labels, probabilities, classes)
+    low = np.minimum(np.floor(10 * np.asarray(curve.confidence)) / 10, 0.9)
     bins = tuple(
-        Bin(low=begins, high=begins + 0.1, confidence=said, accuracy=true, count=count)
-        for begins, said, true, count in zip(low, found.confidence, found.accuracy, found.count, strict=True)
+        Bin(low=begins, high=begins + 0.1, confidence=confidence, accuracy=true, count=count)
+        for begins, confidence, true, count in zip(low, curve.confidence, curve.accuracy, curve.count, strict=True)
     )
-    return CalibrationPart(title=title, bins=bins, ece=found.expected_calibration_error, brier=found.brier)
+    return CalibrationPart(title=title, bins=bins, ece=curve.expected_calibration_error, brier=curve.brier)
 
 
 def learning_curve(
@@ -142,6 +142,6 @@ def document(
         versions={name: version_of(name) for name in ("numpy", "scipy", "scikit-learn")},
         model_hashes=tuple(model_hashes),
     )
-    made = to_json(whole)
-    Recognition.from_json(made)
-    return made
+    content = to_json(whole)
+    Recognition.from_json(content)
+    return content

@@ -1,6 +1,6 @@
-"""One dropped scan, fitted in a process of its own by the call of the command line, and what it tells meanwhile.
+"""Fit one uploaded scan in a process of its own, with the function of the command line, and report its progress.
 
-What travels between the processes is JSON as bytes; pictures go through files in the scan's own folder.
+Messages between the processes are JSON as bytes; large data goes through files in the scan's folder.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ if TYPE_CHECKING:
 PREVIEW = "preview.bin"
 PICTURE = "fit.bin"
 NAME = "fit"
-"""NAME of the result files in the folder of a scan."""
+"""Stem of the result files in the folder of a scan."""
 
-LARGEST_SHOWN = 300_000
+MAX_TRIANGLES = 300_000
 """Triangles of a scan that are sent to the page; the fit uses all."""
-_LARGEST_MESSAGE = 2**24
-_SENT = (
+_MAX_MESSAGE_BYTES = 2**24
+_VERDICT_KEYS = (
     "status", "reason", "shown", "shown_scan_mm", "notes", "start", "seconds", "iterations", "b", "z", "b_stddev",
     "distances_mm",
 )  # fmt: skip
 """Keys of a record that are sent to the page."""
-_LOOK_EVERY_S = 0.05
+_POLL_S = 0.05
 
 DIED = "The fit ended unexpectedly, most likely for lack of memory; thin the scan and try again."
 TOO_LONG = "The fit took longer than {:.0f} minutes and was stopped; thin or crop the scan and try again."
-STOPPED = "It was stopped before it came to an end; drop the scan again to start anew."
+STOPPED = "The fit was stopped; drop the scan again to restart it."
 NO_PROCESS = "The system does not let a process for the fit start; close other programs and try again."
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A dropped scan as its worker needs it.
+    """An uploaded scan and the settings of its fit.
 
     Args:
         scan: the uploaded file, under a name of our own.
-        shown: the file's name as its owner knows it; for messages and the record, never a path.
-        folder: where results go.
+        display_name: the user's file name, for messages and the record; never used as a path.
+        folder: for the results.
         model: the model's file.
         model_name: the model's name, for the record.
-        landmarks: points to start from, or None.
-        dense: whether the surface is then taken the rest of the way to the scan.
+        landmarks: file of landmarks to start from, or None.
+        dense: whether to compute the dense surface too.
     """
 
     scan: Path
-    shown: str
+    display_name: str
     folder: Path
     model: Path
     model_name: str
@@ -73,8 +73,8 @@ Message: TypeAlias = Mapping[str, Any]
 
 
 def fit_upload(pipe: Connection, upload: Upload) -> None:
-    """Fit `upload` and tell of it: the scan, each state of the loop, the verdict; runs in a worker process."""
-    _step_back()
+    """Fit `upload` and send the scan, each iterate and the verdict through `pipe`; runs in a worker process."""
+    _lower_priority()
     from msgspec import structs
 
     from shapespace.batch.fit_work import Job, fit_file
@@ -84,12 +84,12 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
     from shapespace.fit.state import IcpState
     from shapespace.model.shape_model import ShapeModel
 
-    def tell(event: str, **facts: Any) -> None:
+    def send(event: str, **facts: Any) -> None:
         pipe.send_bytes(json.dumps({"event": event, **facts}).encode())
 
     def on_state(state: IcpState) -> None:
         T = state.T_scan_model
-        tell(
+        send(
             "state",
             phase=state.phase,
             iteration=state.iteration,
@@ -101,33 +101,34 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
         )
 
     model = ShapeModel.load(upload.model)
-    # A file that cannot be shown cannot be fitted either, and the record says why.
+    # A file that cannot be read cannot be fitted either, and the record holds the reason.
     with contextlib.suppress(ShapespaceError, MemoryError):
-        tell("scan", **_preview(model, upload))
+        send("scan", **_preview(model, upload))
     job, config = Job(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
     record = fit_file(job, model, upload.model, upload.folder, config, stages=True, on_state=on_state)
-    # Our own names and folders mean nothing to the visitor.
+    # Our own names and folders mean nothing to the user.
     record = structs.replace(
         record,
-        scan=structs.replace(record.scan, name=upload.shown, path=""),
+        scan=structs.replace(record.scan, name=upload.display_name, path=""),
         model=structs.replace(record.model, name=upload.model_name, path=""),
-        reason=_with_shown_name(record.reason, upload),
-        notes=tuple(_with_shown_name(note, upload) for note in record.notes),
+        reason=_with_display_name(record.reason, upload),
+        notes=tuple(_with_display_name(note, upload) for note in record.notes),
     )
     write_record(upload.folder / f"{NAME}.fit.json", record)
-    pictured, why = False, ""
+    pictured, error_text = False, ""
     if record.is_fitted:
         try:
-            _picture(upload)
+            _write_picture(upload)
             pictured = True
         except ShapespaceError as error:
-            why = _with_shown_name(str(error), upload)
+            error_text = _with_display_name(str(error), upload)
     content = record.to_json()
-    tell("verdict", pictured=pictured, why_not=why, **{key: content[key] for key in _SENT if key in content})
+    facts = {key: content[key] for key in _VERDICT_KEYS if key in content}
+    send("verdict", pictured=pictured, why_not=error_text, **facts)
 
 
 def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
-    """Write the scan in mm about an origin of its own, and return what leads from there back to the file's frame."""
+    """Write the scan in mm and centred, and return the origin and unit that lead back to the file's frame."""
     import numpy as np
 
     from shapespace.errors import FitError
@@ -145,11 +146,11 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
         mm = 1.0
     # The frame that the states of the fit are in.
     T_mm_scan = mm_frame(scan, mm)
-    placed, _ = thinned(scan.with_vertices(T_mm_scan.apply(scan.vertices)), LARGEST_SHOWN)
+    placed, _ = thinned(scan.with_vertices(T_mm_scan.apply(scan.vertices)), MAX_TRIANGLES)
     arrays: dict[str, Any] = {"vertices": placed.vertices.astype(np.float32)}
     if placed.faces is not None:
         arrays["faces"] = placed.faces.astype(np.uint32)
-    (upload.folder / PREVIEW).write_bytes(pack(arrays, {"name": upload.shown}))
+    (upload.folder / PREVIEW).write_bytes(pack(arrays, {"name": upload.display_name}))
     return {
         "origin": T_mm_scan.inverse().translation.tolist(),
         "mm_per_scan_unit": mm,
@@ -158,31 +159,31 @@ def _preview(model: ShapeModel, upload: Upload) -> dict[str, Any]:
     }
 
 
-def _picture(upload: Upload) -> None:
+def _write_picture(upload: Upload) -> None:
     from shapespace.report.saved import Folder, find_fits, staged_fit
 
     folder = Folder(upload.folder)
-    (found,) = find_fits(folder)
-    (upload.folder / PICTURE).write_bytes(packed(staged_fit(folder, found.with_entry(name=upload.shown))))
+    (fit,) = find_fits(folder)
+    (upload.folder / PICTURE).write_bytes(pack_staged(staged_fit(folder, fit.with_entry(name=upload.display_name))))
 
 
-def packed(staged: StagedFit) -> bytes:
-    """Return a fit for the page, with all its iterations; a scan of very many triangles is thinned."""
+def pack_staged(staged: StagedFit) -> bytes:
+    """Return a fit with all its iterations for the page; a scan with too many triangles is thinned."""
     from shapespace.report.scene import pack_fit
 
-    return pack_fit(staged, most_sent=LARGEST_SHOWN)
+    return pack_fit(staged, most_sent=MAX_TRIANGLES)
 
 
-def _with_shown_name(sentence: str, upload: Upload) -> str:
-    """Return `sentence` with the file's own name in place of ours, and without our folders."""
-    ours = f"{re.escape(str(upload.scan))}|{re.escape(upload.scan.name)}"
+def _with_display_name(sentence: str, upload: Upload) -> str:
+    """Return `sentence` with the user's file name in place of ours, and without our folders."""
+    own_names = f"{re.escape(str(upload.scan))}|{re.escape(upload.scan.name)}"
     for folder in (upload.folder, upload.model.parent):
         sentence = sentence.replace(f"{folder}{os.sep}", "")
-    return re.sub(ours, lambda _: upload.shown, sentence)
+    return re.sub(own_names, lambda _: upload.display_name, sentence)
 
 
-def _step_back() -> None:
-    """Let the server go first: it gets the cores it asks for, and lives when memory ends."""
+def _lower_priority() -> None:
+    """Prefer the server: for processor time, and as the process that survives when memory runs out."""
     if sys.platform != "win32":
         os.nice(5)
     if sys.platform == "linux":
@@ -190,46 +191,45 @@ def _step_back() -> None:
             Path("/proc/self/oom_score_adj").write_text("1000")
 
 
-def converse(
-    worker: Worker, upload: Upload, tell: Callable[[Message], None], stop: threading.Event, limit_s: float
+def run_worker(
+    worker: Worker, upload: Upload, on_message: Callable[[Message], None], stop: threading.Event, limit_s: float
 ) -> str | None:
-    """Run `worker` in a process, hand on what it tells, and return one sentence where it did not reach a verdict.
+    """Run `worker` in a process, and return an error sentence if it ends without a verdict.
 
     Args:
         worker: a function that a new process can import.
-        upload: what it is given.
-        tell: called with each message, in this thread.
+        upload: its argument.
+        on_message: called with each message, in this thread.
         stop: ends the process when set.
-        limit_s: seconds after which it is ended.
+        limit_s: seconds after which the process is ended.
     """
     if stop.is_set():
         return STOPPED
-    ours, theirs = context().Pipe(duplex=False)
-    process = context().Process(target=worker, args=(theirs, upload), daemon=True)
+    receiver, sender = context().Pipe(duplex=False)
+    process = context().Process(target=worker, args=(sender, upload), daemon=True)
     try:
         process.start()
     except (EOFError, OSError):
-        ours.close()
+        receiver.close()
         return NO_PROCESS
     finally:
-        theirs.close()
-    ends = time.monotonic() + limit_s
-    done = False
+        sender.close()
+    deadline = time.monotonic() + limit_s
     try:
-        while not done:
-            if stop.is_set():
-                return STOPPED
-            if time.monotonic() > ends:
+        while not stop.is_set():
+            if time.monotonic() > deadline:
                 return TOO_LONG.format(limit_s / 60)
-            if ours.poll(_LOOK_EVERY_S):
-                message: dict[str, Any] = json.loads(ours.recv_bytes(_LARGEST_MESSAGE))
-                done = message["event"] == "verdict"
-                tell(message)
+            if receiver.poll(_POLL_S):
+                message: Message = json.loads(receiver.recv_bytes(_MAX_MESSAGE_BYTES))
+                is_verdict = message["event"] == "verdict"
+                on_message(message)
+                if is_verdict:
+                    return None
+        return STOPPED
     except (EOFError, OSError, ValueError, KeyError):
         return DIED
     finally:
         process.kill()
         process.join()
         process.close()
-        ours.close()
-    return None
+        receiver.close()

@@ -1,4 +1,4 @@
-"""What the viewer shows of a folder in correspondence: surfaces one by one, and where a vertex lies on all of them."""
+"""Data of the viewer's page of corresponding surfaces: single surfaces, and the position of a vertex on all of them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from shapespace.report.triage import Concern, concerns_of, distance_share, scan_
 from shapespace.report.wording import without_folders
 from shapespace.version import __version__
 
-MOST_MARKED = 100
-"""So many vertices are told of all scans at a time."""
+MAX_MARKED = 100
+"""Vertices whose positions can be asked for at a time."""
 
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20
-_BYTES_A_VERTEX = 6
-_ORDER = ("unreadable", "set aside", "look", "corresponding")
+_BYTES_PER_VERTEX = 6
+_STATUS_ORDER = ("unreadable", "set aside", "look", "corresponding")
 
 
 class Surfaces:
@@ -41,23 +41,24 @@ class Surfaces:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.at = Corresponded(folder)
-        self._reading = Lock()
-        self.packed_surface = lru_cache(maxsize=2 * _PAGE)(self._packed_surface)
+        self._corresponded = Corresponded(folder)
+        self._lock = Lock()
+        self._packed_mean: bytes | None = None
+        self.packed_surface = lru_cache(maxsize=2 * _PAGE)(self._pack_surface)
 
     def about(self) -> dict[str, Any]:
-        """Return what the page must know before all else; nothing large is read."""
-        run = self.at.run
-        page = _PAGE_BYTES // (_BYTES_A_VERTEX * max(len(self.at.mean.vertices), 1))
+        """Return the counts and colours that the page needs first, without reading surfaces."""
+        run = self._corresponded.run
+        page = _PAGE_BYTES // (_BYTES_PER_VERTEX * max(len(self._corresponded.mean.vertices), 1))
         return {
             "version": __version__,
-            "name": self.at.root.resolve().name,
-            "scans": len(self.at.records) + len(self.at.unread),
-            "corresponding": len(self.at.corresponding),
-            "vertices": len(self.at.mean.vertices),
+            "name": self._corresponded.root.resolve().name,
+            "scans": len(self._corresponded.records) + len(self._corresponded.unread),
+            "corresponding": len(self._corresponded.corresponding),
+            "vertices": len(self._corresponded.mean.vertices),
             "rounds": list(run.rounds),
             "page": max(1, min(_PAGE, page)),
-            "most_marked": MOST_MARKED,
+            "most_marked": MAX_MARKED,
             "clay": colours.CLAY,
             "unknown_colour": colours.UNKNOWN_COLOUR,
             "sequential": colours.as_list(colours.SEQUENTIAL),
@@ -66,10 +67,15 @@ class Surfaces:
         }
 
     def packed_mean(self) -> bytes:
-        """Return the mean shape, upright, its squares, and how many scans show each vertex."""
-        with self._reading:
-            population = self.at.population()
-        mean = self.at.mean
+        """Return the mean shape, upright, its checkerboard, and the number of scans that show each vertex."""
+        with self._lock:
+            if self._packed_mean is None:
+                self._packed_mean = self._pack_mean()
+            return self._packed_mean
+
+    def _pack_mean(self) -> bytes:
+        population = self._corresponded.population()
+        mean = self._corresponded.mean
         along, across = checker_places(mean)
         arrays = {
             "positions": mean.vertices,
@@ -79,33 +85,33 @@ class Surfaces:
         }
         return pack(arrays, {"scans": len(population.names)})
 
-    def listed(self) -> list[dict[str, Any]]:
-        """Return all scans, those to look at first in front."""
-        with self._reading:
-            population = self.at.population()
-        concerns = concerns_of(self.at)
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the list of scans, those with concerns first."""
+        with self._lock:
+            population = self._corresponded.population()
+        concerns = concerns_of(self._corresponded)
         sizes = dict(zip(population.names, population.sizes.tolist(), strict=True))
         rows: list[dict[str, Any]] = [
-            {"name": name, "status": "unreadable", "told": self.told(why), "weight": 0.0, "distance": None}
-            for name, why in self.at.unread.items()
+            {"name": name, "status": "unreadable", "reason": self.public(reason), "weight": 0.0, "distance": None}
+            for name, reason in self._corresponded.unread.items()
         ]
-        for name, record in self.at.records.items():
+        for name, record in self._corresponded.records.items():
             status = scan_status(record, concerns)
-            why = record.reason or population.unread.get(name) or concerns.get(name, Concern()).told
+            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).told
             share = distance_share(record, "mean", sizes[name]) if name in sizes else math.nan
             rows.append(
                 {
                     "name": name,
                     "status": status,
-                    "told": self.told(sentence(why)),
+                    "reason": self.public(sentence(reason)),
                     "weight": concerns.get(name, Concern()).weight,
                     "distance": share if math.isfinite(share) else None,
                     "seen": record.seen_share,
                 }
             )
-        return sorted(rows, key=lambda row: (_ORDER.index(row["status"]), -row["weight"], row["name"]))
+        return sorted(rows, key=lambda row: (_STATUS_ORDER.index(row["status"]), -row["weight"], row["name"]))
 
-    def _packed_surface(self, name: str) -> bytes:
+    def _pack_surface(self, name: str) -> bytes:
         """Return the surface of the scan `name`, moved onto the mean shape.
 
         Raises:
@@ -113,32 +119,32 @@ class Surfaces:
             FileFormatError: it is damaged.
             KeyError: there is no such scan in correspondence.
         """
-        if self.at.records[name].status != "corresponding":
+        if self._corresponded.records[name].status != "corresponding":
             raise KeyError(name)
-        with self._reading:
-            self.at.population()
-        vertices = self.at.placed(name).vertices
+        with self._lock:
+            self._corresponded.population()
+        vertices = self._corresponded.placed(name).vertices
         return pack({"positions": quantised(vertices, coded=True)}, {"name": name})
 
-    def places(self, vertices: Sequence[int]) -> str:
-        """Return a CSV of where `vertices` lie on every scan, in its own frame and unit; empty where it shows nothing.
+    def positions_csv(self, vertices: Sequence[int]) -> str:
+        """Return a CSV of the positions of `vertices` on every scan, in its own frame and unit; empty where missing.
 
         Raises:
-            InputError: a number that is no vertex, or too many of them.
+            InputError: a number is not that of a vertex, or there are too many.
         """
-        count = len(self.at.mean.vertices)
-        if not 0 < len(vertices) <= MOST_MARKED or not all(0 <= vertex < count for vertex in vertices):
-            raise InputError(f"Give 1 to {MOST_MARKED} numbers of vertices, each from 0 to {count - 1}.")
+        count = len(self._corresponded.mean.vertices)
+        if not 0 < len(vertices) <= MAX_MARKED or not all(0 <= vertex < count for vertex in vertices):
+            raise InputError(f"Give 1 to {MAX_MARKED} numbers of vertices, each from 0 to {count - 1}.")
         rows: list[tuple[object, ...]] = []
-        for record in self.at.corresponding:
+        for record in self._corresponded.corresponding:
             try:
-                own = self.at.surface(record.name).vertices[list(vertices)]
+                points = self._corresponded.surface(record.name).vertices[list(vertices)]
             except ShapespaceError:
-                own = np.full((len(vertices), 3), np.nan)
-            for vertex, point in zip(vertices, own.tolist(), strict=True):
+                points = np.full((len(vertices), 3), np.nan)
+            for vertex, point in zip(vertices, points.tolist(), strict=True):
                 rows.append((record.name, vertex, *(value if math.isfinite(value) else "" for value in point)))
         return table_text(("scan", "vertex", "x", "y", "z"), rows)
 
-    def told(self, sentence: str) -> str:
-        """Return `sentence` as visitors may read it: without the folders of this machine."""
+    def public(self, sentence: str) -> str:
+        """Return `sentence` without the folders of this machine."""
         return without_folders(sentence)

@@ -1,96 +1,64 @@
-"""The viewer's application for a folder in correspondence: it only reads, and knows no visitors."""
+"""The viewer's application for a folder of corresponding surfaces; it only reads."""
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager
-from typing import Any
-
-from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from shapespace.viewer.answers import PAGES, answer, application, asset, binary
 from shapespace.viewer.guard import Access, Guard
+from shapespace.viewer.responses import PAGES, application, asset, binary, json_response
 from shapespace.viewer.surfaces import Surfaces
 
-_LONGEST = 2000
+_MAX_QUERY = 2000
 
 
 def make_surfaces_app(
-    surfaces: Surfaces, *, access: Access, local: bool = True, cookie_name: str = "shapespace"
+    surfaces: Surfaces, access: Access, *, loopback: bool = True, cookie_name: str = "shapespace"
 ) -> ASGIApp:
     """Return the application.
 
     Args:
-        surfaces: what it shows.
-        access: what every request must carry.
-        local: whether it is for this machine alone.
-        cookie_name: of its cookie; browsers share cookies between ports, so it should name the port.
+        surfaces: the folder.
+        access: the secrets of this viewer.
+        loopback: whether only this machine can reach the server.
+        cookie_name: browsers share cookies between ports, so the name should contain the port.
     """
-    shown = _Viewer(surfaces)
 
-    @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
-        # All surfaces are read once while the browser still opens.
-        reading: asyncio.Task[Any] = asyncio.create_task(shown.packed_mean())
-        try:
-            yield
-        finally:
-            reading.cancel()
-            await asyncio.gather(reading, return_exceptions=True)
-
-    routes = [
-        Route("/", shown.page),
-        Route("/assets/{name}", asset),
-        Route("/api/about", shown.about),
-        Route("/api/mean", shown.mean),
-        Route("/api/surfaces", shown.listed),
-        Route("/api/surfaces/{name}", shown.surface),
-        Route("/api/places", shown.places),
-    ]
-    app = application(routes, lifespan, surfaces.told)
-    return Guard(app, access=access, cookie=f"{cookie_name}_token", local=local)
-
-
-class _Viewer:
-    def __init__(self, surfaces: Surfaces) -> None:
-        self._surfaces = surfaces
-        self._packed: bytes | None = None
-        self._packing = asyncio.Lock()
-
-    async def page(self, request: Request) -> Response:
+    def page(request: Request) -> Response:
         return FileResponse(PAGES / "surfaces.html", media_type="text/html")
 
-    async def about(self, request: Request) -> Response:
-        return answer(self._surfaces.about())
+    def about(request: Request) -> Response:
+        return json_response(surfaces.about())
 
-    async def mean(self, request: Request) -> Response:
-        return binary(await self.packed_mean())
+    def mean(request: Request) -> Response:
+        return binary(surfaces.packed_mean())
 
-    async def packed_mean(self) -> bytes:
-        async with self._packing:
-            if self._packed is None:
-                self._packed = await asyncio.to_thread(self._surfaces.packed_mean)
-            return self._packed
+    def surface_list(request: Request) -> Response:
+        return json_response(surfaces.rows())
 
-    async def listed(self, request: Request) -> Response:
-        return answer(await asyncio.to_thread(self._surfaces.listed))
-
-    async def surface(self, request: Request) -> Response:
+    def surface(request: Request) -> Response:
         try:
-            packed = await asyncio.to_thread(self._surfaces.packed_surface, request.path_params["name"])
+            return binary(surfaces.packed_surface(request.path_params["name"]))
         except KeyError:
             raise HTTPException(404, "There is no such scan in correspondence; reload the page.") from None
-        return binary(packed)
 
-    async def places(self, request: Request) -> Response:
-        given = request.query_params.get("vertices", "")[:_LONGEST].split(",")
-        if not all(part.isascii() and part.isdigit() for part in given):
+    def positions(request: Request) -> Response:
+        numbers = request.query_params.get("vertices", "")[:_MAX_QUERY].split(",")
+        if not all(part.isascii() and part.isdigit() for part in numbers):
             raise HTTPException(400, "Give the numbers of vertices with commas between them.")
-        text = await asyncio.to_thread(self._surfaces.places, [int(part) for part in given])
-        return binary(text.encode(), "places.csv")
+        return binary(surfaces.positions_csv([int(part) for part in numbers]).encode(), "places.csv")
+
+    routes = [
+        Route("/", page),
+        Route("/assets/{name}", asset),
+        Route("/api/about", about),
+        Route("/api/mean", mean),
+        Route("/api/surfaces", surface_list),
+        Route("/api/surfaces/{name}", surface),
+        Route("/api/places", positions),
+    ]
+    app = application(routes, surfaces.public)
+    return Guard(app, access=access, cookie_name=cookie_name, loopback=loopback)

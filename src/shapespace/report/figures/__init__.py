@@ -58,10 +58,7 @@ from shapespace.report.figures.recognition import (
     calibration_figure,
     confusion_figure,
     curve_figure,
-    face_map_figure,
-    importance_figure,
     learning_curve_figure,
-    mesh_rows_figure,
 )
 from shapespace.report.staged import StagedFit
 
@@ -86,16 +83,13 @@ __all__ = [
     "distributions_figure",
     "encode_webp",
     "error_curves",
-    "face_map_figure",
     "faces_grid",
     "histogram_figure",
     "history_figure",
-    "importance_figure",
     "learning_curve_figure",
     "levels_figure",
     "looked_at",
     "mean_figure",
-    "mesh_rows_figure",
     "missing_figure",
     "mode_animation",
     "modes_figure",

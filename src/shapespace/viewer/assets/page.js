@@ -104,7 +104,7 @@
       const now = document.documentElement.dataset.theme || (dark ? "dark" : "light");
       const next = now === "dark" ? "light" : "dark";
       document.documentElement.dataset.theme = next;
-      try { localStorage.setItem("shapespace-theme", next); } catch (refused) { /* the choice lasts for this visit */ }
+      try { localStorage.setItem("shapespace-theme", next); } catch (refused) { /* the choice is not stored */ }
       changed();
     });
   }

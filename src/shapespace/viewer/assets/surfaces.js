@@ -126,10 +126,10 @@
 
   function filterRows() {
     const asked = $("filter").value.trim().toLowerCase();
-    const found = rows.filter((row) => `${row.name} ${WORDS[row.status]} ${row.told}`.toLowerCase().includes(asked));
+    const found = rows.filter((row) => `${row.name} ${WORDS[row.status]} ${row.reason}`.toLowerCase().includes(asked));
     wanted = found.filter(pictured);
     $("list").replaceChildren(...found.slice(0, 500).map((row) => h("p", { class: DOTS[row.status], "data-testid": `row-${row.name}` },
-      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "corresponding" ? null : h("small", {}, row.told)))));
+      h("span", { class: "dot" }), h("span", {}, h("strong", {}, row.name), ` ${WORDS[row.status]}`, row.status === "corresponding" ? null : h("small", {}, row.reason)))));
     showPage(0);
   }
 

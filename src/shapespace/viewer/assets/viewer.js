@@ -575,10 +575,10 @@
   // Your scan -------------------------------------------------------------------------------------------------------
 
   let own = null; // the one that is looked at
-  const dropped = []; // all of this visit: {id, name, file, dense, states, preview, said, verdict, placing, ...}
+  const dropped = []; // {id, name, file, dense, states, preview, said, verdict, placing, ...}
   let sending = false;
 
-  const fresh = () => ({ states: [], preview: null, previewed: false, said: null, verdict: null, helped: false, placing: null, frame: null });
+  const fresh = () => ({ states: [], preview: null, previewed: false, said: null, verdict: null, helped: false, placing: null, frame: null, scheduled: 0, run: 0 });
 
   function suits(name) {
     const ending = (/\.[^.]+$/.exec(name.toLowerCase()) || [""])[0];
@@ -690,56 +690,48 @@
     if (own === mine && mine.preview && !mine.verdict) drawScanStates();
   }
 
-  function follow(mine) {
-    const source = new EventSource(`/api/scans/${mine.id}/events`);
-    mine.source = source;
+  const POLL_MS = 100;
+
+  /** Ask the server for the progress of a fit until it is done or removed. */
+  const follow = telling(async (mine) => {
+    const { run } = mine;
     mine.done = false;
-    let scheduled = 0;
-    source.onmessage = telling(async (event) => {
-      const told = JSON.parse(event.data);
-      if (told.event === "queue") say(mine, told.position > 1 ? `Waiting: ${told.position - 1} before it` : "Waiting for a free place", null);
-      else if (told.event === "started") say(mine, "Reading the scan", null);
-      else if (told.event === "scan") {
-        Object.assign(mine, { origin: told.origin, unit: told.mm_per_scan_unit, previewed: true });
-        say(mine, `${told.vertices.toLocaleString("en")} vertices; looking for a place to start`, null);
-        if (own === mine) await drawPreview(mine);
-      } else if (told.event === "state") {
-        mine.states.push(told);
-        if (!scheduled) scheduled = requestAnimationFrame(() => { scheduled = 0; if (!mine.verdict) tellState(mine); });
-      } else if (told.event === "verdict") {
-        mine.verdict = told;
-        if (told.b) {
-          shapes.set(`scan ${mine.id}`, { name: mine.name, z: told.z });
-          fillChoices();
-        }
-        listScans();
-        if (own === mine) await showVerdict(mine);
-      } else if (told.event === "done") {
-        source.close();
-        Object.assign(mine, { done: true, helped: told.can_place_landmarks });
+    for (let after = 0; dropped.includes(mine) && mine.run === run;) {
+      const progress = await json(`/api/scans/${mine.id}/progress?after=${after}`);
+      after += progress.events.length;
+      if (progress.state === "waiting") say(mine, progress.position > 1 ? `Waiting: ${progress.position - 1} before it` : "Waiting for a free place", null);
+      else if (!after) say(mine, "Reading the scan", null);
+      for (const event of progress.events) await telling(handleEvent)(mine, event);
+      if (progress.state === "done") {
+        Object.assign(mine, { done: true, helped: progress.can_place_landmarks });
         if (own === mine) {
           $("progress").hidden = true;
           if (mine.helped && !mine.placing) offerLandmarks(mine);
         }
         sendNext();
-      } else if (told.event === "removed") source.close();
-    });
-    source.onerror = () => {
-      // The browser tries again by itself; what matters is whether there is still a server, and still this scan.
-      setTimeout(telling(async () => {
-        if (mine.source !== source || mine.verdict) return;
-        let known = null;
-        try {
-          known = (await json("/api/scans")).some((scan) => scan.id === mine.id);
-        } finally {
-          if (!known) {
-            source.close();
-            if (own === mine) $("progress").hidden = true;
-          }
-        }
-        if (!known) throw new Error("The visit has ended, and its scans were removed; reload the page.");
-      }), 1500);
-    };
+        return;
+      }
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    }
+  });
+
+  async function handleEvent(mine, event) {
+    if (event.event === "scan") {
+      Object.assign(mine, { origin: event.origin, unit: event.mm_per_scan_unit, previewed: true });
+      say(mine, `${event.vertices.toLocaleString("en")} vertices; looking for a place to start`, null);
+      if (own === mine) await drawPreview(mine);
+    } else if (event.event === "state") {
+      mine.states.push(event);
+      if (!mine.scheduled) mine.scheduled = requestAnimationFrame(() => { mine.scheduled = 0; if (!mine.verdict) tellState(mine); });
+    } else if (event.event === "verdict") {
+      mine.verdict = event;
+      if (event.b) {
+        shapes.set(`scan ${mine.id}`, { name: mine.name, z: event.z });
+        fillChoices();
+      }
+      listScans();
+      if (own === mine) await showVerdict(mine);
+    }
   }
 
   function tellState(mine) {
@@ -805,6 +797,11 @@
     $("verdict").replaceChildren(...[card, distanceFacts(told), told.why_not ? h("p", {}, told.why_not) : null].filter(Boolean));
     $("verdict").hidden = false;
     $("progress").hidden = true;
+    const remove = h("button", { type: "button", "data-testid": "scan-remove", onclick: guarded(async () => {
+      await ask(`/api/scans/${mine.id}`, { method: "DELETE" });
+      drop(mine);
+    }) }, "Remove from the server");
+    if (!told.pictured) $("verdict").append(h("div", { class: "row" }, remove));
     if (!told.b) {
       if (mine.previewed && !mine.preview) mine.preview = await binary(`/api/scans/${mine.id}/preview`);
       if (own !== mine) return;
@@ -822,16 +819,11 @@
     $("scan-detail").append(h("div", { class: "row" },
       h("button", { type: "button", "data-testid": "scan-record", onclick: guarded(async () => {
         save(await (await ask(`/api/scans/${mine.id}/record`)).blob(), `${mine.name.replace(/\.[^.]*$/, "")}.fit.json`);
-      }) }, "Record (JSON)"),
-      h("button", { type: "button", "data-testid": "scan-remove", onclick: guarded(async () => {
-        await ask(`/api/scans/${mine.id}`, { method: "DELETE" });
-        drop(mine);
-      }) }, "Remove from the server")));
+      }) }, "Record (JSON)"), remove));
   }
 
   /** Forget a scan that the server has removed, or never had. */
   function drop(mine) {
-    if (mine.source) mine.source.close();
     dropped.splice(dropped.indexOf(mine), 1);
     shapes.delete(`scan ${mine.id}`);
     fillChoices();
@@ -975,14 +967,14 @@
     await ask(`/api/scans/${mine.id}/landmarks`, post({ landmarks }));
     $("scan-detail").hidden = false;
     scanView.active = shown === "scan";
-    Object.assign(mine, fresh());
+    Object.assign(mine, fresh(), { run: mine.run + 1 });
     say(mine, "Starting from your landmarks", null);
     look(mine);
     follow(mine);
   });
 
   async function startScan() {
-    $("zone-hint").textContent = `${about.formats.map((ending) => ending.slice(1).toUpperCase()).join(", ")}, up to ${Math.round(about.upload_bytes / 2 ** 20)} MB. It is fitted on the machine where the viewer runs; no other visitor sees it, and the file is removed after the fit.`;
+    $("zone-hint").textContent = `${about.formats.map((ending) => ending.slice(1).toUpperCase()).join(", ")}, up to ${Math.round(about.upload_bytes / 2 ** 20)} MB. It is fitted on the machine where the viewer runs, and the file is removed after the fit.`;
     $("file").accept = about.formats.join(",");
     $("choose").addEventListener("click", () => $("file").click());
     $("file").addEventListener("change", () => { dropFiles(Array.from($("file").files)); $("file").value = ""; });
@@ -1003,7 +995,6 @@
     for (const { id, name, dense } of earlier) {
       const mine = { id, name, dense, ...fresh() };
       dropped.push(mine);
-      // Those that have ended are told of at once, and their streams close.
       follow(mine);
     }
     if (dropped.length) {

@@ -1,4 +1,4 @@
-"""What a viewer shows: a model, and the fits of a folder, ready to be sent to the page."""
+"""Data of the viewer's page: a model and the fits of a folder."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -33,39 +34,42 @@ from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest
 from shapespace.store.results import results_at
 from shapespace.types import Mesh
-from shapespace.viewer.fitting import packed
+from shapespace.viewer.fitting import pack_staged
 
-MODEL_BYTES = 48 * 2**20
-"""Modes beyond this size as sent are left out, and the page says so; in the browser they take twice as much."""
-MOST_LISTED = 1000
-"""Fits of a store that the page lists: those that need a look most."""
-_ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
+MAX_MODEL_BYTES = 48 * 2**20
+"""Modes beyond this size are not sent, and the page says so; in the browser they take twice as much memory."""
+_BYTES_PER_VERTEX = 6
+MAX_LISTED = 1000
+"""Fits of a store that the page lists: those with the most concerns."""
+_STATUS_ORDER = ("unreadable", "failed", "doubtful", "max_iterations", "converged")
 _DIGITS = 6
 
 
-class Shown:
-    """A model, and perhaps a folder of fits by it.
+class ModelView:
+    """A model and, optionally, a folder of its fits.
 
     Args:
-        model: the shape space.
-        model_name: what the page calls it.
-        folder: of the fits; None without.
+        model: the shape model.
+        model_name: its name on the page.
+        folder: of the fits, or None.
     """
 
     def __init__(self, model: ShapeModel, model_name: str, folder: Path | None = None) -> None:
         self.model = model
         self.model_name = model_name
         self.folder = None if folder is None else Folder(folder)
-        self._read: tuple[object, dict[str, SavedFit]] = (None, {})
-        self._picture = lru_cache(maxsize=4)(self._packed_fit)
+        self._cached_fits: tuple[object, dict[str, SavedFit]] = (None, {})
+        self._cached_picture = lru_cache(maxsize=4)(self._pack_fit)
+        self._packed_model: bytes | None = None
+        self._lock = Lock()
 
     @staticmethod
-    def open(path: Path, model: Path | None = None) -> Shown:
-        """Return what `path` holds: a model file, or a folder of results of `shapespace fit`.
+    def open(path: Path, model: Path | None = None) -> ModelView:
+        """Open a model file, or a folder of results of `shapespace fit`.
 
         Args:
             path: the file or folder.
-            model: the model's file, where the records of the folder do not lead to it.
+            model: the model's file, needed where the records of the folder do not name an existing one.
 
         Raises:
             FileError: it cannot be read.
@@ -79,19 +83,26 @@ class Shown:
                 raise InputError(
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
                 )
-            return Shown(ShapeModel.load(path), path.name)
+            return ModelView(ShapeModel.load(path), path.name)
         if not has_fits(Folder(path)) and (deeper := next(path.glob("*/**/*.fit.json"), None)):
             raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
         folder = Folder(path)
         fits = listed_fits(folder)
-        found = model_of(folder, fits, model)
+        fitted_model = model_of(folder, fits, model)
         name = next(fit.record.model.name for fit in fits if fit.record.model.hash)
-        return Shown(found, model.name if model else name, path)
+        return ModelView(fitted_model, model.name if model else name, path)
 
-    def packed_model(self) -> tuple[bytes, int]:
-        """Return the model for the page, and how many of its modes that holds."""
-        modes = max(1, min(self.model.n_modes, MODEL_BYTES // (6 * self.model.n_vertices)))
-        return pack_model(self.model, modes), modes
+    @property
+    def n_modes_sent(self) -> int:
+        """Number of modes that are sent to the page."""
+        return max(1, min(self.model.n_modes, MAX_MODEL_BYTES // (_BYTES_PER_VERTEX * self.model.n_vertices)))
+
+    def packed_model(self) -> bytes:
+        """Return the model for the page."""
+        with self._lock:
+            if self._packed_model is None:
+                self._packed_model = pack_model(self.model, self.n_modes_sent)
+            return self._packed_model
 
     def fits(self) -> dict[str, SavedFit]:
         """Return the fits of the folder by name, read again when files have changed.
@@ -102,7 +113,7 @@ class Shown:
         if self.folder is None:
             return {}
         try:
-            now = sorted(
+            files = sorted(
                 (p.name, p.lstat().st_mtime_ns)
                 for p in (*self.folder.root.glob("*.fit.json"), *self.folder.root.glob(Manifest.FILE))
             )
@@ -110,39 +121,39 @@ class Shown:
             raise FileError(
                 f"Cannot read {self.folder.root}: {error.strerror or error}; is the folder still there?"
             ) from error
-        if self._read[0] != now:
-            self._read = (now, {fit.name: fit for fit in listed_fits(self.folder)} if now else {})
-            self._picture.cache_clear()
-        return self._read[1]
+        if self._cached_fits[0] != files:
+            self._cached_fits = (files, {fit.name: fit for fit in listed_fits(self.folder)} if files else {})
+            self._cached_picture.cache_clear()
+        return self._cached_fits[1]
 
     def fit_list(self) -> list[dict[str, Any]]:
-        """Return what the page lists: failed and doubtful fits first, then by the error they expect of themselves."""
+        """Return the rows of the page's list, sorted by status (failed first), then by expected error."""
         rows = [self._safe_row(fit) for fit in self.fits().values()]
 
-        def concern(row: Mapping[str, Any]) -> tuple[int, float, str]:
+        def sort_key(row: Mapping[str, Any]) -> tuple[int, float, str]:
             error = row["scan_to_model_mm"] if row["expected_error_mm"] is None else row["expected_error_mm"]
             return _rank(row["status"]), -(error or 0.0), row["name"]
 
-        return sorted(rows, key=concern)
+        return sorted(rows, key=sort_key)
 
-    def told(self, sentence: str) -> str:
-        """Return `sentence` as visitors may read it: with the names of files, not of the folders they lie in."""
+    def public(self, sentence: str) -> str:
+        """Return `sentence` with file names only, without the folders of this machine."""
         for folder in () if self.folder is None else (self.folder.root, self.folder.root.resolve()):
             if folder.is_absolute() and folder.name:
                 sentence = sentence.replace(str(folder), folder.name)
         return without_folders(sentence)
 
     def packed_fit(self, name: str) -> bytes:
-        """Return the pictures of the fit `name`.
+        """Return the surfaces and distances of the fit `name` for the page.
 
         Raises:
             FileError: its surfaces cannot be read.
             FileFormatError: they were not saved, or are damaged.
-            InputError: they do not belong to the model.
+            InputError: the fit belongs to another model.
             KeyError: there is no such fit.
         """
         self.fits()
-        return self._picture(name)
+        return self._cached_picture(name)
 
     def fitted_mesh(self, name: str, *, dense: bool = False) -> Mesh:
         """Return the fitted surface of the fit `name`, or its dense one, in the frame and unit of its scan.
@@ -157,23 +168,23 @@ class Shown:
         with _as_damaged(name):
             return self.folder.mesh(fit.entry.dense if dense else fit.entry.fitted)
 
-    def _packed_fit(self, name: str) -> bytes:
+    def _pack_fit(self, name: str) -> bytes:
         assert self.folder is not None
         fit = self.fits()[name]
-        if not self._ours(fit):
+        if not self._is_of_this_model(fit):
             raise InputError(f"{name} was fitted by another model; give that one with --model.")
         with _as_damaged(name):
             try:
-                return packed(staged_fit(self.folder, fit))
+                return pack_staged(staged_fit(self.folder, fit))
             except ScanNotFoundError as error:
                 surfaces = saved_surfaces(self.folder, fit)
-                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=self.told(str(error)))
+                return pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, why=self.public(str(error)))
 
-    def _ours(self, fit: SavedFit) -> bool:
+    def _is_of_this_model(self, fit: SavedFit) -> bool:
         return fit.record.model.hash == self.model.content_hash
 
     def _safe_row(self, fit: SavedFit) -> dict[str, Any]:
-        """Return the row of `fit`; where its record holds what no fit writes, that of an unreadable one."""
+        """Return the row of `fit`, or the row of an unreadable fit if its record holds invalid values."""
         try:
             with _as_damaged(fit.name):
                 return self._row(fit)
@@ -181,18 +192,18 @@ class Shown:
             return self._row(SavedFit(fit.entry, FitRecord(status="unreadable", reason=str(error))))
 
     def _row(self, fit: SavedFit) -> dict[str, Any]:
-        pictured, why = fit.pictured, ""
-        if pictured and not self._ours(fit):
-            pictured, why = False, "It was fitted by another model."
+        pictured, why_not = fit.pictured, ""
+        if pictured and not self._is_of_this_model(fit):
+            pictured, why_not = False, "It was fitted by another model."
         elif not pictured and fit.status not in ("failed", "unreadable"):
-            why = "Its fitted surface is not in the folder; fit the scan again."
+            why_not = "Its fitted surface is not in the folder; fit the scan again."
         row: dict[str, Any] = {
             "name": fit.name,
             "label": fit.label,
             "status": fit.status,
-            "reason": self.told(_by_name(fit)),
+            "reason": self.public(_reason_with_name(fit)),
             "pictured": pictured,
-            "why_not": why,
+            "why_not": why_not,
             "fitted": fit.entry.fitted is not None and fit.fitted,
             "z": None,
         }
@@ -203,33 +214,33 @@ class Shown:
             "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
             "expected_error_mm": _number(fit.expected_error_mm),
         }
-        if self._ours(fit) and fit.record.z:
+        if self._is_of_this_model(fit) and fit.record.z:
             row["z"] = _rounded(fit.record.z)
         return row
 
 
 @contextmanager
 def _as_damaged(name: str) -> Generator[None]:
-    """Let whatever goes wrong with the files of the fit `name` be one sentence: one of many must not stop the rest."""
+    """Turn any error in the files of the fit `name` into one sentence: one damaged fit must not hide the others."""
     try:
         yield
     except ShapespaceError:
         raise
     except Exception as error:
-        raise FileFormatError(f"The files of {name} are damaged: they hold what no fit writes; {FIT_AGAIN}.") from error
+        raise FileFormatError(f"The files of {name} are damaged: they hold invalid values; {FIT_AGAIN}.") from error
 
 
 def listed_fits(folder: Folder) -> list[SavedFit]:
-    """Return the fits in `folder`, in the order of their names; of a store with very many those to look at first.
+    """Return the fits in `folder` sorted by name; of a store with very many, those with the most concerns.
 
     Raises:
         FileError: the folder cannot be read.
         InputError: there is no fit in it.
     """
     results = results_at(folder.root)
-    if results is None or len(results) <= MOST_LISTED:
+    if results is None or len(results) <= MAX_LISTED:
         return find_fits(folder)
-    return [saved_fit(folder, results, name) for name in sorted(neediest(results, MOST_LISTED))]
+    return [saved_fit(folder, results, name) for name in sorted(neediest(results, MAX_LISTED))]
 
 
 def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
@@ -238,11 +249,13 @@ def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
     Raises:
         InputError: more than the model has, or values that are not finite.
     """
-    given = np.asarray(z, dtype=np.float64)
-    return model.mesh(given * model.stddev[: len(given)] if given.ndim == 1 and len(given) <= model.n_modes else given)
+    values = np.asarray(z, dtype=np.float64)
+    is_valid = values.ndim == 1 and len(values) <= model.n_modes
+    # The model itself refuses invalid coefficients.
+    return model.mesh(values * model.stddev[: len(values)] if is_valid else values)
 
 
-def _by_name(fit: SavedFit) -> str:
+def _reason_with_name(fit: SavedFit) -> str:
     """Return the reason of `fit` with its scan's name in place of an absolute path, which may hold spaces."""
     name = fit.record.scan.name
     if not name:
@@ -252,7 +265,7 @@ def _by_name(fit: SavedFit) -> str:
 
 
 def _rank(status: str) -> int:
-    return _ORDER.index(status) if status in _ORDER else 0
+    return _STATUS_ORDER.index(status) if status in _STATUS_ORDER else 0
 
 
 def _number(value: float) -> float | None:
