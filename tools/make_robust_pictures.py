@@ -105,9 +105,9 @@ def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Loo
     lines = np.stack([x[vertices.vertex][here], on_scan[here]], axis=1)[:, :, [2, 1]]
     colours = [(0.1, 0.55, 0.25, 0.9) if allowed else (0.6, 0.6, 0.6, 0.7) for allowed in vertices.allowed[here]]
     axes.add_collection(LineCollection(lines, colors=colours, linewidths=1.0))
-    axes.plot([], [], color=(0.05, 0.45, 0.75), lw=2, label="scan to model (eq 4), thick where it counts (eq 8)")
-    axes.plot([], [], color=(0.1, 0.55, 0.25), lw=1.2, label="model to scan (eq 5)")
-    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="model to scan, not allowed (border, or eq 6)")
+    axes.plot([], [], color=(0.05, 0.45, 0.75), lw=2, label="scan to model (R4), thick where it counts (R8)")
+    axes.plot([], [], color=(0.1, 0.55, 0.25), lw=1.2, label="model to scan (R5)")
+    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="model to scan, not allowed (border, or R6)")
     axes.set_aspect("equal")
     axes.set_xlim(x[near(x), 2].max() - 75.0, x[near(x), 2].max() + 12.0)
     axes.set_ylim(-80.0, 75.0)
@@ -124,7 +124,7 @@ def levels_picture(path: Path, sigma: list[float], width: list[float], error: li
     """Draw spread, width and true error against the step, with the levels shaded."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(8.0, 5.2), dpi=110, sharex=True)
     steps = np.arange(1, len(sigma) + 1)
-    above.semilogy(steps, width, color=SCAN, label="width (eq 7)")
+    above.semilogy(steps, width, color=SCAN, label="width (R7)")
     above.semilogy(steps, sigma, color=INK, label="spread sigma of the residuals")
     above.set_ylabel("mm")
     above.legend(frameon=False, fontsize=9)
