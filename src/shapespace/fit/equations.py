@@ -28,7 +28,7 @@ class Estimate:
     """Pose and coefficients of an iterate.
 
     Args:
-        T_scan_model: from the model's frame to the scan's mm frame.
+        T_scan_model: from the model's frame to the scan's mm frame (R2).
         b: (K,) coefficients of all modes, mm.
     """
 

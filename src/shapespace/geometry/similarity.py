@@ -47,8 +47,8 @@ def fit_similarity(
     if not w.any():
         raise InputError("A similarity needs at least three points with a positive weight.")
 
-    mean_source, mean_target = w @ source, w @ target  # P8-P9
-    q, q_prime = source - mean_source, target - mean_target  # P10-P11
+    mean_source, mean_target = w @ source, w @ target  # P8, P9
+    q, q_prime = source - mean_source, target - mean_target  # P10, P11
     weighted = q * w[:, None]
     H = weighted.T @ q_prime  # P12
     spread = np.vdot(weighted, q)
@@ -61,7 +61,7 @@ def fit_similarity(
             "The matched points lie on a line or coincide, so they determine no rotation; use more points."
         )
     Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # P16: the reflection guard
-    R = (Vt.T * Z) @ U.T  # P14-P15, as corrected
+    R = (Vt.T * Z) @ U.T  # P14, P15, as corrected
     s = float((D * Z).sum() / spread) if with_scale else 1.0  # P18, as corrected
     if s <= 0:
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")

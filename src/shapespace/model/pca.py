@@ -151,7 +151,7 @@ def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
 
 
 def _centred_gram(data: FloatArray) -> FloatArray:
-    """Return the lower triangle of X^T X (N, N), X the centred shapes (P1-P3)."""
+    """Return the lower triangle of X^T X (N, N), X the centred shapes (P1, P2, P3)."""
     n = len(data)
     raw = syrk(data)
     if not np.isfinite(raw.diagonal()).all():
