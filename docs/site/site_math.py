@@ -79,7 +79,7 @@ def visit_block(translator: HTML5Translator, node: nodes.math_block) -> None:
     tag = TAG.search(tex)
     anchor = f' id="eq-{tag[1].lower()}"' if tag else ""
     number = f'<span class="eqno">({tag[1]})</span>' if tag else ""
-    translator.body.append(f'<div class="math"{anchor}>{mathml(tex, "block")}{number}</div>\n')
+    translator.body.append(f'<div class="math"{anchor}><div>{mathml(tex, "block")}</div>{number}</div>\n')
     raise nodes.SkipNode
 
 
