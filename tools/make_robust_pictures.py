@@ -20,7 +20,7 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Cut, Hole, simulate_scan
 from shapespace.fit.equations import Estimate
 from shapespace.fit.moving_model import prepare
-from shapespace.fit.robust import Look, Problem
+from shapespace.fit.robust import Iterate, Problem
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
 from shapespace.geometry.similarity import fit_similarity
@@ -57,26 +57,27 @@ def main() -> None:
     turn = np.asarray(Rotation.from_rotvec([0.12, 0.1, -0.08]).as_matrix())
     at = Estimate(pose @ Similarity(1.0, turn, np.array([4.0, -5.0, 3.0])), np.zeros(model.n_modes))
     sigma, width, error, ends = [], [], [], []
-    first: Look | None = None
-    for level in problem.settings.levels:
-        matcher = problem.matcher(level, at, problem.surface.vertex_tree(), None)
-        for step in problem.descent(matcher, at, level):
-            at = step.at
-            sigma.append(step.look.sigma_mm)
-            width.append(step.look.weights.width_mm)
-            placed = at.T_scan_model.apply(problem.surface.vertices)
+    iterate = problem.iterate(at)
+    for number, level in enumerate(problem.settings.levels):
+        matcher = problem.matcher(level)
+        hint = matcher.first_hint(iterate.surface, iterate.T_scan_model)
+        for step in problem.descent(matcher, iterate, hint, level):
+            iterate = step.iterate
+            sigma.append(step.weighted.sigma_mm)
+            width.append(step.weighted.weights.width_mm)
+            placed = iterate.T_scan_model.apply(iterate.surface.vertices)
             error.append(float(np.linalg.norm(placed - truth_mm, axis=1).mean()))
-            if level is problem.settings.levels[0] and first is None:
-                first = slice_picture(out / "robust-matching.png", problem, at, scan)
+            if number == 0 and len(sigma) == 1:
+                slice_picture(out / "robust-matching.png", problem, iterate, scan)
         ends.append(len(sigma))
     levels_picture(out / "robust-levels.png", sigma, width, error, ends)
 
 
-def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Look:
+def slice_picture(path: Path, problem: Problem, iterate: Iterate, scan: Mesh) -> None:
     """Draw what lies within a few millimetres of the middle of the face, seen from the side."""
-    matcher = problem.matcher(problem.settings.levels[-1], at, problem.surface.vertex_tree(), None)
-    look = problem.look(matcher, at)
-    x, faces, T = problem.surface.vertices, problem.prepared.topology.faces, at.T_scan_model.inverse()
+    matcher = problem.matcher(problem.settings.levels[-1])
+    weighted = problem.match(matcher, iterate, matcher.first_hint(iterate.surface, iterate.T_scan_model))
+    x, faces, T = iterate.surface.vertices, problem.prepared.topology.faces, iterate.T_scan_model.inverse()
     middle = float(np.median(x[:, 0]))
 
     def near(points: FloatArray) -> np.ndarray:
@@ -89,10 +90,10 @@ def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Loo
     q = T.apply(scan.vertices)
     axes.plot(*q[near(q)][:, [2, 1]].T, ".", color=SCAN, ms=2.5, label="points of the scan")
     axes.plot([], [], color=INK, lw=1, label="the model, after the first step")
-    points, vertices, weights = look.matches.points, look.matches.vertices, look.weights
+    points, vertices, weights = weighted.matches.points, weighted.matches.vertices, weighted.weights
     on_model = np.einsum("mc,mcd->md", points.barycentric, x[faces[points.triangle]])
     here = near(on_model)
-    drawn = matcher._in_model(at.T_scan_model)
+    drawn = matcher._in_model(iterate.T_scan_model)
     lines = np.stack([drawn[here], on_model[here]], axis=1)[:, :, [2, 1]]
     strength = weights.points[here] / weights.points.max()
     axes.add_collection(
@@ -105,9 +106,9 @@ def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Loo
     lines = np.stack([x[vertices.vertex][here], on_scan[here]], axis=1)[:, :, [2, 1]]
     colours = [(0.1, 0.55, 0.25, 0.9) if allowed else (0.6, 0.6, 0.6, 0.7) for allowed in vertices.allowed[here]]
     axes.add_collection(LineCollection(lines, colors=colours, linewidths=1.0))
-    axes.plot([], [], color=(0.05, 0.45, 0.75), lw=2, label="scan to model (eq 4), thick where it counts (eq 8)")
-    axes.plot([], [], color=(0.1, 0.55, 0.25), lw=1.2, label="model to scan (eq 5)")
-    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="model to scan, not allowed (border, or eq 6)")
+    axes.plot([], [], color=(0.05, 0.45, 0.75), lw=2, label="scan to model (R4), thick where it counts (R8)")
+    axes.plot([], [], color=(0.1, 0.55, 0.25), lw=1.2, label="model to scan (R5)")
+    axes.plot([], [], color=(0.6, 0.6, 0.6), lw=1.2, label="model to scan, not allowed (border, or R6)")
     axes.set_aspect("equal")
     axes.set_xlim(x[near(x), 2].max() - 75.0, x[near(x), 2].max() + 12.0)
     axes.set_ylim(-80.0, 75.0)
@@ -117,14 +118,13 @@ def slice_picture(path: Path, problem: Problem, at: Estimate, scan: Mesh) -> Loo
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     figure.savefig(path, bbox_inches="tight")
-    return look
 
 
 def levels_picture(path: Path, sigma: list[float], width: list[float], error: list[float], ends: list[int]) -> None:
     """Draw spread, width and true error against the step, with the levels shaded."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(8.0, 5.2), dpi=110, sharex=True)
     steps = np.arange(1, len(sigma) + 1)
-    above.semilogy(steps, width, color=SCAN, label="width (eq 7)")
+    above.semilogy(steps, width, color=SCAN, label="width (R7)")
     above.semilogy(steps, sigma, color=INK, label="spread sigma of the residuals")
     above.set_ylabel("mm")
     above.legend(frameon=False, fontsize=9)

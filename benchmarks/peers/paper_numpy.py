@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 
 def similarity(p: np.ndarray, p_prime: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return scale, rotation and translation of the least-squares similarity of `p` (V, 3) on `p_prime`."""
-    p_bar, p_prime_bar = p.mean(axis=0), p_prime.mean(axis=0)  # eqs 8-9
-    q, q_prime = p - p_bar, p_prime - p_prime_bar  # eqs 10-11
-    U, D, Vt = np.linalg.svd(q.T @ q_prime)  # eqs 12-13
-    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # eq 16
-    R = (Vt.T * Z) @ U.T  # eqs 14-15
-    s = (D * Z).sum() / (q**2).sum()  # eq 18
-    return s, R, p_prime_bar - s * R @ p_bar  # eq 17
+    p_bar, p_prime_bar = p.mean(axis=0), p_prime.mean(axis=0)  # P8-P9
+    q, q_prime = p - p_bar, p_prime - p_prime_bar  # P10-P11
+    U, D, Vt = np.linalg.svd(q.T @ q_prime)  # P12-P13
+    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # P16
+    R = (Vt.T * Z) @ U.T  # P14-P15
+    s = (D * Z).sum() / (q**2).sum()  # P18
+    return s, R, p_prime_bar - s * R @ p_bar  # P17
 
 
 def fit(
@@ -53,12 +53,12 @@ def fit(
         distance, index = tree.query(y, workers=1)
         rms = np.sqrt((distance**2).mean()) / s
         for _ in range(max_iterations):
-            c = scan_vertices[index]  # eq 7, step 1
+            c = scan_vertices[index]  # P7, step 1
             s, R, T = similarity(Q, c)  # step 2
             if phase == 1:
                 Q_matched = (c - T) @ R / s
-                b = basis.T @ (Q_matched - mean).ravel()  # eq 19, step 3
-                Q = mean + (basis @ b).reshape(-1, 3)  # eq 6
+                b = basis.T @ (Q_matched - mean).ravel()  # P19, step 3
+                Q = mean + (basis @ b).reshape(-1, 3)  # P6
             moved, y = y, s * Q @ R.T + T
             distance, index = tree.query(y, workers=1)
             before, rms = rms, np.sqrt((distance**2).mean()) / s

@@ -1,4 +1,4 @@
-"""The documentation site: Sphinx over the Markdown files as they stand in the repository (`make docs`)."""
+"""The documentation site: Sphinx over the Markdown files of the repository (`make docs`)."""
 
 import sys
 from pathlib import Path
@@ -11,6 +11,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path.insert(0, str(HERE))
 
+import site_math  # noqa: E402
 import site_plots  # noqa: E402
 import site_text  # noqa: E402
 import site_trees  # noqa: E402
@@ -26,6 +27,10 @@ include_patterns = [*(f"{page}.md" for page in site_text.documents(ROOT)), "docs
 _folders = {page.partition("/")[0] for page in site_text.documents(ROOT)}
 exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _folders]
 myst_heading_anchors = 4
+# The forms that GitHub typesets too: $...$ in a line, a fence ```math for a block.
+myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]
+html_math_renderer = "mathml"
 default_role = "literal"
 
 autodoc_typehints = "description"
@@ -50,6 +55,7 @@ pygments_style, pygments_dark_style = "friendly", "github-dark"
 def setup(app: Sphinx) -> None:
     """Add what the documents need beside the extensions."""
     app.add_lexer("layers", TextLexer)
+    site_math.setup(app)
     app.connect("builder-inited", site_plots.draw_all)
     app.connect("source-read", site_text.complete)
     app.connect("autodoc-process-docstring", site_text.markup)

@@ -158,7 +158,7 @@ PLOTS = (
         "peers", BENCHMARKS, "Beside the peers",
         "Two dots for each method, a complete scan and one with a cut, a hole and extra neck: of shapespace both lie "
         "at the same place, of most others the second lies far off",
-        _errors, ((BENCHMARKS, "Beside the peers"), ("docs/other-tools", "What was measured")),
+        _errors, ((BENCHMARKS, "Beside the peers"), ("docs/other-tools", "Measured comparisons")),
     ),
     Plot(
         "speed", BENCHMARKS, "Speed",

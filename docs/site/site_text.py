@@ -26,36 +26,35 @@ NAVIGATION = {
         "docs/tutorial-spleens",
         "docs/tutorial-volumes",
         "docs/tutorial-bones",
-        "docs/correspondence",
         "docs/tutorial-recognition",
         "docs/tutorial-groups",
         "docs/tutorial-identity",
-        "docs/scale",
+        "docs/tutorial-*",
     ],
-    "How to": [
-        "docs/howto-hair",
-        "docs/landmarks",
-        "docs/howto-partial",
+    "How-to: models": [
+        "docs/correspondence",
         "docs/howto-own-model",
+        "docs/volumes",
+        "docs/missing",
+        "docs/quality",
+        "docs/build-at-scale",
+    ],
+    "How-to: fits": [
+        "docs/howto-hair",
+        "docs/howto-partial",
+        "docs/landmarks",
+        "docs/dense",
+        "docs/colours",
+        "docs/scale",
+        "docs/stores",
         "docs/interop",
+        "docs/report",
+        "docs/viewer",
         "docs/howto-*",
     ],
-    "Understand": [
-        "docs/how-it-works",
-        "docs/robust",
-        "docs/uncertainty",
-        "docs/what-can-go-wrong",
-        "docs/quality",
-        "docs/missing",
-        "docs/dense",
-        "docs/bspline",
+    "How-to: questions": [
         "docs/recognise",
-        "docs/other-tools",
-        "docs/benchmarks",
-        "docs/paper-map",
-        "docs/errata",
-    ],
-    "Answers about cohorts": [
+        "docs/real-sets",
         "docs/statistics",
         "docs/identity",
         "docs/compare",
@@ -64,24 +63,30 @@ NAVIGATION = {
         "docs/regress",
         "docs/score",
     ],
-    "Look up": [
+    "Reference": [
         "docs/cli",
         "docs/fit-results",
-        "docs/glossary",
         "docs/api",
-        "docs/api-stability",
-        "docs/model-formats",
+        "docs/glossary",
+        "docs/symbols",
         "docs/mesh-formats",
-        "docs/report",
-        "docs/viewer",
-        "docs/volumes",
-        "docs/stores",
-        "docs/build-at-scale",
-        "docs/data",
-        "docs/real-sets",
+        "docs/model-formats",
         "docs/model-file",
+        "docs/data",
+        "docs/benchmarks",
+        "docs/api-stability",
     ],
-    "Work on it": [
+    "Explanation": [
+        "docs/how-it-works",
+        "docs/robust",
+        "docs/paper-map",
+        "docs/errata",
+        "docs/uncertainty",
+        "docs/what-can-go-wrong",
+        "docs/bspline",
+        "docs/other-tools",
+    ],
+    "Development": [
         "docs/architecture",
         "docs/extending",
         "docs/dependencies",
@@ -93,7 +98,7 @@ NAVIGATION = {
     ],
 }
 """Caption -> pages, a pattern or the names of documents without `.md`; `LATER` takes those that are nowhere here."""
-LATER = "Look up"
+LATER = "Reference"
 
 
 def documents(root: Path) -> list[str]:

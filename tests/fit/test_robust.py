@@ -53,7 +53,7 @@ def test_a_step_is_that_of_plain_numpy(modes: int, triangles: bool) -> None:
     weighted = problem.match(matcher, iterate, hint)
     expected, hessian = gauss_newton_step(problem, weighted, iterate, modes)
     _, equations = problem.equations(weighted, iterate, modes)
-    whole = equations.data + np.diag(equations.prior)
+    whole = equations.H + np.diag(equations.D)
     np.testing.assert_allclose(whole, hessian, rtol=1e-4, atol=1e-4 * np.abs(hessian).max())
     step = problem.step(matcher, iterate, hint, modes)
     np.testing.assert_allclose(step.iterate.b[:modes] - b[:modes], expected[POSE:], rtol=2e-3, atol=1e-4)

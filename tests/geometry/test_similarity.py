@@ -121,7 +121,7 @@ def test_scale_is_least_squares_and_noise_does_not_inflate_it() -> None:
 def test_eq_15_as_printed_turns_the_wrong_way() -> None:
     p, T = cloud(), similarity(8, 40.0, 1.0)
     q, q_prime = p - p.mean(0), T.apply(p) - T.apply(p).mean(0)
-    U, _, Vt = np.linalg.svd(q.T @ q_prime)  # eq 12-13
+    U, _, Vt = np.linalg.svd(q.T @ q_prime)  # P12-P13
     printed = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     assert np.allclose(printed, T.rotation.T)
     assert angle_deg(printed @ T.rotation.T) == pytest.approx(80.0)

@@ -93,7 +93,7 @@ def test_the_divisor_is_n_minus_1() -> None:
     covariance = np.cov(data.T, ddof=1)
     assert np.allclose(covariance @ pc.basis, pc.basis * pc.variance, atol=1e-9 * pc.variance[0])
     assert pc.total_variance == pytest.approx(np.trace(covariance))
-    # As printed, eq 4 has no divisor and eq 2 has N: neither is the spread of the shapes.
+    # As printed, P4 has no divisor and P2 has N: neither is the spread of the shapes.
     assert abs(pc.total_variance - np.trace(np.cov(data.T, ddof=0))) > 0.05 * pc.total_variance
     assert abs(pc.variance[0] / ((data - pc.mean) @ pc.basis[:, 0]).var(ddof=1) - 1) < 1e-9
 

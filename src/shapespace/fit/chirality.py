@@ -121,5 +121,5 @@ def _cost(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> float:
         target.engine.query(vertices).distance,
     )
     rms = sum(float(np.sqrt((np.minimum(way, cap) ** 2).mean())) for way in ways) / scale
-    prior = float((fitted.b**2 / new_shapes(model)[: len(fitted.b)]).sum())
-    return _PATCHES * math.log(max(rms, 1e-12)) + 0.5 * prior
+    prior_cost = float((fitted.b**2 / new_shapes(model)[: len(fitted.b)]).sum())
+    return _PATCHES * math.log(max(rms, 1e-12)) + 0.5 * prior_cost

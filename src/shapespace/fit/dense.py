@@ -154,7 +154,7 @@ class WeightedMatches:
     def gathered(self, spread_mm: float) -> tuple[FloatArray, FloatArray]:
         """Return the precision (V,), mm^-2, of what the scan says of each vertex, and the same times the residual."""
         gathered = self.matches.gathered(self._weights(spread_mm), self.faces, self.vertices)
-        return gathered.weight / spread_mm**2, gathered.pull / spread_mm**2
+        return gathered.W / spread_mm**2, gathered.h / spread_mm**2
 
 
 def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:

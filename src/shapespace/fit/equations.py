@@ -1,6 +1,6 @@
-"""The normal equations of one step: pose and coefficients together, data and prior apart.
+"""The normal equations of one Gauss-Newton step on pose and coefficients, with data and prior as separate terms.
 
-Equation numbers are those of docs/robust.md. Everything here is a function of its arguments.
+Equation numbers and symbols are those of docs/robust.md.
 """
 
 from __future__ import annotations
@@ -18,24 +18,25 @@ from shapespace.geometry.similarity import POSE
 from shapespace.types import FloatArray, Similarity
 
 _DAMPING = 1e-7
+"""Added to the unit diagonal of R15a; far below the precision of the float32 rows."""
 SCALE = 6
-"""Where the log scale stands among the pose parameters: rotation 0-2, translation 3-5."""
+"""Index of the log scale among the pose parameters: rotation 0-2, translation 3-5."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where a fit is.
+    """Pose and coefficients of an iterate.
 
     Args:
-        T_scan_model: from the model's frame to the scan's mm frame.
-        b: (K,) coefficients of all modes that there are, mm.
+        T_scan_model: from the model's frame to the scan's mm frame (R2).
+        b: (K,) coefficients of all modes, mm.
     """
 
     T_scan_model: Similarity
     b: FloatArray
 
     def moved_by(self, delta: FloatArray) -> Estimate:
-        """Return where `delta` (7 + k,) leads (eq 3): turn, shift, scale in the model's frame, then k coefficients."""
+        """Return the estimate after the step `delta` (7 + k,): omega, tau, ds, then db (R3, R16)."""
         b = self.b.copy()
         b[: len(delta) - POSE] += delta[POSE:]
         return Estimate(self.T_scan_model @ small_similarity(delta[:POSE]), b)
@@ -43,13 +44,13 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of pose and shape before the scan is looked at (eqs 13 and 14).
+    """Normal prior of the coefficients and of the log scale (R13, R14).
 
     Args:
         stddev: (K,) of each coefficient, mm.
-        weight: of the prior beside one match.
-        start_scale: scale of the start,
-        scale_stddev: and how far the log of the scale is from its log; zero where the scale is held.
+        weight: alpha, weight of the prior relative to one match.
+        start_scale: s_0, scale of the start.
+        scale_stddev: of log(s / s_0); zero where the scale is held.
     """
 
     stddev: FloatArray
@@ -65,40 +66,42 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """(data + prior) delta = -gradient, for turn, shift, log scale and k coefficients.
+    """(H + D + H_landmarks) delta = -gradient, for rotation, translation, log scale and k coefficients (R15).
+
+    All terms are multiplied by sigma^2, the variance of the residuals.
 
     Args:
-        data: (7 + k, 7 + k) Hessian of the matches, not divided by the variance of the residuals.
-        prior: (7 + k,) diagonal of the Hessian of the prior, times that variance.
-        gradient: (7 + k,) of both.
-        holds_scale: whether the scale has no say.
-        marks: (7 + k, 7 + k) Hessian of landmarks as a step weighs them, times that variance; None without any.
+        H: (7 + k, 7 + k) Hessian of the matches (R12).
+        D: (7 + k,) diagonal of the Hessian of the prior (R13, R14).
+        gradient: (7 + k,) g + e, of matches, prior and landmarks.
+        holds_scale: whether the scale is fixed, so that its row and column are left out.
+        H_landmarks: (7 + k, 7 + k) Hessian of the landmarks with their gain (R16c); None without landmarks.
     """
 
-    data: FloatArray
-    prior: FloatArray
+    H: FloatArray
+    D: FloatArray
     gradient: FloatArray
     holds_scale: bool
-    marks: FloatArray | None = None
+    H_landmarks: FloatArray | None = None
 
     def step(self) -> FloatArray:
-        """Return delta (7 + k,), solved with a unit diagonal and hardly damped (eq 15).
+        """Return delta (7 + k,), solved with a unit diagonal and light damping (R15, R15a).
 
         Raises:
             LinAlgError: the equations have no solution.
         """
         free = np.delete(np.arange(len(self.gradient)), [SCALE] if self.holds_scale else [])
-        hessian = self.data[np.ix_(free, free)] if self.holds_scale else self.data.copy()
-        if self.marks is not None:
-            hessian += self.marks[np.ix_(free, free)]
-        hessian[np.diag_indices_from(hessian)] += self.prior[free]
-        unit = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-30))
+        hessian = self.H[np.ix_(free, free)] if self.holds_scale else self.H.copy()
+        if self.H_landmarks is not None:
+            hessian += self.H_landmarks[np.ix_(free, free)]
+        hessian[np.diag_indices_from(hessian)] += self.D[free]
+        unit = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-30))  # R15a
         hessian *= np.outer(unit, unit)
         hessian[np.diag_indices_from(hessian)] += _DAMPING
         delta = np.zeros(len(self.gradient))
         try:
             factor = cho_factor(hessian, lower=True, overwrite_a=True)
-            delta[free] = -unit * np.asarray(cho_solve(factor, unit * self.gradient[free]))
+            delta[free] = -unit * np.asarray(cho_solve(factor, unit * self.gradient[free]))  # R15
         except ValueError as error:
             raise LinAlgError(str(error)) from error
         return delta
@@ -110,30 +113,30 @@ def normal_equations(
     """Return the equations of one Gauss-Newton step on the pose and the first `modes` coefficients.
 
     Args:
-        surface: the model's surface at `at`.
-        gathered: what the matches want of each of its vertices.
-        prior: of pose and shape.
+        surface: of the model, with the coefficients of `at`.
+        gathered: weights and weighted residuals of the matches at each of its vertices.
+        prior: of coefficients and scale.
         sigma_mm: spread of the residuals.
-        at: where the fit is.
-        modes: how many are free.
+        at: pose and coefficients.
+        modes: k, the number of free modes.
     """
-    rows = np.empty((len(gathered.weight), POSE + modes), dtype=np.float32)
+    rows = np.empty((len(gathered.W), POSE + modes), dtype=np.float32)
     gradient = np.zeros(POSE + modes)
     count = rows_into(
-        surface.vertices, surface.normals, surface.modes, modes, gathered.weight, gathered.pull, rows, gradient
-    )  # eqs 11, 12
+        surface.vertices, surface.normals, surface.modes, modes, gathered.W, gathered.h, rows, gradient
+    )  # R11, R12
     rho = prior.weight * sigma_mm**2
-    precision = np.zeros(POSE + modes)
-    precision[POSE:] = rho / prior.stddev[:modes] ** 2  # eq 13
-    gradient[POSE:] += precision[POSE:] * at.b[:modes]
+    D = np.zeros(POSE + modes)
+    D[POSE:] = rho / prior.stddev[:modes] ** 2  # R13
+    gradient[POSE:] += D[POSE:] * at.b[:modes]
     if not prior.holds_scale:
-        precision[SCALE] = rho / prior.scale_stddev**2  # eq 14
-        gradient[SCALE] += precision[SCALE] * np.log(at.T_scan_model.scale / prior.start_scale)
-    data = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)
-    return NormalEquations(data, precision, gradient, prior.holds_scale)
+        D[SCALE] = rho / prior.scale_stddev**2  # R14
+        gradient[SCALE] += D[SCALE] * np.log(at.T_scan_model.scale / prior.start_scale)
+    H = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)  # R12
+    return NormalEquations(H, D, gradient, prior.holds_scale)
 
 
 def small_similarity(delta: FloatArray) -> Similarity:
-    """Return the similarity of a turn (radians), a shift (mm) and a log scale, `delta` (7,), about the origin."""
+    """Return S of R3 from `delta` (7,): omega (radians), tau (mm) and ds, about the origin."""
     turn = np.asarray(Rotation.from_rotvec(delta[:3]).as_matrix())
     return Similarity(float(np.exp(delta[SCALE])), turn, delta[3:6])

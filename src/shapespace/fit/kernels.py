@@ -150,7 +150,7 @@ def meet_into(
             dot += n * point_normals[i, k]
             known += point_normals[i, k] ** 2
         length = np.sqrt(length) if length > 0.0 else 1.0
-        residual[i], distance[i] = along / length, np.sqrt(squared)
+        residual[i], distance[i] = along / length, np.sqrt(squared)  # R4
         cosine[i] = dot / length if known > 0.0 else 1.0
         covered[i] = (wa > 1e-9 and not rim[a]) or (wb > 1e-9 and not rim[b]) or (wc > 1e-9 and not rim[c])
 
@@ -196,16 +196,16 @@ def gather_into(
     faces: IntArray,
     w: FloatArray,
     residual: FloatArray,
-    weight_at: FloatArray,
-    pull_at: FloatArray,
+    W: FloatArray,
+    h: FloatArray,
 ) -> None:
-    """Add the weights w (M,) and weighted residuals of matched points to the model vertices that carry them."""
+    """Add the weights w (M,) and weighted residuals of matched points to the model vertices that carry them (R10)."""
     for i in range(len(triangle)):
         if w[i] > 0.0:
             for k in range(3):
                 v, share = faces[triangle[i], k], w[i] * barycentric[i, k]
-                weight_at[v] += share
-                pull_at[v] += share * residual[i]
+                W[v] += share
+                h[v] += share * residual[i]
 
 
 @compiled
@@ -214,34 +214,33 @@ def rows_into(
     normals: FloatArray,
     basis: Float32Array,
     modes: int,
-    weight_at: FloatArray,
-    pull_at: FloatArray,
+    W: FloatArray,
+    h: FloatArray,
     rows: Float32Array,
     gradient: FloatArray,
 ) -> int:
-    """Write the weighted rows of the normal equations and the gradient; return how many rows there are.
+    """Write the weighted rows of the Jacobian and the gradient (R11, R12); return the number of rows.
 
-    Row j is sqrt(weight_j) n_j^T [ -[x_j]x | I | x_j | P_j ]: how the model's vertex moves along its normal with each
-    parameter.
+    Row j is sqrt(W_j) J_j, with J_j = n_j^T [ -[x_j]x | I | x_j | P_j ].
 
     Args:
         vertices: (V, 3) model vertices x,
         normals: (V, 3) their unit normals.
         basis: (V, 3, C) modes, float32.
-        modes: how many of them count.
-        weight_at: (V,) weight of each vertex,
-        pull_at: (V,) its weighted residual.
+        modes: k, the number of free modes.
+        W: (V,) weight of each vertex.
+        h: (V,) its weighted residual, mm.
         rows: (V, 7 + C) float32 to be written.
         gradient: (7 + C,) to be added to.
     """
     count = 0
     for j in range(len(vertices)):
-        if weight_at[j] <= 0.0:
+        if W[j] <= 0.0:
             continue
         nx, ny, nz = normals[j, 0], normals[j, 1], normals[j, 2]
         x, y, z = vertices[j, 0], vertices[j, 1], vertices[j, 2]
-        row, root, pull = rows[count], np.float32(np.sqrt(weight_at[j])), pull_at[j]
-        pose = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz, nx * x + ny * y + nz * z)
+        row, root, pull = rows[count], np.float32(np.sqrt(W[j])), h[j]
+        pose = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz, nx * x + ny * y + nz * z)  # R11
         for k in range(7):
             row[k] = root * np.float32(pose[k])
             gradient[k] += pull * pose[k]

@@ -73,13 +73,13 @@ class LandmarkConstraint:
         distance = np.linalg.norm(off, axis=1)
         stddev = self.stddev_mm / T_scan_model.scale
         # A wrong landmark lies far off beside the others, however far these are off on the way.
-        width = _WIDTH * max(stddev, min(_MAD * float(np.median(distance)), self.far_mm))
-        weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2
+        width = _WIDTH * max(stddev, min(_MAD * float(np.median(distance)), self.far_mm))  # R16b
+        weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2  # R16a
         pose = small_poses(x).reshape(len(x), 3, POSE)
         rows = np.concatenate([pose, self.landmarks.interpolate(surface.modes[:, :, :modes])], axis=2)
         every = rows.reshape(3 * len(x), -1)
         heavy = np.repeat(weight, 3)[:, None] * every
-        hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)
+        hessian: FloatArray = np.asarray(heavy.T @ every, dtype=np.float64)  # R16c
         return hessian, np.asarray(heavy.T @ off.ravel(), dtype=np.float64)
 
     def notes(self, surface: ModelSurface, T_scan_model: Similarity) -> list[str]:

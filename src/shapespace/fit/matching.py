@@ -64,8 +64,8 @@ class Matches:
     """What is matched at one moment of a fit, both ways.
 
     Args:
-        points: scan points on the model (eq 4).
-        vertices: model vertices on the scan (eq 5).
+        points: scan points on the model (R4).
+        vertices: model vertices on the scan (R5).
         winding: -1 where the scan's normals are reversed, else 1.
     """
 
@@ -84,7 +84,7 @@ class Matches:
         return np.concatenate([p.residual[p.allowed], v.residual[v.allowed]])
 
     def weights(self, name: str, width_mm: float, far_mm: float, vertex_share: float) -> Weights:
-        """Return how much each counts (eqs 8 and 9): residuals against a width, distances against how far is far."""
+        """Return how much each counts (R8, R9): residuals against a width, distances against how far is far."""
         p, v = self.points, self.vertices
         return Weights(
             match_weights(name, p.residual, p.distance, p.allowed, width_mm, far_mm),
@@ -94,29 +94,29 @@ class Matches:
         )
 
     def gathered(self, weights: Weights, faces: IntArray, vertices: int) -> Gathered:
-        """Return weight and pull of the matches at the model vertices that carry them (eq 10)."""
+        """Return weights and weighted residuals of the matches at the model vertices that carry them (R10)."""
         p, v = self.points, self.vertices
-        weight_at, pull_at = np.zeros(vertices), np.zeros(vertices)
-        gather_into(p.triangle, p.barycentric, faces, weights.points, p.residual, weight_at, pull_at)
-        seen = weight_at > 0.0
-        weight_at[v.vertex] += weights.vertices
-        pull_at[v.vertex] += weights.vertices * v.residual
-        return Gathered(weight_at, pull_at, seen)
+        W, h = np.zeros(vertices), np.zeros(vertices)
+        gather_into(p.triangle, p.barycentric, faces, weights.points, p.residual, W, h)
+        seen = W > 0.0
+        W[v.vertex] += weights.vertices
+        h[v.vertex] += weights.vertices * v.residual
+        return Gathered(W, h, seen)
 
     def unexplained_variance(self, weights: Weights, faces: IntArray, vertices: int, seed: int) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise (eq 17); it can be below zero.
+        """Return the variance, mm^2, of the part of the residuals that is no noise (R17); it can be below zero.
 
-        Scan points fall into two halves at random. Noise is independent between them, so the product of what the two
-        say of the same vertex is the variance of the shape that is left.
+        Scan points are split into two halves at random. Noise is independent between them, so the mean product of their
+        mean residuals at a vertex is the variance of the remaining shape difference.
         """
         p, w = self.points, weights.points
         half = np.random.default_rng(seed).random(len(w)) < 0.5
-        seen, pull = np.zeros((2, vertices)), np.zeros((2, vertices))
+        W, h = np.zeros((2, vertices)), np.zeros((2, vertices))
         for i, part in enumerate((half, ~half)):
-            gather_into(p.triangle, p.barycentric, faces, w * part, p.residual, seen[i], pull[i])
-        both = np.minimum(seen[0], seen[1])
-        mean = pull / np.maximum(seen, 1e-12)
-        return float((both * mean[0] * mean[1]).sum() / max(both.sum(), 1e-12))
+            gather_into(p.triangle, p.barycentric, faces, w * part, p.residual, W[i], h[i])  # R10 of each half
+        both = np.minimum(W[0], W[1])
+        m = h / np.maximum(W, 1e-12)
+        return float((both * m[0] * m[1]).sum() / max(both.sum(), 1e-12))  # R17
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +141,13 @@ class Gathered:
     """The matches as the model's vertices carry them, (V,) each.
 
     Args:
-        weight: of all matches at each vertex.
-        pull: the same times the residuals, mm.
-        seen: where a scan point that counts is matched.
+        W: sum of the weights of all matches at each vertex (R10).
+        h: sum of the weighted residuals there, mm (R10).
+        seen: True where a scan point with a positive weight is matched.
     """
 
-    weight: FloatArray
-    pull: FloatArray
+    W: FloatArray
+    h: FloatArray
     seen: BoolArray
 
 
@@ -219,7 +219,7 @@ class Matcher:
         return ((self.points_mm - T.translation) @ T.rotation) / T.scale
 
     def match(self, surface: ModelSurface, T_scan_model: Similarity, hint: MatchHint) -> Matches:
-        """Return the matches of `surface` at a pose (eqs 4 to 6); their `hint` is that of the next search."""
+        """Return the matches of `surface` at a pose (R4-R6); their `hint` is that of the next search."""
         q, n = self._in_model(T_scan_model), self.point_normals @ T_scan_model.rotation
         nearest, triangle, barycentric = surface.closest(q, hint.vertex, hint.triangle)
         residual, distance, cosine, covered = surface.meet(q, n, triangle, barycentric, bulging=self.bulging)
@@ -237,7 +237,7 @@ def match_vertices(
     target: ScanTarget, engine: ClosestPointEngine, T_scan_model: Similarity, surface: ModelSurface, vertex: IntArray,
     near: ClosestPoints | None, *, winding: float, normal_cosine: float,
 ) -> VertexMatches:  # fmt: skip
-    """Match some of the surface's vertices to the scan (eqs 5 and 6).
+    """Match some of the surface's vertices to the scan (R5, R6).
 
     Args:
         target: the scan.

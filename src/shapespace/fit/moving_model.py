@@ -172,7 +172,7 @@ class ModelSurface:
 
 @dataclass(frozen=True, eq=False)
 class LinearShape:
-    """A linear shape model on fixed triangles (eq 1).
+    """A linear shape model on fixed triangles (R1).
 
     Args:
         topology: of all of them.
@@ -185,7 +185,7 @@ class LinearShape:
     modes: Float32Array
 
     def surface(self, b: FloatArray) -> ModelSurface:
-        """Return the surface with coefficients `b` (k,) mm of the first k modes (eq 1)."""
+        """Return the surface with coefficients `b` (k,) mm of the first k modes (R1)."""
         k = len(b)
         flat = self.modes.reshape(-1, self.modes.shape[2])
         offset = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)

@@ -56,11 +56,11 @@ class Posterior:
 
     def b_stddev(self, modes: int) -> FloatArray:
         """Return the standard deviations (modes,) of the first coefficients, mm; never above those of the prior."""
-        return np.sqrt(np.clip(self.b_covariance(modes).diagonal(), 0.0, self.prior_variance[:modes]))
+        return np.sqrt(np.clip(self.b_covariance(modes).diagonal(), 0.0, self.prior_variance[:modes]))  # R21a
 
     def shrinkage(self, modes: int) -> FloatArray:
-        """Return (modes,) in [0, 1]: 1 where the scan told the coefficient, 0 where only the prior did."""
-        return 1.0 - self.b_stddev(modes) ** 2 / self.prior_variance[:modes]
+        """Return (modes,) in [0, 1]: 1 where the scan determines the coefficient, 0 where only the prior does."""
+        return 1.0 - self.b_stddev(modes) ** 2 / self.prior_variance[:modes]  # R21b
 
 
 def posterior(
@@ -74,7 +74,7 @@ def posterior(
     beyond_model_mm: float,
     allowed_share: float,
 ) -> Posterior:
-    """Return what is known at the end of a fit (eqs 20 to 22).
+    """Return what is known at the end of a fit (R20-R22).
 
     Args:
         model: the shape space.
@@ -88,33 +88,33 @@ def posterior(
     """
     K, n = model.n_modes, POSE + len(prior.stddev)
     variance = np.concatenate([new_shapes(model), prior.stddev[K:] ** 2])
-    data = equations.data / sigma_mm**2
+    H = equations.H / sigma_mm**2
     if equations.holds_scale:
-        data[SCALE], data[:, SCALE] = 0.0, 0.0
+        H[SCALE], H[:, SCALE] = 0.0, 0.0
     matches = float(weights.points.sum()) + float(weights.vertices.sum())
     size_mm = rms_size(model.mean_vertices)
     # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
     scale_stddev = prior.scale_stddev or 1.0
     unit = np.concatenate([np.ones(3), np.full(3, size_mm), [scale_stddev], np.sqrt(variance)])
-    known_before = np.concatenate([np.full(POSE - 1, 1e-9), np.ones(n - POSE + 1)])
+    prior_precision = np.concatenate([np.full(POSE - 1, 1e-9), np.ones(n - POSE + 1)])
 
     def covariance(patches: float) -> FloatArray:
         # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
-        temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # eq 20
-        scaled = data / temperature * np.outer(unit, unit)
-        if equations.marks is not None:
+        temperature = _NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # R20
+        scaled = H / temperature * np.outer(unit, unit)
+        if equations.H_landmarks is not None:
             # Weighed up in a step by what matches are worth, they are what they are beside tempered ones.
-            scaled += equations.marks / (sigma_mm**2 * worth(matches)) * np.outer(unit, unit)
-        scaled[np.diag_indices(n)] += known_before
-        inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # eq 21
+            scaled += equations.H_landmarks / (sigma_mm**2 * worth(matches)) * np.outer(unit, unit)
+        scaled[np.diag_indices(n)] += prior_precision
+        inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # R21
         if equations.holds_scale:
             inverse[SCALE], inverse[:, SCALE] = 0.0, 0.0
         return inverse * np.outer(unit, unit)
 
-    told = covariance(max(_PATCHES * allowed_share**2, _FEWEST_PATCHES))
-    dark = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else told
-    off_mm2 = float((dark * _gram(surface)).sum()) / len(surface.vertices)  # eq 22, first term
-    return Posterior(told, variance, float(np.sqrt(max(off_mm2, 0.0))))
+    reported = covariance(max(_PATCHES * allowed_share**2, _FEWEST_PATCHES))  # R20a
+    conservative = covariance(_FEWEST_PATCHES) if beyond_model_mm > 0 else reported
+    off_mm2 = float((conservative * _gram(surface)).sum()) / len(surface.vertices)  # R22, first term
+    return Posterior(reported, variance, float(np.sqrt(max(off_mm2, 0.0))))
 
 
 def covariance_of_landmarks(known: Posterior, surface: ModelSurface, landmarks: SurfaceLandmarks) -> FloatArray:

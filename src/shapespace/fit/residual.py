@@ -86,7 +86,7 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
     sources = [modes] if mirror is None else [modes, mirror(modes)]
-    fields = smooth_fields(x, settings.range_share * rms_size(x))
+    fields = smooth_fields(x, settings.range_share * rms_size(x))  # R17b
     mode, at = strongest_products(model.stddev, np.linalg.norm(fields, axis=0), MOST_PRODUCTS // len(sources))
     field = (np.sqrt(settings.local_share) * fields).astype(np.float32)[:, at] * stddev[mode]
     mirrored = np.float32(np.sqrt(settings.mirror_share)) * stddev

@@ -2,9 +2,9 @@
 
 One step minimises, over a small change of the pose and over the coefficients b, in the model's frame,
 
-    sum_i w_i r_i^2 / sigma^2  +  prior (sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2)
+    sum_i w_i r_i^2 / sigma^2  +  alpha (sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2)                   (R14a)
 
-where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992), and `prior` is
+where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992), and alpha is
 the weight of what is known beforehand beside that of one match. Matches go both ways: each scan point to the closest
 point of the moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals
 that disagree, or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The
@@ -60,7 +60,7 @@ class Iterate:
 
     Args:
         estimate: pose and coefficients.
-        surface: of the model, with these coefficients (eq 1).
+        surface: of the model, with these coefficients (R1).
     """
 
     estimate: Estimate
@@ -150,7 +150,7 @@ class Problem:
         return replace(self, prior=prior, shape=replace(self.shape, modes=extra.modes))
 
     def iterate(self, estimate: Estimate) -> Iterate:
-        """Return the iterate with this pose and these coefficients (eq 1)."""
+        """Return the iterate with this pose and these coefficients (R1)."""
         return Iterate(estimate, self.shape.surface(estimate.b))
 
     def matcher(self, level: Level) -> Matcher:
@@ -162,7 +162,7 @@ class Problem:
         return Matcher.of(target, points, vertex, engine, s.normal_cosine)
 
     def match(self, matcher: Matcher, iterate: Iterate, hint: MatchHint) -> WeightedMatches:
-        """Return the matches of an iterate with their weights (eqs 4 to 9).
+        """Return the matches of an iterate with their weights (R4-R9).
 
         Raises:
             FitError: hardly anything matches.
@@ -170,7 +170,7 @@ class Problem:
         return self.weigh(matcher.match(iterate.surface, iterate.T_scan_model, hint))
 
     def weigh(self, matches: Matches) -> WeightedMatches:
-        """Return the matches with their weights (eqs 7 to 9).
+        """Return the matches with their weights (R7-R9).
 
         Raises:
             FitError: hardly anything matches.
@@ -182,16 +182,16 @@ class Problem:
                 f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks "
                 "(--landmarks), or check that it shows what the model does."
             )
-        sigma_mm = max(spread(residual), s.least_spread_mm)
-        width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # eq 7
+        sigma_mm = max(spread(residual), s.least_spread_mm)  # R6a
+        width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # R7
         fineness = min(1.0, len(self.target.mesh.vertices) / len(self.shape.mean))
         weights = matches.weights(
             s.weight, width_mm, s.reach * width_mm + s.reach_mm, s.vertex_share * fineness**2
-        )  # eqs 8, 9
+        )  # R8, R9
         return WeightedMatches(matches, weights, sigma_mm)
 
     def equations(self, weighted: WeightedMatches, iterate: Iterate, modes: int) -> tuple[Gathered, NormalEquations]:
-        """Return what each vertex carries of the matches, and the normal equations of a step (eqs 10 to 14)."""
+        """Return what each vertex carries of the matches, and the normal equations of a step (R10-R14)."""
         surface = iterate.surface
         gathered = weighted.matches.gathered(weighted.weights, self.prepared.topology.faces, len(surface.vertices))
         equations = normal_equations(surface, gathered, self.prior, weighted.sigma_mm, iterate.estimate, modes)
@@ -199,8 +199,8 @@ class Problem:
             return gathered, equations
         hessian, gradient = self.marks.equations(surface, iterate.T_scan_model, modes)
         weights = weighted.weights
-        gain = weighted.sigma_mm**2 * worth(float(weights.points.sum() + weights.vertices.sum()))
-        return gathered, replace(equations, gradient=equations.gradient + gain * gradient, marks=gain * hessian)
+        gain = weighted.sigma_mm**2 * worth(float(weights.points.sum() + weights.vertices.sum()))  # R16d
+        return gathered, replace(equations, gradient=equations.gradient + gain * gradient, H_landmarks=gain * hessian)
 
     def step(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, modes: int) -> Step:
         """Return one Gauss-Newton step on the pose and the first `modes` coefficients.
@@ -208,22 +208,23 @@ class Problem:
         Raises:
             FitError: hardly anything matches, or the fit diverged.
         """
-        weighted = self.match(matcher, iterate, hint)  # eqs 4 to 9
-        _, equations = self.equations(weighted, iterate, modes)  # eqs 10 to 14
+        weighted = self.match(matcher, iterate, hint)  # R4-R9
+        _, equations = self.equations(weighted, iterate, modes)  # R10-R14
         try:
-            delta = equations.step()  # eq 15
+            delta = equations.step()  # R15
         except LinAlgError as error:
             raise FitError(
                 f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
                 "what the model shows (--crop)."
             ) from error
-        estimate = iterate.estimate.moved_by(delta)  # eq 16
+        estimate = iterate.estimate.moved_by(delta)  # R16
         # Without free modes the shape stays as it is.
         following = self.iterate(estimate) if modes else replace(iterate, estimate=estimate)
         some = slice(None, None, _MOTION_STRIDE)
         before = iterate.T_scan_model.apply(iterate.surface.vertices[some])
         moved = estimate.T_scan_model.apply(following.surface.vertices[some]) - before
-        return Step(weighted, following, float(np.linalg.norm(moved, axis=1).max()) / estimate.T_scan_model.scale)
+        motion_mm = float(np.linalg.norm(moved, axis=1).max()) / estimate.T_scan_model.scale  # R16e
+        return Step(weighted, following, motion_mm)
 
     def descent(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, level: Level) -> Generator[Step]:
         """Yield steps with the modes that are free on `level`, until hardly anything moves.
@@ -240,13 +241,13 @@ class Problem:
                 return
 
     def unexplained_variance(self, weighted: WeightedMatches) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is not noise (eq 17)."""
+        """Return the variance, mm^2, of the part of the residuals that is not noise (R17)."""
         return weighted.matches.unexplained_variance(
             weighted.weights, self.prepared.topology.faces, len(self.shape.mean), self.settings.seed
         )
 
     def in_model(self, iterate: Iterate, surface_mm: float, modes: int) -> Estimate:
-        """Return the pose and the first `modes` of the model's own coefficients of an iterate (eqs 18 and 19).
+        """Return the pose and the first `modes` of the model's own coefficients of an iterate (R18, R19).
 
         Args:
             iterate: of the fit, with residual modes or without.
@@ -314,8 +315,8 @@ def robust_icp(
     problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
     course, tree = yield from _coarse_to_fine(problem, start, max_iterations)
     weighted = problem.match(course.matcher, course.iterate, course.hint)
-    unexplained_mm2 = problem.unexplained_variance(weighted)  # eq 17
-    least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)
+    unexplained_mm2 = problem.unexplained_variance(weighted)  # R17
+    least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)  # R17a
     if unexplained_mm2 >= least_mm2 and course.state.iteration < max_iterations:
         problem = problem.with_residual_modes()
         course = yield from _extended(problem, course, tree, max_iterations)
@@ -388,7 +389,7 @@ def _summary(
         problem: of the fit.
         iterate: the last one.
         weighted: its matches.
-        unexplained_mm2: variance of the residuals that is not noise, before residual modes joined (eq 17).
+        unexplained_mm2: variance of the residuals that is not noise, before residual modes joined (R17).
         modes: how many coefficients to report; None for all.
     """
     model, target, settings = problem.prepared.model, problem.target, problem.settings
@@ -411,7 +412,7 @@ def _summary(
     if wanted < model.n_modes:
         reported = problem.in_model(iterate, known.surface_mm, wanted)
     in_model = (T.inverse() @ whole.T_scan_model).apply(model.reconstruct(whole.b))
-    left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())
+    left_out_mm2 = float(((surface.vertices - in_model) ** 2).sum(axis=1).mean())  # R22, second term
     return RobustFitted(
         T_scan_model=reported.T_scan_model,
         b=reported.b,

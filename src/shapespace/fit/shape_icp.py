@@ -38,7 +38,7 @@ def shape_icp(
         InputError: the matches determine no similarity, or the fit has diverged.
     """
     b = np.zeros(model.n_modes) if b is None else b
-    Q = model.reconstruct(b)  # eq 6
+    Q = model.reconstruct(b)  # P6
     y = T_scan_model.apply(Q)
     matched = scan.query(y)
     rms_mm = [matched.rms / T_scan_model.scale]
@@ -46,10 +46,10 @@ def shape_icp(
 
     for iteration in range(1, stop.max_iterations + 1):
         c = matched.points  # step 1: closest points of the current deformed model
-        T_scan_model = fit_pose(Q, c, T_scan_model, with_scale)  # step 2: eqs 8-18
+        T_scan_model = fit_pose(Q, c, T_scan_model, with_scale)  # step 2: P8-P18
         Q_matched = T_scan_model.inverse().apply(c)  # in model order and in the model's frame
-        b = model.project(Q_matched, align=False)  # step 3: b = P^T (Q - Q_bar), eq 19
-        Q = model.reconstruct(b)  # eq 6: the deformed model
+        b = model.project(Q_matched, align=False)  # step 3: b = P^T (Q - Q_bar), P19
+        Q = model.reconstruct(b)  # P6: the deformed model
         moved, y = y, T_scan_model.apply(Q)
         matched = scan.query(y, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)

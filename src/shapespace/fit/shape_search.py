@@ -53,7 +53,7 @@ def shape_search(
     tree: KdArrays,
     counts: IntArray,
     reaches: FloatArray,
-    prior: float,
+    prior_weight: float,
     scale_precision: float,
     slack: FloatArray,
     cap: float,
@@ -62,7 +62,7 @@ def shape_search(
     """Run two-way Gauss-Newton over pose and leading modes from one pose, in place, and return the scale it ends at.
 
     All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
-    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior reach^2 (sum b_k^2 / lam_k + c
+    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight reach^2 (sum b_k^2 / lam_k + c
     log(scale)^2), w Geman and McClure's.
 
     Args:
@@ -75,7 +75,7 @@ def shape_search(
         tree: of the scan's points.
         counts: (2,) how many of the first points of the model and of the scan look for the other.
         reaches: (I,) of the weights, for each iteration, mm.
-        prior: weight of the prior.
+        prior_weight: weight of the prior.
         scale_precision: c; infinity holds the scale.
         slack: (2,) how far a match may lie sideways, model to scan and back, mm.
         cap: distance beyond which a match counts no more in the score, mm.
@@ -180,13 +180,13 @@ def shape_search(
             out[1] = out[1] / seen if seen > 0 else cap
             break
         for m in range(n_modes):
-            A[7 + m, 7 + m] += prior * nu * shape.precision[m]
-            g[7 + m] += prior * nu * shape.precision[m] * b[m]
+            A[7 + m, 7 + m] += prior_weight * nu * shape.precision[m]
+            g[7 + m] += prior_weight * nu * shape.precision[m] * b[m]
         if held:
             A[6, :7], A[7:, 6], A[6, 6], g[6] = 0.0, 0.0, 1.0, 0.0
         else:
-            A[6, 6] += prior * nu * scale_precision
-            g[6] += prior * nu * scale_precision * np.log(scale)
+            A[6, 6] += prior_weight * nu * scale_precision
+            g[6] += prior_weight * nu * scale_precision * np.log(scale)
         for p in range(6):
             A[p, p] += 1e-6 * (A[p, p] + 1.0)
         for p in range(size):

@@ -35,8 +35,8 @@ def similarity_icp(
     yield IcpState(1, 0, T_scan_model, b, rms_mm[0], np.inf)
 
     for iteration in range(1, stop.max_iterations + 1):
-        p_prime = matched.points  # eq 7: the closest scan point of each model vertex
-        T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # eqs 8-18
+        p_prime = matched.points  # P7: the closest scan point of each model vertex
+        T_scan_model = fit_pose(Q_mean, p_prime, T_scan_model, with_scale)  # P8-P18
         moved, p = p, T_scan_model.apply(Q_mean)
         matched = scan.query(p, near=matched)
         rms_mm.append(matched.rms / T_scan_model.scale)

@@ -25,7 +25,7 @@ def in_span(
     *,
     with_scale: bool,
 ) -> Estimate:
-    """Return the likeliest pose and first `modes` coefficients given the surface `vertices` (eqs 18 and 19).
+    """Return the likeliest pose and first `modes` coefficients given the surface `vertices` (R18, R19).
 
     Args:
         prepared: the model.
@@ -48,7 +48,7 @@ def in_span(
     normal = (pose.T @ pose - (inside.T * kept) @ inside) * np.outer(unit, unit)
     normal[np.diag_indices(free)] += noise / reach
     delta = np.zeros(POSE)
-    delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept * b)))  # eq 18
+    delta[:free] = unit * np.linalg.solve(normal, unit * (pose.T @ y - inside.T @ (kept * b)))  # R18
     small = small_similarity(delta)
     y = (small.inverse().apply(vertices) - prepared.model.mean_vertices).ravel()
-    return Estimate(at.T_scan_model @ small, kept * (P.T @ y))  # eq 19
+    return Estimate(at.T_scan_model @ small, kept * (P.T @ y))  # R19

@@ -11,17 +11,17 @@ from shapespace.types import BoolArray, FloatArray
 
 def welsch(residual: FloatArray, scale: float) -> FloatArray:
     """Return exp(-r^2 / (2 scale^2)): what lies far off counts nothing (Zhang, Yao and Deng, PAMI 2022)."""
-    return np.exp(-0.5 * (residual / scale) ** 2)
+    return np.exp(-0.5 * (residual / scale) ** 2)  # R8a
 
 
 def geman_mcclure(residual: FloatArray, scale: float) -> FloatArray:
     """Return (scale^2 / (scale^2 + r^2))^2, with heavier tails than Welsch's (Zhou, Park and Koltun, ECCV 2016)."""
-    return (scale**2 / (scale**2 + residual**2)) ** 2
+    return (scale**2 / (scale**2 + residual**2)) ** 2  # R8b
 
 
 def huber(residual: FloatArray, scale: float) -> FloatArray:
     """Return 1 up to `scale` and scale / |r| beyond: nothing is ever left out (Huber, 1964)."""
-    return scale / np.maximum(np.abs(residual), scale)
+    return scale / np.maximum(np.abs(residual), scale)  # R8c
 
 
 WEIGHTS: Mapping[str, Callable[[FloatArray, float], FloatArray]] = {
@@ -33,12 +33,12 @@ WEIGHTS: Mapping[str, Callable[[FloatArray, float], FloatArray]] = {
 
 
 def spread(residual: FloatArray) -> float:
-    """Return the standard deviation that the median of |residual| (M,) stands for, whatever the outliers are."""
+    """Return the robust standard deviation of `residual` (M,) from the median of its absolute values (R6a)."""
     return 1.4826 * float(np.median(np.abs(residual))) if len(residual) else float("inf")
 
 
 def tails(residual: FloatArray, spread_mm: float) -> float:
-    """Return how far the outer tenth of |residual| (M,) lies, where 1 is what noise of that spread would give."""
+    """Return the 90 % quantile of |residual| (M,) over that of normal noise of this spread (R6b)."""
     return float(np.quantile(np.abs(residual), 0.9)) / (1.645 * spread_mm)
 
 

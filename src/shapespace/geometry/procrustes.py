@@ -334,7 +334,7 @@ def _pass(
 
 
 def _rotations(products: FloatArray) -> FloatArray:
-    """Return the rotations (n, 3, 3) of `fit_similarity`, eqs 13 to 16, from products (n, 3, 3) of centred points."""
+    """Return the rotations (n, 3, 3) of `fit_similarity`, P13-P16, from products (n, 3, 3) of centred points."""
     U, D, Vt = np.linalg.svd(products)
     if (D[:, 1] <= _ON_A_LINE * D[:, 0]).any():
         raise InputError(

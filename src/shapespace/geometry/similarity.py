@@ -47,25 +47,25 @@ def fit_similarity(
     if not w.any():
         raise InputError("A similarity needs at least three points with a positive weight.")
 
-    mean_source, mean_target = w @ source, w @ target  # eqs 8-9
-    q, q_prime = source - mean_source, target - mean_target  # eqs 10-11
+    mean_source, mean_target = w @ source, w @ target  # P8, P9
+    q, q_prime = source - mean_source, target - mean_target  # P10, P11
     weighted = q * w[:, None]
-    H = weighted.T @ q_prime  # eq 12
+    H = weighted.T @ q_prime  # P12
     spread = np.vdot(weighted, q)
     if not (np.isfinite(spread) and np.isfinite(H).all()):
         raise InputError("The points of a similarity must be finite.")
 
-    U, D, Vt = np.linalg.svd(H)  # eq 13
+    U, D, Vt = np.linalg.svd(H)  # P13
     if spread <= 0 or D[1] <= _RANK_TOLERANCE * max(D[0], np.finfo(float).tiny):
         raise InputError(
             "The matched points lie on a line or coincide, so they determine no rotation; use more points."
         )
-    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # eq 16: the reflection guard
-    R = (Vt.T * Z) @ U.T  # eqs 14-15, as corrected
-    s = float((D * Z).sum() / spread) if with_scale else 1.0  # eq 18, as corrected
+    Z = np.array([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])  # P16: the reflection guard
+    R = (Vt.T * Z) @ U.T  # P14, P15, as corrected
+    s = float((D * Z).sum() / spread) if with_scale else 1.0  # P18, as corrected
     if s <= 0:
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
-    T = mean_target - s * R @ mean_source  # eq 17, as corrected
+    T = mean_target - s * R @ mean_source  # P17, as corrected
     return Similarity(s, R, T)
 
 

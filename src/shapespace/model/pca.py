@@ -19,7 +19,7 @@ _BLOCK = 1024
 _CANCELLATION = 1e4
 """Beyond this ratio of raw to centred sum of squares, centring the Gram matrix would cost too many digits."""
 _NO_VARIANCE = 1e-10
-"""Modes with less than this share of the first mode's variance are rounding, not shape (erratum to eq 4)."""
+"""Modes with less than this share of the first mode's variance are rounding, not shape (erratum to P4)."""
 ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
@@ -95,7 +95,7 @@ def principal_components(data: FloatArray, modes: int | float | None = None) -> 
 
     wanted = modes if isinstance(modes, int) else n - 1
     values, vectors = eigh(gram, lower=True, subset_by_index=(n - wanted, n - 1), check_finite=False, overwrite_a=True)
-    variance = values[::-1] / (n - 1)  # eq 4
+    variance = values[::-1] / (n - 1)  # P4
     variance = varying(variance)
     if isinstance(modes, float):
         variance = variance[: modes_for_variance(variance, modes)]
@@ -151,7 +151,7 @@ def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
 
 
 def _centred_gram(data: FloatArray) -> FloatArray:
-    """Return the lower triangle of X^T X (N, N), X the centred shapes (eqs 1-3)."""
+    """Return the lower triangle of X^T X (N, N), X the centred shapes (P1, P2, P3)."""
     n = len(data)
     raw = syrk(data)
     if not np.isfinite(raw.diagonal()).all():
@@ -179,7 +179,7 @@ def _centred_gram_by_blocks(data: FloatArray) -> FloatArray:
 
 
 def _mean_and_basis(data: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean (D,) and P = X weights (D, K) (eq 5), orthonormal to rounding, with deterministic signs."""
+    """Return the mean (D,) and P = X weights (D, K) (P5), orthonormal to rounding, with deterministic signs."""
     n, k = weights.shape
     combined = np.vstack([weights.T, np.full((1, n), 1.0 / n)]) @ data  # one pass over the data for both
     mean, rows = combined[k].copy(), combined[:k]

@@ -72,7 +72,7 @@ class Representation(Protocol):
 
 
 class Vertices:
-    """The paper's representation (eq 1): all coordinates, one vertex after the other, D = 3V."""
+    """The paper's representation (P1): all coordinates, one vertex after the other, D = 3V."""
 
     takes_holes: ClassVar[bool] = False
 

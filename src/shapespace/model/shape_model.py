@@ -1,4 +1,4 @@
-"""The shape space: a mean, an orthonormal basis of modes, and how far each mode reaches (eqs 1-6)."""
+"""The shape space: a mean, an orthonormal basis of modes, and how far each mode reaches (P1-P6)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _WIDEST = 1e6
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
-    """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (eq 6).
+    """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (P6).
 
     Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b;
     `to_z` and `to_b` turn one into the other.
@@ -182,7 +182,7 @@ class ShapeModel:
         keep_shapes: Path | None = None,
         tell: Tell = lambda _: None,
     ) -> ShapeModel:
-        """Build the shape space of corresponding `meshes` (eqs 1-5), in mm.
+        """Build the shape space of corresponding `meshes` (P1-P5), in mm.
 
         Args:
             meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
@@ -459,7 +459,7 @@ class ShapeModel:
         return _FILES.get(self)
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
-        """Return the vertices (V, 3), mm, of the shape with coefficients `b` (eq 6).
+        """Return the vertices (V, 3), mm, of the shape with coefficients `b` (P6).
 
         Args:
             b: (k,) mm, k at most K; missing ones are zero.
@@ -476,7 +476,7 @@ class ShapeModel:
         return Mesh(vertices, self.faces, self.landmarks.positions(vertices), name="model")
 
     def project(self, shape: Mesh | FloatArray, *, align: bool = True) -> FloatArray:
-        """Return the coefficients b (K,), mm, of a shape in vertex correspondence: b = P^T (Q - mean) (eq 19).
+        """Return the coefficients b (K,), mm, of a shape in vertex correspondence: b = P^T (Q - mean) (P19).
 
         Args:
             shape: a mesh or (V, 3) vertices, mm, in the model's vertex order.

@@ -352,7 +352,7 @@ def _split(cohort: Cohort, sides: Sides) -> tuple[FloatArray, FloatArray, FloatA
     if cohort.gauge == "shape":
         scale_to_tangent(both)
     mean = both.mean(axis=0)
-    difference = both[:n] - both[n:]
+    difference = both[:n] - both[n:]  # S31
     if cohort.analysed is not None:
         # A vertex that no shape observes on both sides contains no information on their difference.
         known = cohort.analysed[sides.vertices]
@@ -397,9 +397,10 @@ def _anova(
     gram_off = off @ off.T
     between = who.shares @ (who.shares > 0).T
     # A shape and its image lie half of their difference from the symmetric part, one on either side.
-    individual = 2.0 * float((between * gram_s).sum())
-    side = rows * float(mean_d @ mean_d) / 2.0
-    both = float((between * gram_off).sum()) / 2.0
+    individual = 2.0 * float((between * gram_s).sum())  # S32
+    side = rows * float(mean_d @ mean_d) / 2.0  # S33
+    both = float((between * gram_off).sum()) / 2.0  # S34
+    # S35
     error_s, error_d = 2.0 * float(np.trace(gram_s)) - individual, float(np.trace(gram_off)) / 2.0 - both
     d_sym, d_asym = dimensions
     repeated = rows > n
@@ -525,13 +526,13 @@ def _scores(fields: FloatArray, who: _Means, shared: FloatArray | None) -> Score
         squared = max(squared, trace**2 / flat.shape[1])
         along = ((own @ off.T) ** 2).sum(axis=1) / df
     of_mean, of_mean_squared = trace / who.counts, squared / who.counts**2
-    net = squares - of_mean
+    net = squares - of_mean  # S36
     # A mean lies partly along its own error, which scatters it less than it seems.
     steep = np.maximum(along / who.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
     steep = np.where(net > 0, np.minimum(steep, np.sqrt(of_mean_squared)), 0.0)
     steep = steep if shared is None else steep + shared
     normal = NormalDist().inv_cdf(0.5 + LEVEL / 2) ** 2
-    middle = net + 2 * normal * steep
+    middle = net + 2 * normal * steep  # S37
     half = np.sqrt(np.maximum(middle**2 - net**2 + 2 * normal * of_mean_squared, 0.0))
 
     def mm(square: FloatArray) -> FloatArray:

@@ -82,7 +82,7 @@ def mean_test(
 
     def t_of(sums: FloatArray) -> FloatArray:
         within = np.maximum(squares - sums**2 / n, _FLOOR * squares) / (n - 1)
-        return _ratio(sums / n, np.sqrt(within / n))
+        return _ratio(sums / n, np.sqrt(within / n))  # S24
 
     def draws() -> Iterator[FloatArray]:
         if every:
@@ -133,7 +133,7 @@ def difference_test(
     def t_of(difference: FloatArray) -> FloatArray:
         between = difference**2 * of_first * of_second / n
         within = np.maximum(squares - between, _FLOOR * squares) / (n - 2)
-        return _ratio(difference, np.sqrt(within * (1.0 / of_first + 1.0 / of_second)))
+        return _ratio(difference, np.sqrt(within * (1.0 / of_first + 1.0 / of_second)))  # S25
 
     def draws() -> Iterator[FloatArray]:
         yield contrast(second)
@@ -174,7 +174,7 @@ def _permuted(
         if on_step is not None:
             on_step(len(maxima), count)
     ordered = np.sort(maxima)
-    below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))
+    below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))  # S26
     return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima), _critical(ordered)
 
 

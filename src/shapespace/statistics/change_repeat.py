@@ -47,7 +47,7 @@ class Repeatability:
     @property
     def smallest_mm(self) -> FloatArray:
         """(V,) smallest detectable change, 1.96 sqrt(2) times the standard deviation."""
-        return SMALLEST * self.within_mm
+        return SMALLEST * self.within_mm  # S22
 
     @property
     def volumes_smallest_mm3(self) -> FloatArray:
@@ -126,7 +126,7 @@ class Rescans:
             self.scans,
             self.visits,
             freedom,
-            np.sqrt(self._along / freedom),
+            np.sqrt(self._along / freedom),  # S21
             np.sqrt(self._volume / freedom),
             np.sqrt(self._marks / freedom),
             _icc(between, self._within, self.people),
@@ -143,7 +143,7 @@ def _icc(between: FloatArray, within: FloatArray, sizes: list[int]) -> FloatArra
     k = (n - sum(size**2 for size in sizes) / n) / (groups - 1)
     b, w = between / (groups - 1), within / (n - groups)
     total = b + (k - 1) * w
-    return np.divide(b - w, total, out=np.full(len(b), np.nan), where=total > 0)
+    return np.divide(b - w, total, out=np.full(len(b), np.nan), where=total > 0)  # S23
 
 
 def _squares(values: FloatArray) -> FloatArray:

@@ -457,8 +457,8 @@ def term_tests(
         products = stratum.products(np.hstack([own, rest]), residual, count, options.seed, flips=stratum.flips(reduced))
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
-        explained = squares[:, :df].sum(axis=1)
-        f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)
+        explained = squares[:, :df].sum(axis=1)  # S2
+        f = _ratio(explained / df, ((residual**2).sum() - squares.sum(axis=1)) / stratum.df_error)  # S3
         if units is not None:
             # Columns of the reduced model are not tested; each unit has its own variance.
             f = units.estimate(
@@ -773,7 +773,7 @@ def _between(effects: Sequence[Effect]) -> Iterator[Angle]:
 
 
 def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the (P,) angles in degrees of vectors (P, K)."""
+    """Return the (P,) angles in degrees of vectors (P, K) (S10)."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
 
@@ -826,7 +826,7 @@ def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
 
 
 def _share(statistic: FloatArray) -> float:
-    return float((statistic >= statistic[0] * (1 - _TIE)).mean())
+    return float((statistic >= statistic[0] * (1 - _TIE)).mean())  # S4
 
 
 def _ratio(explained: FloatArray, left: FloatArray) -> FloatArray:

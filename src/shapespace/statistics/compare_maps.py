@@ -94,7 +94,7 @@ class EffectMap:
     def interval_mm(self, vertex: int) -> tuple[float, float]:
         """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
         f, shown = float(self.shown.f[vertex]), float(self.shown_mm[vertex])
-        half = float("inf") if f <= 0 else abs(shown) * float(np.sqrt(self.shown.critical / f))
+        half = float("inf") if f <= 0 else abs(shown) * float(np.sqrt(self.shown.critical / f))  # S9
         # A length is not negative.
         return (shown - half if self.normal_mm is not None else max(shown - half, 0.0)), shown + half
 
@@ -162,7 +162,7 @@ def effect_maps(
                     effect = np.tensordot(along, drawn, axes=(1, 1))
                     explained = np.einsum("epvc,epvc->epv", effect, effect)
                     left = squares - np.einsum("pmvc,pmvc->pv", drawn, drawn)
-                    f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)
+                    f = explained * stratum.df_error / np.maximum(left, _NONE * squares + 1e-300)  # S7
                 if weights is not None:
                     f *= weights[:, None, part]
                 if start == 0:
@@ -233,7 +233,7 @@ def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: Floa
         near = tree.sparse_distance_matrix(cKDTree(mean[part]), _REACH * width_mm, output_type="coo_matrix")
         near.data = np.exp(-0.5 * (near.data / width_mm) ** 2)
         shapes: FloatArray = np.asarray((near.tocsr().T @ ahead.T).T)
-        filters: FloatArray = precision @ shapes
+        filters: FloatArray = precision @ shapes  # S11
         return filters, np.maximum((filters * shapes).sum(axis=0), 1e-300)
 
     return bump
@@ -266,7 +266,7 @@ def _bin(f: FloatArray) -> Any:
 def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, level: float) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
-    as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))
+    as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))  # S8
     of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
     q = false_discovery_control(of_all[_bin(f)])
     critical = float(np.sort(largest)[-(int(level * len(largest) * (1 + _TIE)) + 1)])

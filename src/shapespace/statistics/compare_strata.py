@@ -117,11 +117,11 @@ class Stratum:
         return [term for term in (*self.nuisance, *self.terms) if not variables <= term.variables]
 
     def residual(self, terms: Sequence[Term]) -> FloatArray:
-        """Return the (n, K) residuals of the model of some of the terms."""
+        """Return the (n, K) residuals of the model of some of the terms (S1)."""
         return less(self.shapes, self.matrix[:, self.at(terms)])
 
     def direction(self, contrast: FloatArray) -> FloatArray:
-        """Return (n,) what gives the estimate of a contrast (P,) of the design when multiplied by the shapes."""
+        """Return (n,) what gives the estimate of a contrast (P,) of the design when multiplied by the shapes (S6)."""
         own = np.zeros(len(self.columns))
         tested = self.at(self.terms)
         own[tested] = contrast[self.columns[tested]]
@@ -148,7 +148,7 @@ class Stratum:
         out = np.empty((permutations, basis.shape[1], residual.shape[1]))
         for start, rows, signs in self.arrangements(permutations, seed, flips=flips):
             placed = basis[rows] if signs is None else basis * signs[:, :, None]
-            made = placed.transpose(0, 2, 1).reshape(-1, len(residual)) @ residual
+            made = placed.transpose(0, 2, 1).reshape(-1, len(residual)) @ residual  # S4
             out[start : start + len(rows)] = made.reshape(len(rows), basis.shape[1], -1)
         return out
 

@@ -112,7 +112,7 @@ def dispersion_test(
     own = np.searchsorted(used, codes[rows])
     squares = (residual[rows] ** 2).sum(axis=1) / (1.0 - leverage[rows])
     variances = np.bincount(own, weights=squares) / np.bincount(own)
-    distances = np.sqrt(squares)
+    distances = np.sqrt(squares)  # S12
     f = np.concatenate(
         [_f_of_means(distances[rows], own) for rows in _permutations(len(distances), permutations, seed)]
     )
@@ -168,7 +168,7 @@ class UnequalVariances:
         n = len(self.residual)
         for start in range(0, self.permutations, _BATCH):
             drawn = np.random.default_rng([self.seed, 4, start]).choice((-1.0, 1.0), (_BATCH, n))
-            factors = (drawn * self.scale)[: self.permutations - start]
+            factors = (drawn * self.scale)[: self.permutations - start]  # S14
             if start == 0:
                 factors[0] = 1.0
             yield start, factors
@@ -216,7 +216,7 @@ class Estimate:
         return full.T @ (self.weights[:, None] * full)
 
     def statistic(self) -> FloatArray:
-        """Return the (permutations,) squared length of the estimate divided by the trace of its covariance."""
+        """Return the (permutations,) squared length of the estimate divided by the trace of its covariance (S13)."""
         rows = self.flips.residual
         squares = (rows**2).sum(axis=1)
         fitted, weighted = self.flips.fitted, self._weighted

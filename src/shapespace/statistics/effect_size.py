@@ -43,7 +43,7 @@ def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:
     spread = float(transformed.std())
     if not np.isfinite(spread) or spread <= 1e-12 * max(float(np.abs(transformed).max()), _SMALLEST):
         return 0.0
-    return float((transformed[0] - transformed.mean()) / spread)
+    return float((transformed[0] - transformed.mean()) / spread)  # S5
 
 
 def box_cox_exponent(values: FloatArray) -> float:

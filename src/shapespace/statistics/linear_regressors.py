@@ -38,7 +38,7 @@ class Choice:
     amount: float
 
     def factors(self, singular: FloatArray) -> FloatArray:
-        """Return by how much (r,) directions with singular values (r,) take part, 0 to 1."""
+        """Return the factors (r,), 0 to 1, of directions with singular values (r,) (S42)."""
         if self.space == "raw":
             return singular**2 / (singular**2 + self.amount * singular[0] ** 2)
         return (np.arange(len(singular)) < self.amount).astype(np.float64)
@@ -83,7 +83,7 @@ class Decomposed:
         mean = weighted_mean(targets, self.weight)
         along = (X - self.middle) @ self.right.T / self.singular
         of_targets = self.left.T @ (np.sqrt(self.weight)[:, None] * (targets - mean))
-        return np.stack([mean + (along * choice.factors(self.singular)) @ of_targets for choice in choices])
+        return np.stack([mean + (along * choice.factors(self.singular)) @ of_targets for choice in choices])  # S41
 
     def weights(self, target: FloatArray, choice: Choice) -> tuple[FloatArray, float]:
         """Return weights (K,) and intercept of a prediction from coefficients, for a target (n,)."""

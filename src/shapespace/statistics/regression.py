@@ -226,7 +226,7 @@ def regress(
     errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
     predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], level)
     centred = y - weighted_mean(y, share)
-    pattern = (share * centred) @ X / float((share * centred**2).sum())
+    pattern = (share * centred) @ X / float((share * centred**2).sum())  # S44
     low_at, high_at = _percentiles(y, codes, share, _EDGES)
     return Regression(
         cohort=cohort,
@@ -445,6 +445,7 @@ def _p_of(
     for start in range(0, permutations, _BLOCK):
         targets = np.stack([_permuted(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))], axis=1)
         done = nested(X, targets, share, outer, inner, on_fold=steps.fold)
+        # S43
         r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
         beyond += int((r2 >= observed - 1e-12).sum())
     return beyond / (1 + permutations)

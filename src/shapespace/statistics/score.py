@@ -364,7 +364,7 @@ class _Measure:
         return (coefficients - self.mean) @ self.components.T
 
     def squared(self, scores: FloatArray, noise: FloatArray | None) -> FloatArray:
-        """Return squared Mahalanobis distances (...,) of scores (..., q), with noise (K, K) of coefficients."""
+        """Return squared Mahalanobis distances (...,) of scores (..., q), with noise (K, K) of coefficients (S51)."""
         if noise is None:
             return (scores**2 / self.variance).sum(axis=-1)
         covariance = np.diag(self.variance) + self.components @ noise @ self.components.T
@@ -410,12 +410,12 @@ class _Ruler:
 
     def share(self, farther: BoolArray) -> float:
         """Return the share of people, a new one among them, who are `farther` (R, N); those of a person count once."""
-        return (1 + float((farther.mean(axis=0) * self.weight).sum())) / (self.people + 1)
+        return (1 + float((farther.mean(axis=0) * self.weight).sum())) / (self.people + 1)  # S52
 
     def p_value(self, squared: float) -> float:
         """Return the chance of a squared distance as large by the F distribution."""
         q, n = self.modes, self.people
-        return float(f_distribution.sf(squared * (n - q) / ((n - 1) * q), q, n - q))
+        return float(f_distribution.sf(squared * (n - q) / ((n - 1) * q), q, n - q))  # S53
 
 
 @dataclass(frozen=True, eq=False)
@@ -522,7 +522,7 @@ def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | N
         if seen is not None and rows is not None:
             along = np.einsum("kmi,mi->km", rows.reshape(len(rows), -1, 3)[:, part], own)
             uncertain = seen.variance @ along**2
-        z[:, part] = moved / np.sqrt(variance * (1 + 1 / count) + uncertain)
+        z[:, part] = moved / np.sqrt(variance * (1 + 1 / count) + uncertain)  # S54
         rest = n - size
         others = (total - groups @ x) / rest
         spread = np.maximum((squares - groups @ x**2 - rest * others**2) / np.maximum(rest - 1, 1), 1e-18)

@@ -75,7 +75,7 @@ class TwoCovariance:
         freedom = several.sum() - (counts > 1).sum()
         within = cast(FloatArray, shrunk(own[several], assume_centered=True)[0]) * (several.sum() / freedom)
         spread = cast(FloatArray, shrunk(means - mean, assume_centered=True)[0]) * (len(names) / (len(names) - 1))
-        between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)
+        between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)  # S61
         values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
         stated = training.variance.mean(axis=0) @ basis**2
         noise = np.minimum(stated, _MOST_NOISE)
@@ -101,9 +101,9 @@ class TwoCovariance:
         for row, (x, total) in enumerate(zip(g, of_g, strict=True)):
             # Of the probe given the gallery scan, if they are of one person.
             pull = self.between / total
-            left = of_p - self.between * pull
+            left = of_p - self.between * pull  # S63
             together = ((p - pull * x) ** 2 / left + np.log(left)).sum(axis=1)
-            out[row] = 0.5 * (alone - together)
+            out[row] = 0.5 * (alone - together)  # S62
         return out
 
     def within(self, samples: Samples) -> FloatArray:
