@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from shapespace.errors import InputError
-from shapespace.statistics.change_group import difference_test
 from shapespace.statistics.dispersion import UnequalVariances, dispersion_test, unequal_variances
+from shapespace.statistics.map_tests import difference_test
 from shapespace.types import FloatArray
 
 STUDIES = 150

@@ -28,9 +28,10 @@ def add(sub: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import steps
-    from shapespace.statistics.score import ScoreOptions, score
+    from shapespace.report.analyses.score import score_report
+    from shapespace.statistics.score import ScoreConfig, score
 
-    options = ScoreOptions(
+    config = ScoreConfig(
         modes=arguments.modes,
         subject=arguments.subject,
         nearest=arguments.nearest,
@@ -41,5 +42,5 @@ def run(arguments: argparse.Namespace) -> int:
     reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
     subjects = cohort_of(arguments, onto=reference)
     with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
-        scores = score(reference, subjects, options, on_step=step)
-    return finish(scores.answer(), arguments)
+        result = score(reference, subjects, config, progress=step)
+    return finish(score_report(result), arguments)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.proportions import zero_bound
+from shapespace.report.analyses.analysis_report import Rows
 from shapespace.schemas import Series
-from shapespace.statistics.answer import Rows
-from shapespace.statistics.identity.rates import Figure
-from shapespace.statistics.identity.rounds import IdentityOptions, Trial
+from shapespace.statistics.identity.rates import RateEstimate
+from shapespace.statistics.identity.trial import IdentityConfig, Trial
 from shapespace.types import FloatArray
 
 _POINTS = 300
@@ -35,7 +35,7 @@ def called(name: str) -> str:
     return CALLED.get(name, name)
 
 
-def in_percent(one: Figure) -> str:
+def in_percent(one: RateEstimate) -> str:
     """Return a share with its interval in words."""
     if one.value is None:
         return "not known"
@@ -43,12 +43,12 @@ def in_percent(one: Figure) -> str:
     return f"{100 * one.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
 
 
-def interval(one: Figure) -> tuple[float, float] | None:
+def interval(one: RateEstimate) -> tuple[float, float] | None:
     """Return the ends of an interval, or None if there is none."""
     return None if one.low is None or one.high is None else (one.low, one.high)
 
 
-def cells(one: Figure) -> list[object]:
+def cells(one: RateEstimate) -> list[object]:
     """Return value, low and high of a figure as cells of a CSV table."""
     return ["" if value is None else value for value in (one.value, one.low, one.high)]
 
@@ -75,14 +75,9 @@ def who_was_tested(trial: Trial, trained_on: int) -> str:
     )
 
 
-def settings(options: IdentityOptions) -> dict[str, Any]:
+def settings(config: IdentityConfig) -> dict[str, Any]:
     """Return all that the result depends on."""
-    return asdict(options)
-
-
-def hashes(trial: Trial) -> tuple[str, ...]:
-    """Return the hash of the model of the fits."""
-    return () if trial.cohort.fitted is None else (trial.cohort.fitted.model.content_hash,)
+    return asdict(config)
 
 
 def scans_told(trial: Trial) -> Rows:

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer, Lengths, Rows
-from shapespace.statistics.methods_answer import methods_parts
-from shapespace.statistics.observed import blank_where, weights_of, with_shape_data
+from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
     SMALL,
-    Measure,
-    Regression,
+    AccuracyMeasure,
+    RegressionResult,
     compare_with,
     permutation_scheme,
     share_of,
@@ -30,7 +31,7 @@ _CALLED = {
 }  # fmt: skip
 
 
-def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | None = None) -> Answer:
+def regression_report(found: RegressionResult, new: tuple[Cohort, Predictions] | None = None) -> AnalysisReport:
     """Return the answer to what number goes with a shape, with what is predicted of new shapes."""
     parts: list[Part] = [_measures(found), _calibration(found)]
     if new is not None:
@@ -44,8 +45,7 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         f"{name}.ply": Mesh(found.shape_at(at), faces, name=f"{found.target} {at:g}")
         for name, at in (("low", found.low_at), ("high", found.high_at))
     }
-    fitted = found.cohort.fitted
-    answer = Answer(
+    report = AnalysisReport(
         question="regress",
         title=f"{found.target} from shape",
         summary=_summary(found, new),
@@ -57,17 +57,17 @@ def answer_of_regression(found: Regression, new: tuple[Cohort, Predictions] | No
         settings={
             "target": found.target, "gauge": found.cohort.gauge, "shapes": len(found.cohort),
             "subjects": found.n_subjects, "folds": found.folds, "permutations": found.permutations,
-            "level": found.level, "choice": found.choice.words(), "seed": found.seed,
+            "level": found.confidence, "choice": found.choice.words(), "seed": found.seed,
         },
-        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        model_hashes=model_hashes(found.cohort),
         methods=found.methods,
     )  # fmt: skip
-    return with_shape_data(answer, found.cohort)
+    return add_shape_data(report, found.cohort)
 
 
-def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> Answer:
+def prediction_report(learned: Predictor, cohort: Cohort, told: Predictions) -> AnalysisReport:
     """Return the answer of a predictor that was learned earlier."""
-    answer = Answer(
+    report = AnalysisReport(
         question="regress",
         title=f"{learned.target} from shape",
         summary=(
@@ -77,14 +77,14 @@ def predicted_answer(learned: Predictor, cohort: Cohort, told: Predictions) -> A
         parts=(_new_part(learned, told),),
         tables={"new.csv": _new_rows(cohort, told)},
         notes=cohort.notes,
-        settings={"target": learned.target, "gauge": learned.gauge, "level": learned.level},
+        settings={"target": learned.target, "gauge": learned.gauge, "level": learned.confidence},
         model_hashes=(learned.model_hash,) if learned.model_hash else (),
     )
-    return with_shape_data(answer, cohort)
+    return add_shape_data(report, cohort)
 
 
-def _summary(found: Regression, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
-    m, level = found.measures, f"{100 * found.level:.0f} %"
+def _summary(found: RegressionResult, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
+    m, level = found.measures, f"{100 * found.confidence:.0f} %"
     sentences = [
         f"Shape predicts {found.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
         f"({level} interval {_span(m['rmse'])}), beside {found.baseline_rmse:.3g} by the mean alone: "
@@ -127,7 +127,7 @@ def _outside(learned: Predictor, told: Predictions) -> str:
     )
 
 
-def _span(measure: Measure) -> str:
+def _span(measure: AccuracyMeasure) -> str:
     return f"{measure.low:.3g} to {measure.high:.3g}"
 
 
@@ -139,8 +139,8 @@ def _observed(cohort: Cohort, target: str) -> Any:
     return None if np.isnan(values).any() else values
 
 
-def _measures(found: Regression) -> TablePart:
-    level = f"{100 * found.level:.0f} %"
+def _measures(found: RegressionResult) -> TablePart:
+    level = f"{100 * found.confidence:.0f} %"
     numbers = (TableColumn(name=name, kind="number") for name in ("value", "low", "high"))
     columns = (TableColumn(name="measure"), *numbers)
     rows: list[tuple[object, ...]] = []
@@ -157,11 +157,11 @@ def _measures(found: Regression) -> TablePart:
     )  # fmt: skip
 
 
-def _measure_rows(found: Regression) -> Rows:
+def _measure_rows(found: RegressionResult) -> Rows:
     return ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in found.measures.items()]
 
 
-def _calibration(found: Regression) -> CurvePart:
+def _calibration(found: RegressionResult) -> CurvePart:
     order = np.argsort(found.predicted, kind="stable")
     x = found.predicted[order]
     slope, intercept = found.measures["slope"].value, found.measures["intercept"].value
@@ -174,7 +174,7 @@ def _calibration(found: Regression) -> CurvePart:
     )  # fmt: skip
 
 
-def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
+def _pictures(found: RegressionResult) -> tuple[dict[str, Any], list[Part]]:
     low, high = found.shape_at(found.low_at), found.shape_at(found.high_at)
     blank = weights_of(found.cohort.observed_share) == 0
     arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
@@ -190,13 +190,13 @@ def _pictures(found: Regression) -> tuple[dict[str, Any], list[Part]]:
         ),
         SurfaceMapPart(
             title=f"Change of shape for one unit of {found.target}", arrays=_FILE, values="per_unit_mm",
-            unit=Lengths(found.cohort.unit).of_map,
+            unit=LengthFormat(found.cohort.unit).of_map,
             note="Along the normals of the mean; shapespace compare tests where this is more than chance.",
         ),
     ]  # fmt: skip
 
 
-def _rows(found: Regression) -> Rows:
+def _rows(found: RegressionResult) -> Rows:
     header = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
     columns = (found.observed, found.predicted, found.low, found.high, found.baseline)
     return header, [
@@ -213,7 +213,7 @@ def _new_rows(cohort: Cohort, told: Predictions) -> Rows:
 
 
 def _new_part(learned: Predictor, told: Predictions) -> Part:
-    level = f"{100 * learned.level:.0f} %"
+    level = f"{100 * learned.confidence:.0f} %"
     columns = (
         TableColumn(name="scan"), TableColumn(name="predicted", kind="number"), TableColumn(name="low", kind="number"),
         TableColumn(name="high", kind="number"), TableColumn(name="outside"),

@@ -11,6 +11,14 @@ import numpy.typing as npt
 
 from shapespace.cohort.table import named
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
+from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Rows
+from shapespace.report.analyses.methods import (
+    dispersion_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
 from shapespace.schemas import (
     CurvePart,
     MorphPart,
@@ -21,16 +29,16 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import NOTE_OF_REDUCED_MORPH, Answer, Rows
-from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
-from shapespace.statistics.change_group import LEVEL, MapTest
-from shapespace.statistics.methods_answer import (
-    dispersion_sentence,
-    is_dispersion_warning,
-    methods_parts,
-    multiplicity_sentence,
+from shapespace.statistics.change_result import (
+    ChangeResult,
+    GroupDifferenceTests,
+    MeanChangeTests,
+    SubjectChange,
+    change_or_rate,
+    interval_of_mean,
 )
-from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
+from shapespace.statistics.map_tests import LEVEL, MapTest
+from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import FloatArray, Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
@@ -51,9 +59,9 @@ _SOURCES = {
 }
 
 
-def answer_of(change: Found) -> Answer:
+def change_report(change: ChangeResult) -> AnalysisReport:
     """Return the report, tables, arrays and meshes of what changed."""
-    settings = change.settings
+    config = change.config
     arrays: dict[str, npt.NDArray[Any]] = {
         "before": change.before,
         "after": change.after,
@@ -61,23 +69,23 @@ def answer_of(change: Found) -> Answer:
         "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
     }
     parts: list[Part] = []
-    if change.group is not None:
-        parts += _of_group(change, change.group, arrays)
-    if change.between is not None:
-        parts += _between(change, change.between, arrays)
-    parts += _of_noise(change, arrays)
-    parts += _of_subjects(change, arrays)
-    parts += _over_time(change)
+    if change.mean_change is not None:
+        parts += _mean_change_parts(change, change.mean_change, arrays)
+    if change.group_difference is not None:
+        parts += _group_difference_parts(change, change.group_difference, arrays)
+    parts += _noise_parts(change, arrays)
+    parts += _subject_parts(change, arrays)
+    parts += _time_series(change)
     parts.append(
         SurfaceMapPart(
             title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
             unit="share of subjects", signed=False, limit=1.0,
-            note=f"Asked for: {settings.stable if isinstance(settings.stable, str) else 'vertices of a list'}. The "
+            note=f"Asked for: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
             "scans of a subject were brought to each other rigidly by these vertices.",
         )
     )  # fmt: skip
-    stable = settings.stable
-    answer = Answer(
+    stable = config.stable
+    report = AnalysisReport(
         "change",
         "What changed?",
         tuple(_summary(change)),
@@ -90,24 +98,24 @@ def answer_of(change: Found) -> Answer:
         },
         notes=(*change.cohort.notes, *_notes(change)),
         settings={
-            "subject": settings.subject,
-            "time": settings.time,
-            "order": settings.order,
+            "subject": config.subject,
+            "time": config.time,
+            "order": config.order,
             "stable": str(stable) if isinstance(stable, str) or not isinstance(stable, Sequence) else list(stable),
-            "group": settings.group,
-            "rate": settings.rate,
-            "permutations": settings.permutations,
-            "seed": settings.seed,
-            "unequal_variances": settings.unequal_variances,
+            "group": config.group,
+            "rate": config.rate,
+            "permutations": config.permutations,
+            "seed": config.seed,
+            "unequal_variances": config.unequal_variances,
             "uncertainty": change.uncertainty,
         },
-        model_hashes=() if change.cohort.fitted is None else (change.cohort.fitted.model.content_hash,),
+        model_hashes=model_hashes(change.cohort),
         methods=change.methods,
     )
-    return with_shape_data(answer, change.cohort)
+    return add_shape_data(report, change.cohort)
 
 
-def _summary(change: Found) -> list[str]:
+def _summary(change: ChangeResult) -> list[str]:
     subjects = change.subjects
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
@@ -116,27 +124,29 @@ def _summary(change: Found) -> list[str]:
         f"{who} changed by {rms:.2f} mm (RMS along the normals{'' if len(subjects) == 1 else ', median'}), and on "
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     ]
-    if change.group is not None and change.group_volumes is not None:
-        volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects])
+    if change.mean_change is not None:
+        volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3[0] for one in subjects])
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
-        sentences.append(_of_test(change, change.group, "the mean change", "none"))
-        what = "The volume changed by" if change.closed else "The open surface swept"
+        sentences.append(_test_sentence(change, change.mean_change.surface, "the mean change", "none"))
+        what = "The volume changed by" if change.is_closed else "The open surface swept"
         sentences.append(
             f"{what} {unit.text(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.text(low)} to "
             f"{unit.text(high)}), "
-            f"{_p(float(change.group_volumes.p[0]))}."
+            f"{_p(float(change.mean_change.volumes.p[0]))}."
         )
-    if change.between is not None and change.between_volumes is not None:
-        first, second = change.groups
-        sentences.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
-        difference = float(change.between_volumes.effect[0])
+    if change.group_difference is not None:
+        first, second = change.group_difference.groups
+        sentences.append(
+            _test_sentence(change, change.group_difference.surface, f"the change of {second}", f"that of {first}")
+        )
+        difference = float(change.group_difference.volumes.effect[0])
         unit = _VolumeUnit.of(difference)
         sentences.append(
             f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per(change)} "
-            f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
+            f"more than that of {first}, {_p(float(change.group_difference.volumes.p[0]))}."
         )
-        unequal = change.settings.unequal_variances
+        unequal = change.config.unequal_variances
         sentences += [
             dispersion_sentence(one, unequal, "mm")
             for one in change.methods.dispersions
@@ -154,7 +164,7 @@ def _summary(change: Found) -> list[str]:
             f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
         )
-    if change.group is not None:
+    if change.mean_change is not None:
         sentences.append(multiplicity_sentence(change.methods))
     return sentences
 
@@ -177,7 +187,7 @@ class _VolumeUnit:
         return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
 
 
-def _of_test(change: Found, test: MapTest, what: str, other: str) -> str:
+def _test_sentence(change: ChangeResult, test: MapTest, what: str, other: str) -> str:
     at = int(np.abs(test.t).argmax())
     found = test.p <= _LEVEL
     low, high = test.interval(at)
@@ -201,11 +211,12 @@ def _p(p: float) -> str:
     return f"p = {p:.3g}"
 
 
-def _per(change: Found) -> str:
-    return f" per {change.unit}" if change.settings.rate else ""
+def _per(change: ChangeResult) -> str:
+    return f" per {change.time_unit}" if change.config.rate else ""
 
 
-def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    test = tests.surface
     unit = f"mm{_per(change)}"
     arrays |= {
         "mean": blank_where(test.effect, change.blank),
@@ -229,10 +240,10 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
         ),
         _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change"),
     ]  # fmt: skip
-    if change.group_volumes is not None and len(change.parts) > 1:
-        parts.append(_region_table(change, change.group_volumes))
-    if change.group_landmarks is not None:
-        header, rows = _group_landmarks(change, change.group_landmarks)
+    if len(change.regions) > 1:
+        parts.append(_region_table(change, tests.volumes))
+    if tests.landmarks is not None:
+        header, rows = _landmark_summary(change, tests.landmarks)
         kinds = ("text", "mm", "mm", "mm", "mm", "p")
         columns = tuple(TableColumn(name=name, kind=kind) for name, kind in zip(header, kinds, strict=True))  # type: ignore[arg-type]
         parts.append(
@@ -244,11 +255,11 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
     return parts
 
 
-def _region_table(change: Found, test: MapTest) -> Part:
+def _region_table(change: ChangeResult, test: MapTest) -> Part:
     rows: list[tuple[Any, ...]] = []
-    volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3 for one in change.subjects])
+    volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
-    for at, name in enumerate(change.parts):
+    for at, name in enumerate(change.regions):
         own = volumes[:, at] / unit.mm3
         rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[at])))
     return TablePart(
@@ -263,17 +274,19 @@ def _region_table(change: Found, test: MapTest) -> Part:
     )
 
 
-def _group_landmarks(change: Found, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
+def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
     rows: list[list[Any]] = []
-    maps = np.stack([effect_of(one, rate=change.settings.rate).along_mm for one in change.subjects])
+    maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
     for at, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
         low, high = interval_of_mean(values)
         rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[at]])
     return ("landmark", "mean", "stddev", "low", "high", "p"), rows
 
 
-def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    first, second = change.groups
+def _group_difference_parts(
+    change: ChangeResult, tests: GroupDifferenceTests, arrays: dict[str, npt.NDArray[Any]]
+) -> list[Part]:
+    (first, second), test = tests.groups, tests.surface
     arrays |= {
         "difference": blank_where(test.effect, change.blank),
         "difference_p": test.p,
@@ -293,7 +306,7 @@ def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) 
     ]  # fmt: skip
 
 
-def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     found = change.repeatability
     if found is None:
         text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
@@ -312,7 +325,7 @@ def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
                 float(found.volumes_smallest_mm3[at]),
                 found.volume_icc if at == 0 else None,
             )
-            for at, name in enumerate(change.parts)
+            for at, name in enumerate(change.regions)
         ),
         *(
             (f"{name} (mm)", float(within), float(smallest), float(icc))
@@ -345,7 +358,7 @@ def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     ]  # fmt: skip
 
 
-def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     every = len(change.subjects)
     more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
     volumes = (one.change.volumes_mm3[0] for one in change.subjects[:LISTED])
@@ -355,17 +368,18 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
         TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
         *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
     ]  # fmt: skip
-    if change.closed:
+    if change.is_closed:
         columns.append(TableColumn(name="of the volume before", kind="percent"))
-    if change.groups:
+    has_groups = change.group_difference is not None
+    if has_groups:
         columns.append(TableColumn(name="group"))
     rows: list[tuple[Any, ...]] = []
     for one in change.subjects[:LISTED]:
         volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
         row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
         row += [volume / unit.mm3, _or_none(stddev / unit.mm3)]
-        row += [volume / one.before_mm3] if change.closed else []
-        rows.append((*row, *([one.group] if change.groups else [])))
+        row += [volume / one.volume_before_mm3] if change.is_closed else []
+        rows.append((*row, *([one.group] if has_groups else [])))
     parts: list[Part] = [
         TablePart(
             title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
@@ -413,18 +427,18 @@ def _morph(
         arrays[high] = before + times * change
     return MorphPart(
         title=title, arrays=ARRAYS, low=low, high=high, low_label=low_label, high_label=high_label, times=times,
-        note="" if times == 1 else NOTE_OF_REDUCED_MORPH,
+        note="" if times == 1 else REDUCED_MORPH_NOTE,
     )  # fmt: skip
 
 
-def _over_time(change: Found) -> list[Part]:
-    if not change.unit or all(len(one.visits) < 3 for one in change.subjects):
+def _time_series(change: ChangeResult) -> list[Part]:
+    if not change.time_unit or all(len(one.visits) < 3 for one in change.subjects):
         return []
     unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:CURVES] for visit in one.visits))
     series = tuple(
         Series(
             label=one.name,
-            x=tuple(visit.at for visit in one.visits),
+            x=tuple(visit.time for visit in one.visits),
             y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
         )
         for one in change.subjects[:CURVES]
@@ -433,18 +447,18 @@ def _over_time(change: Found) -> list[Part]:
     more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
     return [
         CurvePart(
-            title="Over time", level=2, series=series, x=change.unit, y=f"volume since the first visit, {unit.name}",
+            title="Over time", level=2, series=series, x=change.time_unit, y=f"volume since the first visit, {unit.name}",
             note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
         )
     ]  # fmt: skip
 
 
-def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
+def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
     header = [
         "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
         "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
     ]  # fmt: skip
-    if change.unit:
+    if change.time_unit:
         header += ["rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit"]
     rows: list[list[Any]] = []
     for one in change.subjects:
@@ -458,7 +472,7 @@ def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
             one.beyond_share,
             float(one.change.volumes_mm3[0]),
             _or_none(one.change.volumes_stddev_mm3[0]),
-            _or_none(one.change.volumes_mm3[0] / one.before_mm3),
+            _or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
             len(one.visits),
             sum(visit.scans for visit in one.visits),
             float(np.median(one.change.stddev_mm)),
@@ -468,29 +482,29 @@ def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
                 float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
                 float(one.rate.volumes_mm3[0]),
                 _or_none(one.rate.volumes_stddev_mm3[0]),
-                change.unit,
+                change.time_unit,
             ]
         rows.append(row)
     return header, rows
 
 
-def _tables(change: Found) -> dict[str, Rows]:
+def _tables(change: ChangeResult) -> dict[str, Rows]:
     tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
     tables["visits.csv"] = (
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
-            (one.name, visit.label, visit.at, visit.scans, visit.rms_mm, visit.volume_mm3)
+            (one.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
             for one in change.subjects
             for visit in one.visits
         ],
     )
-    if len(change.parts) > 1:
+    if len(change.regions) > 1:
         tables["regions.csv"] = (
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
                 (one.name, name, float(one.change.volumes_mm3[at]), _or_none(one.change.volumes_stddev_mm3[at]))
                 for one in change.subjects
-                for at, name in enumerate(change.parts)
+                for at, name in enumerate(change.regions)
             ],
         )
     if change.landmarks:
@@ -499,12 +513,12 @@ def _tables(change: Found) -> dict[str, Rows]:
              "along_normal_stddev_mm", "smallest_detectable_mm"),
             [row for one in change.subjects for row in _landmark_rows(change, one)],
         )  # fmt: skip
-        if change.group_landmarks is not None:
-            tables["group_landmarks.csv"] = _group_landmarks(change, change.group_landmarks)
+        if change.mean_change is not None and change.mean_change.landmarks is not None:
+            tables["group_landmarks.csv"] = _landmark_summary(change, change.mean_change.landmarks)
     return tables
 
 
-def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[object]]:
+def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequence[object]]:
     found, known = subject.change, change.repeatability
     along, stddev = change.landmarks.interpolate(np.stack([found.along_mm, found.stddev_mm], axis=1)).T
     smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
@@ -529,7 +543,7 @@ def _largest(subject: SubjectChange) -> float:
     return float(along[np.abs(along).argmax()])
 
 
-def _maps(change: Found) -> dict[str, npt.NDArray[Any]]:
+def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
     found = {
         "subjects": np.array([one.name for one in change.subjects]),
         "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
@@ -538,23 +552,25 @@ def _maps(change: Found) -> dict[str, npt.NDArray[Any]]:
         "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
     }
     found["beyond"] = np.stack([one.change.beyond for one in change.subjects])
-    if change.unit:
-        rates = [effect_of(one, rate=True) for one in change.subjects]
+    if change.time_unit:
+        rates = [change_or_rate(one, rate=True) for one in change.subjects]
         found["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
         found["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
     return found
 
 
-def _notes(change: Found) -> list[str]:
+def _notes(change: ChangeResult) -> list[str]:
     notes: list[str] = []
-    if change.single:
-        alone, every = len(change.single), len(change.subjects) + len(change.single)
-        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({named(change.single)}).")
+    if change.single_visit_subjects:
+        alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
+        notes.append(
+            f"{alone} of {every} subjects are left out, who have one visit ({named(change.single_visit_subjects)})."
+        )
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
-    if not change.unit and len(ends) > 1:
+    if not change.time_unit and len(ends) > 1:
         told = named([f"{first} to {last}" for first, last in sorted(ends)])
         notes.append(f"Not all subjects have the same first and last visit ({told}).")
-    if change.model_only:
+    if change.is_model_only:
         notes.append(
             "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
             "give --surfaces dense."

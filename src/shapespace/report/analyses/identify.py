@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer
-from shapespace.statistics.identity.identify import Identification, Identified
-from shapespace.statistics.identity.told import (
+from shapespace.report.analyses.analysis_report import AnalysisReport
+from shapespace.report.analyses.identity import (
     INTERVALS,
     called,
     cells,
-    hashes,
     in_percent,
     interval,
     none_missed,
@@ -20,10 +17,12 @@ from shapespace.statistics.identity.told import (
     settings,
     who_was_tested,
 )
-from shapespace.statistics.observed import with_shape_data
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.schemas import CurvePart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.statistics.identity.identify import IdentificationRates, IdentificationResult
 
 
-def answer_of_identification(found: Identification) -> Answer:
+def identify_report(found: IdentificationResult) -> AnalysisReport:
     """Return what `shapespace recognise identify` writes."""
     trial, first = found.trial, found.scores[0]
     strangers = int((~first.searches.enrolled).sum())
@@ -59,7 +58,7 @@ def answer_of_identification(found: Identification) -> Answer:
         ]
     )
     told = ("score", "figure", "value", "low", "high")
-    answer = Answer(
+    report = AnalysisReport(
         question="recognise identify",
         title="Who is it? Identification",
         summary=summary,
@@ -76,13 +75,13 @@ def answer_of_identification(found: Identification) -> Answer:
             }
         },
         notes=notes,
-        settings=settings(found.options),
-        model_hashes=hashes(trial),
+        settings=settings(found.config),
+        model_hashes=model_hashes(trial.cohort),
     )
-    return with_shape_data(answer, trial.cohort)
+    return add_shape_data(report, trial.cohort)
 
 
-def _rows(one: Identified) -> list[Sequence[object]]:
+def _rows(one: IdentificationRates) -> list[Sequence[object]]:
     rows: list[Sequence[object]] = [[one.name, "rank 1", *cells(one.rank_1)]]
     rows += [[one.name, f"within {k}", share, *ends] for k, (share, *ends) in enumerate(
         zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)]  # fmt: skip
@@ -90,7 +89,7 @@ def _rows(one: Identified) -> list[Sequence[object]]:
     return rows
 
 
-def _parts(found: Identification) -> tuple[Part, ...]:
+def _parts(found: IdentificationResult) -> tuple[Part, ...]:
     columns = [TableColumn(name="score"), TableColumn(name="first", kind="percent"),
                TableColumn(name="95 %", kind="interval")]  # fmt: skip
     for rate in found.scores[0].fnir:

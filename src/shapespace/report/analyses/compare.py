@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods import (
+    dispersion_sentence,
+    effect_size_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
 from shapespace.schemas import (
     Counts,
     CurvePart,
@@ -22,22 +32,22 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer, Lengths, Rows
-from shapespace.statistics.compare import Comparison, Effect
+from shapespace.statistics.compare import MOST_LEVELS, CompareResult, ShapeEffect
 from shapespace.statistics.compare_maps import EffectMap, Tested
-from shapespace.statistics.methods_answer import effect_size_sentence, methods_parts, multiplicity_sentence
-from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
+from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHOWN_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
 _TIMES = (1, 2, 3, 5, 10, 20, 50)
 _BINS = 40
+_FEWEST_ARRANGEMENTS = 20
+"""Number of different arrangements below which no p value can be small."""
 _PALE = "Vertices that are not found to differ are pale."
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
-def answer_of_comparison(comparison: Comparison) -> Answer:
+def compare_report(comparison: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
     effects = comparison.effects
     parts: list[Part] = [
@@ -47,8 +57,7 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
         *methods_parts(comparison.methods),
     ]
-    fitted = comparison.cohort.fitted
-    answer = Answer(
+    report = AnalysisReport(
         question="compare",
         title=f"Shape {comparison.design.formula.strip()}",
         summary=tuple(_summary(comparison)),
@@ -56,31 +65,31 @@ def answer_of_comparison(comparison: Comparison) -> Answer:
         tables=_tables(comparison),
         arrays={f"effect_{at}.npz": _arrays(comparison, effect) for at, effect in enumerate(effects, 1)},
         meshes=dict(_meshes(comparison)),
-        notes=(*comparison.cohort.notes, *comparison.notes),
+        notes=(*comparison.cohort.notes, *_repeated_measures_notes(comparison)),
         settings={
             "formula": comparison.design.formula,
-            "squares": comparison.options.anova_type,
-            "blocks": comparison.options.blocks,
-            "random": comparison.options.random,
-            "permutations": comparison.options.permutations,
-            "seed": comparison.options.seed,
-            "bump_width_mm": comparison.options.bump_width_mm,
-            "level": comparison.options.level,
-            "unequal_variances": comparison.options.unequal_variances,
-            "effect_size": comparison.options.effect_size,
+            "squares": comparison.config.anova_type,
+            "blocks": comparison.config.blocks,
+            "random": comparison.config.random,
+            "permutations": comparison.config.permutations,
+            "seed": comparison.config.seed,
+            "bump_width_mm": comparison.config.bump_width_mm,
+            "level": comparison.config.alpha,
+            "unequal_variances": comparison.config.unequal_variances,
+            "effect_size": comparison.config.effect_size,
             "gauge": comparison.cohort.gauge,
             "shapes": len(comparison.cohort),
-            "subjects": comparison.subjects,
+            "subjects": comparison.n_subjects,
         },
-        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        model_hashes=model_hashes(comparison.cohort),
         methods=comparison.methods,
     )
-    return with_shape_data(answer, comparison.cohort)
+    return add_shape_data(report, comparison.cohort)
 
 
-def _summary(comparison: Comparison) -> Iterator[str]:
-    level, shapes = comparison.options.level, len(comparison.cohort)
-    kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.options.effect_size]
+def _summary(comparison: CompareResult) -> Iterator[str]:
+    level, shapes = comparison.config.alpha, len(comparison.cohort)
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.config.effect_size]
     for test in comparison.tests:
         figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
         where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
@@ -95,18 +104,123 @@ def _summary(comparison: Comparison) -> Iterator[str]:
                 yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
                 yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
-    yield from comparison.warnings
-    of = f" of {comparison.subjects} subjects" if comparison.subjects < shapes else ""
-    yield f"{shapes} shapes{of}, {comparison.options.permutations} arrangements, the observed one among them."
+    yield from compare_warnings(comparison)
+    of = f" of {comparison.n_subjects} subjects" if comparison.n_subjects < shapes else ""
+    yield f"{shapes} shapes{of}, {comparison.config.permutations} arrangements, the observed one among them."
     yield multiplicity_sentence(comparison.methods)
+
+
+def compare_warnings(comparison: CompareResult) -> tuple[str, ...]:
+    """Return sentences on limitations of the tests."""
+    unequal = comparison.config.unequal_variances
+    return (
+        *(
+            dispersion_sentence(dispersion, unequal, comparison.cohort.unit)
+            for dispersion in comparison.methods.dispersions
+            if is_dispersion_warning(dispersion, unequal_variances=unequal)
+        ),
+        *_subject_warnings(comparison),
+        *_arrangement_warnings(comparison),
+        *_repeated_measures_warnings(comparison),
+        *_uncentred_warnings(comparison),
+        *(
+            f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
+            for one in comparison.design.variables
+            if len(one.levels) > MOST_LEVELS
+        ),
+    )
+
+
+def _subject_warnings(comparison: CompareResult) -> Iterator[str]:
+    table, blocks = comparison.cohort.table, comparison.config.blocks
+    if blocks is None:
+        names = table.columns.get("subject", ())
+        if all(names) and len(set(names)) < len(names):
+            yield (
+                f"The {len(names)} shapes are of {len(set(names))} subjects and are taken for independent, which makes "
+                "differences look surer than they are; say --blocks subject."
+            )
+        return
+    counts = Counter(table.texts(blocks))
+    if max(counts.values()) == 1:
+        yield f"No {blocks} has two shapes, so --blocks changes nothing."
+    elif len(set(counts.values())) > 1 and comparison.strata[0].stratum.startswith("between"):
+        yield (
+            f"There are {min(counts.values())} to {max(counts.values())} shapes of a {blocks}; each counts "
+            "once, by its mean, and p is approximate where means of few scans are noisier."
+        )
+
+
+def _arrangement_warnings(comparison: CompareResult) -> Iterator[str]:
+    for stratum in comparison.strata:
+        if stratum.log_arrangements < math.log(_FEWEST_ARRANGEMENTS):
+            name = f" {stratum.stratum}" if stratum.stratum else ""
+            yield (
+                f"There are only {round(math.exp(stratum.log_arrangements))} arrangements{name} that differ, so no p "
+                "can be small."
+            )
+
+
+def _repeated_measures_warnings(comparison: CompareResult) -> Iterator[str]:
+    repeated, blocks = comparison.repeated_measures, comparison.config.blocks
+    if repeated is None:
+        return
+    if repeated.common_effects:
+        yield (
+            f"All {blocks}s are assumed to respond alike to {', '.join(repeated.common_effects)}; if they do not, p "
+            f"within {blocks}s is too small. Without --random the responses may differ between {blocks}s."
+        )
+    for effect, count in repeated.subjects_without_effect.items():
+        yield (
+            f"{count} of {comparison.n_subjects} {blocks}s lack conditions from which {effect} can be estimated, and "
+            "are left out of its test."
+        )
+
+
+def _uncentred_warnings(comparison: CompareResult) -> Iterator[str]:
+    design = comparison.design
+    for one in design.variables:
+        # A function of the variable, such as center(age), defines its own zero.
+        has_interaction = any(
+            one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
+            for term in design.terms
+        )
+        if comparison.config.anova_type == "III" and has_interaction and not one.levels and one.low * one.high > 0:
+            yield (
+                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
+                f"center({one.name}) in the formula, or take type II."
+            )
+
+
+def _repeated_measures_notes(comparison: CompareResult) -> Iterator[str]:
+    repeated, blocks = comparison.repeated_measures, comparison.config.blocks
+    if repeated is None:
+        return
+    if repeated.n_cells < len(comparison.cohort):
+        yield (
+            f"{len(comparison.cohort)} shapes are averaged to {repeated.n_cells} cells of one {blocks} and condition; "
+            "repeated shapes of a cell do not count as further observations."
+        )
+    if repeated.random_effects:
+        yield (
+            f"Each {blocks} may respond differently to {', '.join(repeated.random_effects)}: each of these effects is "
+            f"tested on one estimate per {blocks}; the signs of the estimates are flipped, or the estimates are "
+            f"permuted between {blocks}s."
+        )
+    if repeated.adjusted_conditions:
+        labels = ", ".join(repeated.adjusted_conditions)
+        yield (
+            f"The shapes of each {blocks} are not of the same conditions: the means of {labels} per {blocks} are "
+            f"covariates of the model between {blocks}s, so that its F contains the uncertainty of this adjustment."
+        )
 
 
 _EXPLORATORY = "exploratory, since its term is not significant: "
 
 
-def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
+def _of_map(comparison: CompareResult, effect: ShapeEffect, shown: EffectMap) -> str:
     """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
-    level = comparison.options.level
+    level = comparison.config.alpha
     scope = f"family-wise error {100 * level:g} % within this map"
     significant = shown.shown.p_family <= level
     if not significant.any():
@@ -117,19 +231,19 @@ def _of_map(comparison: Comparison, effect: Effect, shown: EffectMap) -> str:
     )
 
 
-def _clearest(comparison: Comparison, shown: EffectMap) -> str:
+def _clearest(comparison: CompareResult, shown: EffectMap) -> str:
     """Return the change at the vertex with the largest F, with its simultaneous interval."""
     lengths, at = _lengths(comparison), int(shown.shown.f.argmax())
     low, high = shown.interval_mm(at)
     sign = "" if shown.normal_mm is None else "+"
     return (
-        f"{lengths.text(shown.shown_mm[at], sign)} (simultaneous {100 * (1 - comparison.options.level):g} % interval "
+        f"{lengths.text(shown.shown_mm[at], sign)} (simultaneous {100 * (1 - comparison.config.alpha):g} % interval "
         f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near(comparison.cohort, at)}"
     )
 
 
-def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: FloatArray) -> str:
-    level, at = comparison.options.level, int(bump.f.argmax())
+def _of_bumps(comparison: CompareResult, effect: ShapeEffect, bump: Tested, bump_mm: FloatArray) -> str:
+    level, at = comparison.config.alpha, int(bump.f.argmax())
     scope = f"family-wise error {100 * level:g} % within this map"
     if bump.p_family[at] > level:
         return f"{effect.label}: no bump is found beyond the variation between shapes ({scope})."
@@ -139,8 +253,8 @@ def _of_bumps(comparison: Comparison, effect: Effect, bump: Tested, bump_mm: Flo
     )
 
 
-def _lengths(comparison: Comparison) -> Lengths:
-    return Lengths(comparison.cohort.unit)
+def _lengths(comparison: CompareResult) -> LengthFormat:
+    return LengthFormat(comparison.cohort.unit)
 
 
 def _p(p: float) -> str:
@@ -160,10 +274,10 @@ def _column(name: str, kind: Any = "text") -> TableColumn:
     return TableColumn(name=name, kind=kind)
 
 
-def _of_terms(comparison: Comparison) -> Iterator[Part]:
+def _of_terms(comparison: CompareResult) -> Iterator[Part]:
     strata, lengths = any(test.stratum for test in comparison.tests), _lengths(comparison)
     rows: list[tuple[Any, ...]] = []
-    for left in comparison.remainders:
+    for left in comparison.strata:
         own = [test for test in comparison.tests if test.stratum == left.stratum]
         rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in own]
         share = left.squares / left.squares_total
@@ -179,8 +293,8 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
     note = (
-        f"Type {comparison.options.anova_type} sums of squares of Procrustes distances. {_of_f(comparison)} "
-        f"{effect_size_sentence(comparison.options.effect_size)} R² is the share of the total of its stratum."
+        f"Type {comparison.config.anova_type} sums of squares of Procrustes distances. {_of_f(comparison)} "
+        f"{effect_size_sentence(comparison.config.effect_size)} R² is the share of the total of its stratum."
     )
     yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
     for test in comparison.tests:
@@ -196,7 +310,7 @@ def _of_terms(comparison: Comparison) -> Iterator[Part]:
         )
 
 
-def _of_pairs(comparison: Comparison) -> Iterator[Part]:
+def _of_pairs(comparison: CompareResult) -> Iterator[Part]:
     rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in comparison.effects)
     yield TablePart(
         title="How far apart",
@@ -212,7 +326,7 @@ def _of_pairs(comparison: Comparison) -> Iterator[Part]:
     )  # fmt: skip
 
 
-def _of_angles(comparison: Comparison) -> Iterator[Part]:
+def _of_angles(comparison: CompareResult) -> Iterator[Part]:
     if comparison.angles:
         yield TablePart(
             title="Angles between changes of shape",
@@ -222,8 +336,8 @@ def _of_angles(comparison: Comparison) -> Iterator[Part]:
         )
 
 
-def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part]:
-    file, level = f"effect_{at}.npz", f"{100 * comparison.options.level:g} %"
+def _of_effect(comparison: CompareResult, effect: ShapeEffect, at: int) -> Iterator[Part]:
+    file, level = f"effect_{at}.npz", f"{100 * comparison.config.alpha:g} %"
     yield TextPart(
         title=effect.label,
         level=2,
@@ -262,7 +376,7 @@ def _of_effect(comparison: Comparison, effect: Effect, at: int) -> Iterator[Part
     yield from _of_scores(comparison, effect)
 
 
-def _of_size(comparison: Comparison, effect: Effect) -> str:
+def _of_size(comparison: CompareResult, effect: ShapeEffect) -> str:
     """Return how large a change is: over all vertices, and where it is clearest."""
     whole = f"The change is {_lengths(comparison).text(effect.rms_mm)} (RMS over vertices)."
     if effect.map is None:
@@ -272,8 +386,8 @@ def _of_size(comparison: Comparison, effect: Effect) -> str:
     return f"{whole} It is clearest by {_clearest(comparison, effect.map)}{way}.{label}"
 
 
-def _of_f(comparison: Comparison) -> str:
-    if comparison.options.unequal_variances:
+def _of_f(comparison: CompareResult) -> str:
+    if comparison.config.unequal_variances:
         return (
             "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
             "squared Welch t), compared with sign flips of residuals."
@@ -281,7 +395,7 @@ def _of_f(comparison: Comparison) -> str:
     return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
 
 
-def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
+def _of_scores(comparison: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
     """Yield regression scores against a number: shapes projected on what it changes."""
     one = next((v for v in comparison.design.variables if v.name == effect.name and not v.levels), None)
     length = float(np.linalg.norm(effect.change))
@@ -303,15 +417,15 @@ def _of_scores(comparison: Comparison, effect: Effect) -> Iterator[Part]:
     )
 
 
-def _times(comparison: Comparison, effect: Effect) -> int:
+def _times(comparison: CompareResult, effect: ShapeEffect) -> int:
     cohort = comparison.cohort
     moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
     size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
     return max((one for one in _TIMES if one * moved <= _SHOWN_SHARE * size), default=1)
 
 
-def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[Any]]:
-    cohort, level = comparison.cohort, comparison.options.level
+def _arrays(comparison: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:
+    cohort, level = comparison.cohort, comparison.config.alpha
     times = _times(comparison, effect)
     half = (times - 1) / 2 * effect.change
     out: dict[str, npt.NDArray[Any]] = {
@@ -340,7 +454,7 @@ def _arrays(comparison: Comparison, effect: Effect) -> Mapping[str, npt.NDArray[
     return out
 
 
-def _meshes(comparison: Comparison) -> Iterator[tuple[str, Mesh]]:
+def _meshes(comparison: CompareResult) -> Iterator[tuple[str, Mesh]]:
     if comparison.cohort.faces is None:
         return
     for at, effect in enumerate(comparison.effects, 1):
@@ -348,11 +462,11 @@ def _meshes(comparison: Comparison) -> Iterator[tuple[str, Mesh]]:
             yield f"effect_{at}_{end}.ply", comparison.cohort.mesh(shape, name)
 
 
-def _tables(comparison: Comparison) -> Mapping[str, Rows]:
+def _tables(comparison: CompareResult) -> Mapping[str, Rows]:
     terms: list[tuple[object, ...]] = [
         (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in comparison.tests
     ]
-    for left in comparison.remainders:
+    for left in comparison.strata:
         share = left.squares / left.squares_total
         terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
         terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
 from shapespace.schemas import Counts, HistogramPart, MorphPart, Part, SurfaceMapPart, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer, Lengths, Rows
-from shapespace.statistics.methods_answer import methods_parts
-from shapespace.statistics.observed import with_shape_data
-from shapespace.statistics.score import SMALL, Scores
+from shapespace.statistics.score import SMALL, ScoreResult
 
 _MOST_MAPS, _MOST_MORPHS, _MOST_TOLD, _BINS = 12, 3, 12, 24
 _LIMIT_SD = 4.0
 _FILE = "score.npz"
 
 
-def answer_of_scores(scores: Scores) -> Answer:
+def score_report(scores: ScoreResult) -> AnalysisReport:
     """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
     shown = _shown(scores)
     tables, arrays = _tables(scores), _arrays(scores, shown)
@@ -31,9 +31,8 @@ def answer_of_scores(scores: Scores) -> Answer:
         *_morphs(scores, shown),
         *methods_parts(scores.methods),
     ]
-    fitted = scores.subjects.fitted
     many = len(scores.names) != 1
-    answer = Answer(
+    report = AnalysisReport(
         question="score",
         title=f"{f'{len(scores.names)} subjects' if many else scores.names[0]} against a reference of {scores.people}",
         summary=tuple(_sentence(scores, k) for k in shown[:_MOST_TOLD]),
@@ -45,23 +44,23 @@ def answer_of_scores(scores: Scores) -> Answer:
             "gauge": scores.subjects.gauge,
             "modes": scores.modes,
             "variance_share": scores.variance_share,
-            "subject": scores.options.subject,
-            "draws": scores.options.draws,
-            "seed": scores.options.seed,
+            "subject": scores.config.subject,
+            "draws": scores.config.draws,
+            "seed": scores.config.seed,
         },
-        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        model_hashes=model_hashes(scores.subjects),
         methods=scores.methods,
     )
-    return with_shape_data(answer, scores.subjects)
+    return add_shape_data(report, scores.subjects)
 
 
-def _shown(scores: Scores) -> list[int]:
+def _shown(scores: ScoreResult) -> list[int]:
     """Return the subjects, those who lie farthest out first."""
     order = np.lexsort((-scores.distance, scores.farther))
     return sorted(map(int, order), key=lambda k: not scores.outside[k])
 
 
-def _sentence(scores: Scores, k: int) -> str:
+def _sentence(scores: ScoreResult, k: int) -> str:
     near = ", ".join(one.name for one in scores.nearest[k])
     small = " (a small reference)" if scores.people < SMALL else ""
     told = (
@@ -75,7 +74,7 @@ def _sentence(scores: Scores, k: int) -> str:
     return f"{told} It lies outside what is known: {'; '.join(scores.outside[k])}."
 
 
-def _how(scores: Scores) -> tuple[str, ...]:
+def _how(scores: ScoreResult) -> tuple[str, ...]:
     limit = (
         f"Of 95 % of the reference's subjects no vertex lies beyond {scores.z_limit:.1f} standard deviations."
         if math.isfinite(scores.z_limit)
@@ -91,13 +90,13 @@ def _how(scores: Scores) -> tuple[str, ...]:
     )
 
 
-def _table(scores: Scores) -> TablePart:
+def _table(scores: ScoreResult) -> TablePart:
     columns = [
         TableColumn(name="Subject", kind="text"),
         TableColumn(name="Distance (SD)", kind="number"),
         TableColumn(name="Percentile", kind="percent"),
         TableColumn(name="p (F)", kind="p"),
-        Lengths(scores.subjects.unit).column("Left by the modes"),
+        LengthFormat(scores.subjects.unit).column("Left by the modes"),
         TableColumn(name="Its percentile", kind="percent"),
         TableColumn(name="Beyond 2 SD", kind="percent"),
         TableColumn(name="Size (SD)", kind="number"),
@@ -123,7 +122,7 @@ def _table(scores: Scores) -> TablePart:
     )  # fmt: skip
 
 
-def _histogram(scores: Scores) -> HistogramPart:
+def _histogram(scores: ScoreResult) -> HistogramPart:
     every = np.concatenate([scores.reference_distance, scores.distance])
     edges = np.linspace(0.0, float(every.max()) * 1.02, _BINS + 1)
     series = [_counts(scores.reference_distance, edges, "reference, each by the others")]
@@ -140,7 +139,7 @@ def _counts(values: npt.NDArray[Any], edges: npt.NDArray[Any], label: str) -> Co
     return Counts(counts=tuple(map(float, np.histogram(values, edges)[0])), label=label)
 
 
-def _maps(scores: Scores, shown: list[int]) -> list[Part]:
+def _maps(scores: ScoreResult, shown: list[int]) -> list[Part]:
     parts: list[Part] = [TextPart(title="Maps", level=2, text=_of_maps(scores, shown))]
     for k in shown[:_MOST_MAPS]:
         beyond = ""
@@ -156,7 +155,7 @@ def _maps(scores: Scores, shown: list[int]) -> list[Part]:
     return parts
 
 
-def _of_maps(scores: Scores, shown: list[int]) -> str:
+def _of_maps(scores: ScoreResult, shown: list[int]) -> str:
     rest = len(shown) - _MOST_MAPS
     more = f" Maps of {rest} more are in {_FILE}." if rest > 0 else ""
     return (
@@ -165,7 +164,7 @@ def _of_maps(scores: Scores, shown: list[int]) -> str:
     )
 
 
-def _morphs(scores: Scores, shown: list[int]) -> list[Part]:
+def _morphs(scores: ScoreResult, shown: list[int]) -> list[Part]:
     if scores.mean.faces is None:
         return []
     return [
@@ -177,7 +176,7 @@ def _morphs(scores: Scores, shown: list[int]) -> list[Part]:
     ]  # fmt: skip
 
 
-def _arrays(scores: Scores, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
+def _arrays(scores: ScoreResult, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
     faces = scores.mean.faces
     arrays: dict[str, npt.NDArray[Any]] = {
         "vertices": scores.mean.vertices,
@@ -190,8 +189,8 @@ def _arrays(scores: Scores, shown: list[int]) -> dict[str, npt.NDArray[Any]]:
     return arrays
 
 
-def _tables(scores: Scores) -> dict[str, Rows]:
-    field = Lengths(scores.subjects.unit).field
+def _tables(scores: ScoreResult) -> dict[str, Rows]:
+    field = LengthFormat(scores.subjects.unit).field
     head = (
         "subject", "distance_sd", "percentile", "p_left_out", "p_f", field("rest"), "rest_p", field("beyond_model"),
         "beyond_model_p", "vertices_beyond_2sd", field("centroid_size"), "size_sd", "outside", "map",

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
-from shapespace.statistics.answer import Answer
-from shapespace.statistics.identity.told import (
+from shapespace.report.analyses.analysis_report import AnalysisReport
+from shapespace.report.analyses.identity import (
     INTERVALS,
     called,
     cells,
-    hashes,
     in_percent,
     interval,
     none_missed,
@@ -22,15 +20,16 @@ from shapespace.statistics.identity.told import (
     thinned,
     who_was_tested,
 )
-from shapespace.statistics.identity.verify import FAR, GRID, Verification, Verified
-from shapespace.statistics.observed import with_shape_data
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.schemas import Counts, CurvePart, HistogramPart, Part, Series, TableColumn, TablePart, TextPart
+from shapespace.statistics.identity.verify import FAR, GRID, VerificationRates, VerificationResult
 
 _LEAST_RATE = 1e-4
 _BINS = 40
 _ERRORS = 30
 
 
-def answer_of_verification(found: Verification) -> Answer:
+def verify_report(found: VerificationResult) -> AnalysisReport:
     """Return what `shapespace recognise verify` writes."""
     trial, first = found.trial, found.scores[0]
     pairs = found.pairs
@@ -73,7 +72,7 @@ def answer_of_verification(found: Verification) -> Answer:
         **{f"llr_{one.name}": one.llr for one in found.scores if one.llr is not None},
     }
     told = ("score", "figure", "value", "low", "high")
-    answer = Answer(
+    report = AnalysisReport(
         question="recognise verify",
         title="Who is it? Verification",
         summary=summary,
@@ -84,13 +83,13 @@ def answer_of_verification(found: Verification) -> Answer:
         },
         arrays={"pairs.npz": arrays},
         notes=notes,
-        settings=settings(found.options),
-        model_hashes=hashes(trial),
+        settings=settings(found.config),
+        model_hashes=model_hashes(trial.cohort),
     )
-    return with_shape_data(answer, trial.cohort)
+    return add_shape_data(report, trial.cohort)
 
 
-def _cost(one: Verified) -> str:
+def _cost(one: VerificationRates) -> str:
     if one.cllr.value is None:
         return ""
     return (
@@ -99,7 +98,7 @@ def _cost(one: Verified) -> str:
     )
 
 
-def _rows(one: Verified) -> list[Sequence[object]]:
+def _rows(one: VerificationRates) -> list[Sequence[object]]:
     rows: list[Sequence[object]] = [[one.name, "eer", *cells(one.eer)]]
     rows += [[one.name, f"tar at far {far:g}", *cells(told)] for far, told in one.tar.items()]
     rows += [[one.name, "cllr", *cells(one.cllr)], [one.name, "cllr_min", one.cllr_min, "", ""]]
@@ -110,7 +109,7 @@ def _rows(one: Verified) -> list[Sequence[object]]:
     return rows
 
 
-def _parts(found: Verification) -> tuple[Part, ...]:
+def _parts(found: VerificationResult) -> tuple[Part, ...]:
     parts: list[Part] = [_table(found), _det(found), _roc(found)]
     if any(one.curve for one in found.scores):
         parts.append(
@@ -143,7 +142,7 @@ def _parts(found: Verification) -> tuple[Part, ...]:
     return tuple(parts)
 
 
-def _table(found: Verification) -> TablePart:
+def _table(found: VerificationResult) -> TablePart:
     columns = [TableColumn(name="score"), TableColumn(name="EER", kind="percent"),
                TableColumn(name="95 %", kind="interval")]  # fmt: skip
     for far in FAR:
@@ -151,7 +150,11 @@ def _table(found: Verification) -> TablePart:
     columns += [TableColumn(name="Cllr, bits", kind="number"), TableColumn(name="Cllr-min, bits", kind="number")]
     rows: list[tuple[object, ...]] = []
     for one in found.scores:
-        told = [cell for figure in (one.eer, *one.tar.values()) for cell in (figure.value, interval(figure))]
+        told = [
+            cell
+            for rate_estimate in (one.eer, *one.tar.values())
+            for cell in (rate_estimate.value, interval(rate_estimate))
+        ]
         rows.append((called(one.name), *told, one.cllr.value, one.cllr_min))
     return TablePart(
         title="Verification rates",
@@ -162,7 +165,7 @@ def _table(found: Verification) -> TablePart:
     )
 
 
-def _det(found: Verification) -> CurvePart:
+def _det(found: VerificationResult) -> CurvePart:
     genuine = int(found.pairs.same.sum())
     # A rate of 0 has no place on this scale, and a score without an error would have no line.
     ends = [0.5 / (len(found.pairs) - genuine), 0.5 / genuine]
@@ -183,7 +186,7 @@ def _det(found: Verification) -> CurvePart:
     )
 
 
-def _roc(found: Verification) -> CurvePart:
+def _roc(found: VerificationResult) -> CurvePart:
     least = max(1.0 / int((~found.pairs.same).sum()), _LEAST_RATE)
     series: list[Series] = []
     for one in found.scores:
@@ -205,8 +208,8 @@ def _roc(found: Verification) -> CurvePart:
     )
 
 
-def _by(found: Verification) -> TablePart:
-    columns = [TableColumn(name=found.options.by or ""), TableColumn(name="score"),
+def _by(found: VerificationResult) -> TablePart:
+    columns = [TableColumn(name=found.config.by or ""), TableColumn(name="score"),
                TableColumn(name="pairs of one", kind="count"), TableColumn(name="pairs of two", kind="count"),
                TableColumn(name="EER", kind="percent"), TableColumn(name="95 %", kind="interval"),
                TableColumn(name="TAR at FAR 0.01", kind="percent"),
@@ -218,10 +221,10 @@ def _by(found: Verification) -> TablePart:
         for one in found.scores
         for part in (one.by[value],)
     ]  # fmt: skip
-    return TablePart(title=f"By {found.options.by}", columns=tuple(columns), rows=tuple(rows))
+    return TablePart(title=f"By {found.config.by}", columns=tuple(columns), rows=tuple(rows))
 
 
-def _histogram(one: Verified, found: Verification) -> HistogramPart:
+def _histogram(one: VerificationRates, found: VerificationResult) -> HistogramPart:
     values = one.score if one.llr is None else one.llr / np.log(10.0)
     edges = np.linspace(float(values.min()), float(values.max()) + 1e-12, _BINS + 1)
     counts = [

@@ -10,6 +10,9 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.geometry.surface import rms_size
+from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
 from shapespace.schemas import (
     Counts,
     HistogramPart,
@@ -20,10 +23,8 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import NOTE_OF_REDUCED_MORPH, Answer, Lengths, Rows
-from shapespace.statistics.asymmetry import Asymmetry, Effect, first_pattern
-from shapespace.statistics.methods_answer import methods_parts
-from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
+from shapespace.statistics.asymmetry import AnovaRow, AsymmetryResult, first_pattern
+from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
@@ -36,7 +37,7 @@ _FILE = "asymmetry.npz"
 _FEW_REPEATS = 10
 
 
-def answer_of_asymmetry(found: Asymmetry) -> Answer:
+def asymmetry_report(found: AsymmetryResult) -> AnalysisReport:
     """Return the answer to how symmetric the objects of a cohort are."""
     order = np.argsort(-found.scores.mm, kind="stable")
     arrays, pictures = _pictures(found, order)
@@ -49,8 +50,7 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
         *pictures,
         *methods_parts(found.methods),
     ]
-    fitted = cohort.fitted
-    answer = Answer(
+    report = AnalysisReport(
         question="asymmetry",
         title="How symmetric?",
         summary=_summary(found, order),
@@ -68,13 +68,13 @@ def answer_of_asymmetry(found: Asymmetry) -> Answer:
             "permutations": found.permutations,
             "seed": found.seed,
         },
-        model_hashes=() if fitted is None else (fitted.model.content_hash,),
+        model_hashes=model_hashes(cohort),
         methods=found.methods,
     )
-    return with_shape_data(answer, cohort)
+    return add_shape_data(report, cohort)
 
 
-def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
+def _summary(found: AsymmetryResult, order: Any) -> tuple[str, ...]:
     mm, lengths = found.scores.mm, _lengths(found)
     side, both = found.effect("side"), found.effect("individual x side")
     directional = float(np.sqrt((found.directional**2).mean()))
@@ -109,15 +109,15 @@ def _summary(found: Asymmetry, order: Any) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _lengths(found: Asymmetry) -> Lengths:
-    return Lengths(found.cohort.unit)
+def _lengths(found: AsymmetryResult) -> LengthFormat:
+    return LengthFormat(found.cohort.unit)
 
 
-def _direction(found: Asymmetry) -> str:
+def _direction(found: AsymmetryResult) -> str:
     return "along the normals" if found.normals is not None else "over the points"
 
 
-def _told(found: Asymmetry, at: int) -> str:
+def _told(found: AsymmetryResult, at: int) -> str:
     scores, lengths = found.scores, _lengths(found)
     interval = (
         ""
@@ -128,7 +128,7 @@ def _told(found: Asymmetry, at: int) -> str:
     return f"{lengths.text(scores.mm[at])}{interval}{z}"
 
 
-def _measured(found: Asymmetry) -> tuple[str, ...]:
+def _measured(found: AsymmetryResult) -> tuple[str, ...]:
     sides = found.sides
     pairs = f"{len(sides)} vertices, {sides.on_the_plane:.0f} of them on the plane" if sides.paired else (
         f"{len(sides)} vertices, each with the place nearest to its mirror image")  # fmt: skip
@@ -140,7 +140,7 @@ def _measured(found: Asymmetry) -> tuple[str, ...]:
     )
 
 
-def _cautions(found: Asymmetry) -> list[str]:
+def _cautions(found: AsymmetryResult) -> list[str]:
     notes: list[str] = []
     subjects, repeats = len(found.subjects), int(found.counts.sum()) - len(found.subjects)
     least = 2.0 ** (1 - subjects)
@@ -166,11 +166,11 @@ def _number(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _p(effect: Effect) -> str:
+def _p(effect: AnovaRow) -> str:
     return "not known" if effect.p is None else f"{effect.p:.3g}"
 
 
-def _anova_part(found: Asymmetry) -> TablePart:
+def _anova_part(found: AsymmetryResult) -> TablePart:
     lengths = _lengths(found)
     names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
     numbers = (TableColumn(name=name, kind="number") for name in names)
@@ -181,14 +181,14 @@ def _anova_part(found: Asymmetry) -> TablePart:
     )
 
 
-def _anova_rows(found: Asymmetry) -> Rows:
+def _anova_rows(found: AsymmetryResult) -> Rows:
     field = _lengths(found).field
     return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
         (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in found.anova
     ]
 
 
-def _subject_rows(found: Asymmetry) -> Rows:
+def _subject_rows(found: AsymmetryResult) -> Rows:
     field = _lengths(found).field
     header = (
         "subject", "shapes", *map(field, ("asymmetry", "low", "high", "measured")), "z", "z_low", "z_high",
@@ -208,7 +208,7 @@ def _cell(value: float) -> object:
     return "" if np.isnan(value) else float(value)
 
 
-def _histogram(found: Asymmetry) -> HistogramPart:
+def _histogram(found: AsymmetryResult) -> HistogramPart:
     edges = np.histogram_bin_edges(found.scores.mm, bins=min(_BINS, max(4, len(found.subjects) // 3)))
     series = [("reference group" if not found.in_reference.all() else "", found.in_reference)]
     if not found.in_reference.all():
@@ -224,7 +224,7 @@ def _histogram(found: Asymmetry) -> HistogramPart:
     )
 
 
-def _listed(found: Asymmetry, order: Any) -> TablePart:
+def _listed(found: AsymmetryResult, order: Any) -> TablePart:
     s, lengths = found.scores, _lengths(found)
     columns = (
         TableColumn(name="subject"), TableColumn(name="shapes", kind="count"), lengths.column("asymmetry"),
@@ -243,7 +243,7 @@ def _known(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
+def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
     shown = [int(k) for k in order[:_SHOWN]]
     half = found.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
@@ -293,7 +293,7 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
                 low_label=low,
                 high_label=high,
                 times=times,
-                note=note if times >= 1 else f"{note} {NOTE_OF_REDUCED_MORPH}",
+                note=note if times >= 1 else f"{note} {REDUCED_MORPH_NOTE}",
             )
         )
 
@@ -326,15 +326,15 @@ def _pictures(found: Asymmetry, order: Any) -> tuple[Mapping[str, Any], list[Par
     return arrays, parts
 
 
-def _unobserved(found: Asymmetry) -> BoolArray | None:
+def _unobserved(found: AsymmetryResult) -> BoolArray | None:
     return None if found.observed is None else ~found.observed
 
 
-def _blank_note(found: Asymmetry) -> str:
+def _blank_note(found: AsymmetryResult) -> str:
     return "" if found.blank is None else f" {blank_sentence(int(found.blank.sum()), len(found.blank))}"
 
 
-def _points(found: Asymmetry) -> TablePart:
+def _points(found: AsymmetryResult) -> TablePart:
     of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
         TableColumn(name="point"), _lengths(found).column("directional"), TableColumn(name="p", kind="p"),
@@ -348,7 +348,7 @@ def _points(found: Asymmetry) -> TablePart:
     return TablePart(title="Points", columns=columns, rows=rows, note="p is family-wise.")
 
 
-def _meshes(found: Asymmetry, order: Any) -> dict[str, Mesh]:
+def _meshes(found: AsymmetryResult, order: Any) -> dict[str, Mesh]:
     faces, first = found.sides.faces, int(order[0])
     half = found.difference / 2.0
     shapes = {
