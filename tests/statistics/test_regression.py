@@ -371,7 +371,9 @@ def test_tables_that_teach_nothing_are_refused() -> None:
         regress(changed(cohort, subject=("", *("a",) * 11)), "age")
 
 
-@pytest.mark.parametrize("options", [{"folds": 2}, {"permutations": -1}, {"confidence": 1.0}, {"seed": -1}, {"draws": 0}])
+@pytest.mark.parametrize(
+    "options", [{"folds": 2}, {"permutations": -1}, {"confidence": 1.0}, {"seed": -1}, {"draws": 0}]
+)
 def test_options_that_cannot_be_are_refused(options: dict[str, int]) -> None:
     with pytest.raises(InputError, match=r"must|needs"):
         regress(drawn(12, 1), "age", **options)  # type: ignore[arg-type]

@@ -335,7 +335,14 @@ def _dispersion(result: ChangeResult, maps: FloatArray, second: BoolArray, area:
     residual = rooted - np.stack([rooted[codes == k].mean(axis=0) for k in (0, 1)])[codes]
     leverage = 1.0 / np.bincount(codes)[codes]
     return dispersion_test(
-        config.group or "", residual, leverage, codes, groups, maps.shape[1], config.permutations, config.seed
+        variable=config.group or "",
+        residual=residual,
+        leverage=leverage,
+        codes=codes,
+        groups=groups,
+        n_vertices=maps.shape[1],
+        permutations=config.permutations,
+        seed=config.seed,
     )
 
 

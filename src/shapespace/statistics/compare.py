@@ -97,7 +97,7 @@ class CompareConfig:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TermTest:
     """A row of the Procrustes analysis of variance.
 
@@ -452,9 +452,16 @@ def term_tests(
                 units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
             ).statistic()
         yield TermTest(
-            term.label, stratum.name, df, float(explained[0]), float(explained[0] / total), float(f[0]),
-            effect_size(f, config.effect_size), _share(f), read_only(f),
-        )  # fmt: skip
+            term=term.label,
+            stratum=stratum.name,
+            df=df,
+            squares=float(explained[0]),
+            r2=float(explained[0] / total),
+            f=float(f[0]),
+            z=effect_size(f, config.effect_size),
+            p=_share(f),
+            arrangements=read_only(f),
+        )
         step()
 
 
@@ -648,9 +655,16 @@ def _tested_together(
         return f, changes, [None] * len(family)
     weights = [ends.weight for ends in family if ends.weight is not None]
     maps = effect_maps(
-        cohort, stratum, residual, products, along, changes, config.bump_width_mm,
-        np.stack(weights) if weights else None, alpha=config.alpha,
-    )  # fmt: skip
+        cohort=cohort,
+        stratum=stratum,
+        residual=residual,
+        products=products,
+        along=along,
+        changes=changes,
+        bump_width_mm=config.bump_width_mm,
+        weights=np.stack(weights) if weights else None,
+        alpha=config.alpha,
+    )
     return f, changes, maps
 
 
@@ -677,13 +691,20 @@ def _tested_unequal(
         changes.append(direction @ stratum.shapes)
         maps += (
             effect_maps(
-                cohort, stratum, estimate.flips.residual, estimate.flips.fitted, estimate.along, changes[-1][None],
-                config.bump_width_mm, None if ends.weight is None else ends.weight[None], estimates=[estimate],
+                cohort=cohort,
+                stratum=stratum,
+                residual=estimate.flips.residual,
+                products=estimate.flips.fitted,
+                along=estimate.along,
+                changes=changes[-1][None],
+                bump_width_mm=config.bump_width_mm,
+                weights=None if ends.weight is None else ends.weight[None],
+                estimates=[estimate],
                 alpha=config.alpha,
             )
             if config.maps
             else [None]
-        )  # fmt: skip
+        )
     return np.stack(statistics), np.stack(changes), maps
 
 

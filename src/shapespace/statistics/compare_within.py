@@ -49,7 +49,7 @@ class SubjectResponses:
     variances: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WithinSubjects:
     """The cells of subjects, and the effects that differ within subjects.
 
@@ -101,10 +101,15 @@ class WithinSubjects:
             own = columns_of_terms([self.effects.terms[effect] for effect in self.random])
             strata.append(
                 common_stratum(
-                    self.shapes, self.design.matrix[self.rows], self.effects.matrix[self.rows][:, own], self.at,
-                    self.design, [term for term in self.design.terms if term in fixed], self.blocks,
+                    shapes=self.shapes,
+                    matrix=self.design.matrix[self.rows],
+                    own_columns=self.effects.matrix[self.rows][:, own],
+                    at=self.at,
+                    design=self.design,
+                    terms=[term for term in self.design.terms if term in fixed],
+                    blocks=self.blocks,
                 )
-            )  # fmt: skip
+            )
         return tuple(strata)
 
     def conditions(self) -> Iterator[tuple[Term, FloatArray]]:
@@ -194,10 +199,20 @@ class WithinSubjects:
         constant = np.zeros((s, d))
         constant[:, 0] = roots
         stratum = Stratum(
-            where, (roots[:, None, None] * responses.values).reshape(s * d, -1), whole,
-            np.repeat(columns, d), terms, np.zeros(s, dtype=np.intp), 0, 2, scheme="subjects", width=d,
-            units=responses.subjects, n_units=self.count, constant=constant.ravel(),
-        )  # fmt: skip
+            name=where,
+            shapes=(roots[:, None, None] * responses.values).reshape(s * d, -1),
+            matrix=whole,
+            columns=np.repeat(columns, d),
+            terms=terms,
+            groups=np.zeros(s, dtype=np.intp),
+            removed=0,
+            number=2,
+            scheme="subjects",
+            width=d,
+            units=responses.subjects,
+            n_units=self.count,
+            constant=constant.ravel(),
+        )
         return stratum, between
 
     def _between(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
@@ -358,7 +373,9 @@ def strata_of(
     strata: list[Stratum] = []
     within = None
     if inner:
-        within = _within(design, inner, varying, blocks, random, means, rows, at)
+        within = _within(
+            design=design, inner=inner, varying=varying, blocks=blocks, random=random, shapes=means, rows=rows, at=at
+        )
         strata += within.strata(squares)
     elif random:
         raise _no_effect(random[0], design)
@@ -402,7 +419,16 @@ def _within(
         number: tuple(term for term in inner if term.factors & factors == effect)
         for number, effect in enumerate(effects, 1)
     }
-    return WithinSubjects(design, blocks, design.part([frozenset(), *effects]), terms, tuple(chosen), shapes, rows, at)
+    return WithinSubjects(
+        design=design,
+        blocks=blocks,
+        effects=design.part([frozenset(), *effects]),
+        terms=terms,
+        random=tuple(chosen),
+        shapes=shapes,
+        rows=rows,
+        at=at,
+    )
 
 
 def _no_effect(effect: frozenset[str], design: Design) -> InputError:

@@ -24,7 +24,7 @@ LEVEL = 0.05
 """Family-wise error of maps, and one minus the confidence of their intervals."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MapTest:
     """What a test of maps says.
 
@@ -93,7 +93,16 @@ def mean_test(
         yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
 
     t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, progress)
-    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,), critical)
+    return MapTest(
+        effect=maps.mean(axis=0),
+        t=t,
+        p=p,
+        omnibus_p=omnibus_p,
+        permutations=count,
+        every=every,
+        n=(n,),
+        critical_t=critical,
+    )
 
 
 def difference_test(
@@ -119,7 +128,17 @@ def difference_test(
         omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
         counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
-        return MapTest(effect, t, p, omnibus, len(largest), every, counts, _critical(largest), unequal_variances=True)
+        return MapTest(
+            effect=effect,
+            t=t,
+            p=p,
+            omnibus_p=omnibus,
+            permutations=len(largest),
+            every=every,
+            n=counts,
+            critical_t=_critical(largest),
+            unequal_variances=True,
+        )
     n, of_second = len(maps), int(second.sum())
     of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
@@ -147,7 +166,16 @@ def difference_test(
         yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
 
     t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, progress)
-    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second), critical)
+    return MapTest(
+        effect=contrast(second) @ maps,
+        t=t,
+        p=p,
+        omnibus_p=omnibus_p,
+        permutations=count,
+        every=every,
+        n=(of_first, of_second),
+        critical_t=critical,
+    )
 
 
 def _permuted(

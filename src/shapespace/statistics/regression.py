@@ -151,8 +151,8 @@ class RegressionResult(AnalysisResult):
         figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
         tested = [] if self.p is None else [f"p {self.p:.3g}"]
         return (
-            f"<RegressionResult of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} subjects; "
-            f"{listed_briefly([*tested, *figures])}>"
+            f"<RegressionResult of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} "
+            f"subjects; {listed_briefly([*tested, *figures])}>"
         )
 
 
@@ -207,12 +207,44 @@ def regress(
     steps = _Steps(1 + -(-permutations // _BLOCK), folds, progress)
     done = nested(X, y[:, None], share, outer, inner, on_fold=steps.fold)
     predicted, baseline = done.predicted[:, 0], done.baseline[:, 0]
-    low, high = _intervals(X, y, share, outer, inner, done.chosen[:, 0], confidence)
-    measures = _measures(y, predicted, baseline, low, high, share, codes, draws, confidence, rng)
-    p = _p_of(X, y, codes, share, outer, inner, measures["r2"].value, permutations, rng, steps)
+    low, high = _intervals(
+        X=X, y=y, share=share, outer=outer, inner=inner, chosen=done.chosen[:, 0], confidence=confidence
+    )
+    measures = _measures(
+        y=y,
+        predicted=predicted,
+        baseline=baseline,
+        low=low,
+        high=high,
+        share=share,
+        codes=codes,
+        draws=draws,
+        confidence=confidence,
+        rng=rng,
+    )
+    p = _p_of(
+        X=X,
+        y=y,
+        codes=codes,
+        share=share,
+        outer=outer,
+        inner=inner,
+        observed=measures["r2"].value,
+        permutations=permutations,
+        rng=rng,
+        steps=steps,
+    )
 
     errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
-    predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], confidence)
+    predictor, choice, effective = _predictor(
+        cohort=cohort,
+        target=target,
+        y=y,
+        share=share,
+        outer=outer,
+        choice=CHOICES[int(errors.argmin())],
+        confidence=confidence,
+    )
     centred = y - weighted_mean(y, share)
     pattern = (share * centred) @ X / float((share * centred**2).sum())
     low_at, high_at = _percentiles(y, codes, share, _EDGES)

@@ -297,7 +297,15 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
             )
         )
 
-    morph("The asymmetric mean", "mean", found.mean, half, "From its mirror image to the mean.", "mirrored", "mean")
+    morph(
+        title="The asymmetric mean",
+        key="mean",
+        middle=found.mean,
+        part=half,
+        note="From its mirror image to the mean.",
+        low="mirrored",
+        high="mean",
+    )
     try:
         pattern, share, _ = first_pattern(found)
     except InputError:
@@ -306,7 +314,15 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
         note = (
             f"The first pattern, {100 * share:.0f} % of the fluctuating asymmetry; two standard deviations either way."
         )
-        morph("What subjects differ by most", "pattern", found.mean, pattern, note, "two one way", "two the other")
+        morph(
+            title="What subjects differ by most",
+            key="pattern",
+            middle=found.mean,
+            part=pattern,
+            note=note,
+            low="two one way",
+            high="two the other",
+        )
     for rank, k in enumerate(shown, 1):
         name = found.subjects[k]
         hidden = _unobserved(found)
@@ -321,8 +337,15 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
             )
         )
     k = shown[0]
-    morph(f"{found.subjects[k]} and its mirror image", "subject", found.symmetric[k], found.difference[k] / 2.0,
-          "The middle is the symmetric part.", "mirrored", "as it is")  # fmt: skip
+    morph(
+        title=f"{found.subjects[k]} and its mirror image",
+        key="subject",
+        middle=found.symmetric[k],
+        part=found.difference[k] / 2.0,
+        note="The middle is the symmetric part.",
+        low="mirrored",
+        high="as it is",
+    )
     return arrays, parts
 
 

@@ -447,10 +447,14 @@ def _time_series(change: ChangeResult) -> list[Part]:
     more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
     return [
         CurvePart(
-            title="Over time", level=2, series=series, x=change.time_unit, y=f"volume since the first visit, {unit.name}",
+            title="Over time",
+            level=2,
+            series=series,
+            x=change.time_unit,
+            y=f"volume since the first visit, {unit.name}",
             note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:

@@ -77,7 +77,7 @@ class Searches:
         return 1.0 - np.average(hit[self.enrolled], axis=0, weights=w[self.enrolled])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class IdentificationRates:
     """How well one score finds people.
 
@@ -228,5 +228,10 @@ def identification_rates(name: str, searches: Searches, most: int, people: Float
         for k, rate in enumerate(FPIR)
     }
     return IdentificationRates(
-        name, searches, rate_estimate(float(cmc[0]), drawn[:, 0], searches.people), cmc, band, missed
+        name=name,
+        searches=searches,
+        rank_1=rate_estimate(float(cmc[0]), drawn[:, 0], searches.people),
+        cmc=cmc,
+        band=band,
+        fnir=missed,
     )

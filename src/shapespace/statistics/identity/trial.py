@@ -73,7 +73,7 @@ class Round:
     probes: tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Trial:
     """A cohort ready to be compared.
 
@@ -179,7 +179,15 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
     if all_pairs:
         gallery = probes
     group, rounds = _rounds(person, len(people), gallery, probes, training, config)
-    trial = Trial(cohort, tuple(people), person, rounds, group, all_pairs, tuple(notes))
+    trial = Trial(
+        cohort=cohort,
+        people=tuple(people),
+        person=person,
+        rounds=rounds,
+        group=group,
+        all_pairs=all_pairs,
+        notes=tuple(notes),
+    )
     _refuse_too_few(trial, table)
     return trial
 

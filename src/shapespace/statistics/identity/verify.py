@@ -45,7 +45,7 @@ class SubgroupRates:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class VerificationRates:
     """How well one score tells pairs of one person from pairs of two.
 
@@ -215,7 +215,17 @@ def verification_rates(
         by[value] = SubgroupRates(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
     least = cllr_min(score, pairs.same)
     return VerificationRates(
-        name, score, llr, roc, eer, tar, rate_estimate(cost, drawn[:, 0]), least, band, by, dict(curve or {})
+        name=name,
+        score=score,
+        llr=llr,
+        roc=roc,
+        eer=eer,
+        tar=tar,
+        cllr=rate_estimate(cost, drawn[:, 0]),
+        cllr_min=least,
+        band=band,
+        by=by,
+        curve=dict(curve or {}),
     )
 
 
