@@ -1,4 +1,4 @@
-"""An answer as it is kept: analysis.json with the parts of its report, and tables, arrays and meshes beside it."""
+"""Report of an analysis and its files: analysis.json with the parts, and tables, arrays and meshes beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of asymmetry: the sentences, tables and pictures of its report."""
+"""Report of asymmetry: sentences, ANOVA, tables, maps and morphs."""
 
 from __future__ import annotations
 
@@ -28,64 +28,64 @@ from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 _ALPHA = 0.05
-_SHOWN = 2
-_LISTED = 10
+_MOST_MAPS = 2
+_MOST_ROWS = 10
 _BINS = 20
 _MORPH_SHARE = 0.05
 """Largest displacement in an exaggerated morph, as a share of the size (RMS distance from the centroid)."""
 _FILE = "asymmetry.npz"
-_FEW_REPEATS = 10
+_FEWEST_REPEATS = 10
 
 
-def asymmetry_report(found: AsymmetryResult) -> AnalysisReport:
+def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
     """Return the answer to how symmetric the objects of a cohort are."""
-    order = np.argsort(-found.scores.mm, kind="stable")
-    arrays, pictures = _pictures(found, order)
-    cohort = found.cohort
+    order = np.argsort(-result.scores.mm, kind="stable")
+    arrays, pictures = _maps_and_morphs(result, order)
+    cohort = result.cohort
     parts: list[Part] = [
-        TextPart(title="What is measured", text=_measured(found)),
-        _anova_part(found),
-        _histogram(found),
-        _listed(found, order),
+        TextPart(title="What is measured", text=_method_sentences(result)),
+        _anova_part(result),
+        _histogram(result),
+        _most_asymmetric(result, order),
         *pictures,
-        *methods_parts(found.methods),
+        *methods_parts(result.methods),
     ]
     report = AnalysisReport(
         question="asymmetry",
         title="How symmetric?",
-        summary=_summary(found, order),
+        summary=_summary(result, order),
         parts=tuple(parts),
-        tables={"anova.csv": _anova_rows(found), "subjects.csv": _subject_rows(found)},
+        tables={"anova.csv": _anova_rows(result), "subjects.csv": _subject_rows(result)},
         arrays={_FILE: arrays},
-        meshes=_meshes(found, order),
-        notes=(*cohort.notes, *found.sides.notes, *_cautions(found)),
+        meshes=_meshes(result, order),
+        notes=(*cohort.notes, *result.sides.notes, *_limitation_notes(result)),
         settings={
             "gauge": cohort.gauge,
-            "vertices": len(found.sides),
-            "paired": found.sides.paired,
-            "subjects": len(found.subjects),
+            "vertices": len(result.sides),
+            "paired": result.sides.paired,
+            "subjects": len(result.subjects),
             "shapes": len(cohort),
-            "permutations": found.permutations,
-            "seed": found.seed,
+            "permutations": result.permutations,
+            "seed": result.seed,
         },
         model_hashes=model_hashes(cohort),
-        methods=found.methods,
+        methods=result.methods,
     )
     return add_shape_data(report, cohort)
 
 
-def _summary(found: AsymmetryResult, order: Any) -> tuple[str, ...]:
-    mm, lengths = found.scores.mm, _lengths(found)
-    side, both = found.effect("side"), found.effect("individual x side")
-    directional = float(np.sqrt((found.directional**2).mean()))
+def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
+    mm, lengths = result.scores.mm, _lengths(result)
+    side, interaction = result.effect("side"), result.effect("individual x side")
+    directional = float(np.sqrt((result.directional**2).mean()))
     sentences = [
-        f"{len(found.subjects)} subjects lie {lengths.text(float(np.median(mm)))} (median; 5 to 95 %: "
+        f"{len(result.subjects)} subjects lie {lengths.text(float(np.median(mm)))} (median; 5 to 95 %: "
         f"{lengths.number(float(np.percentile(mm, 5)))} to {lengths.text(float(np.percentile(mm, 95)))}) from their "
-        f"own mirror images, RMS {_direction(found)}.",
+        f"own mirror images, RMS {_direction(result)}.",
         f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
-        f"F = {_number(side.f)}, p = {_p(side)}.",
+        f"F = {_number_text(side.f)}, p = {_p_text(side)}.",
     ]
-    if both.p is None and both.f is None:
+    if interaction.p is None and interaction.f is None:
         sentences.append(
             "No subject was measured twice, so fluctuating asymmetry cannot be distinguished from measurement error, "
             "and the lengths contain both."
@@ -93,43 +93,48 @@ def _summary(found: AsymmetryResult, order: Any) -> tuple[str, ...]:
     else:
         sentences.append(
             f"Subjects differ in their asymmetry beyond measurement error (fluctuating asymmetry): "
-            f"F = {_number(both.f)}, p = {_p(both)}; the error alone would be taken for "
-            f"{lengths.text(found.scores.error_mm)} "
+            f"F = {_number_text(interaction.f)}, p = {_p_text(interaction)}; the error alone would be taken for "
+            f"{lengths.text(result.scores.error_mm)} "
             "in one shape, and is subtracted."
         )
-    if found.permutations:
-        shown = int((found.directional_p <= _ALPHA).sum())
+    if result.permutations:
+        shown = int((result.directional_p <= _ALPHA).sum())
         sentences.append(
-            f"Directional asymmetry is shown at {shown} of {len(found.mean)} vertices (family-wise p at most {_ALPHA})."
+            f"Directional asymmetry is shown at {shown} of {len(result.mean)} vertices (family-wise p at most "
+            f"{_ALPHA})."
             if shown
             else f"No vertex shows directional asymmetry (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
-    sentences.append(f"The most asymmetric is {found.subjects[first]} with {_told(found, first)}.")
+    sentences.append(f"The most asymmetric is {result.subjects[first]} with {_score_text(result, first)}.")
     return tuple(sentences)
 
 
-def _lengths(found: AsymmetryResult) -> LengthFormat:
-    return LengthFormat(found.cohort.unit)
+def _lengths(result: AsymmetryResult) -> LengthFormat:
+    return LengthFormat(result.cohort.unit)
 
 
-def _direction(found: AsymmetryResult) -> str:
-    return "along the normals" if found.normals is not None else "over the points"
+def _direction(result: AsymmetryResult) -> str:
+    return "along the normals" if result.normals is not None else "over the points"
 
 
-def _told(found: AsymmetryResult, at: int) -> str:
-    scores, lengths = found.scores, _lengths(found)
+def _score_text(result: AsymmetryResult, subject: int) -> str:
+    scores, lengths = result.scores, _lengths(result)
     interval = (
         ""
-        if np.isnan(scores.low[at])
-        else f" (95 % interval {lengths.number(scores.low[at])} to {lengths.text(scores.high[at])})"
+        if np.isnan(scores.low[subject])
+        else f" (95 % interval {lengths.number(scores.low[subject])} to {lengths.text(scores.high[subject])})"
     )
-    z = "" if np.isnan(found.z[at]) else f", {found.z[at]:.1f} standard deviations from the mean of the others"
-    return f"{lengths.text(scores.mm[at])}{interval}{z}"
+    z = (
+        ""
+        if np.isnan(result.z[subject])
+        else f", {result.z[subject]:.1f} standard deviations from the mean of the others"
+    )
+    return f"{lengths.text(scores.mm[subject])}{interval}{z}"
 
 
-def _measured(found: AsymmetryResult) -> tuple[str, ...]:
-    sides = found.sides
+def _method_sentences(result: AsymmetryResult) -> tuple[str, ...]:
+    sides = result.sides
     pairs = f"{len(sides)} vertices, {sides.on_the_plane:.0f} of them on the plane" if sides.paired else (
         f"{len(sides)} vertices, each with the place nearest to its mirror image")  # fmt: skip
     return (
@@ -140,20 +145,20 @@ def _measured(found: AsymmetryResult) -> tuple[str, ...]:
     )
 
 
-def _cautions(found: AsymmetryResult) -> list[str]:
+def _limitation_notes(result: AsymmetryResult) -> list[str]:
     notes: list[str] = []
-    subjects, repeats = len(found.subjects), int(found.counts.sum()) - len(found.subjects)
+    subjects, repeats = len(result.subjects), int(result.counts.sum()) - len(result.subjects)
     least = 2.0 ** (1 - subjects)
     if least > _ALPHA / 5:
         notes.append(
             f"{subjects} subjects are few: with random signs p cannot fall below {least:.2g} whatever the asymmetry."
         )
-    if 0 < repeats < _FEW_REPEATS:
+    if 0 < repeats < _FEWEST_REPEATS:
         notes.append(
             f"The measurement error is known from {repeats} repeated shapes only, so intervals are rough; "
-            f"{_FEW_REPEATS} are the least to go by."
+            f"{_FEWEST_REPEATS} are the least to go by."
         )
-    fitted = found.cohort.fitted
+    fitted = result.cohort.fitted
     if fitted is not None:
         notes.append(
             "Fits hold asymmetry back where their model has little of it; docs/asymmetry.md says by how much. Dense "
@@ -162,44 +167,44 @@ def _cautions(found: AsymmetryResult) -> list[str]:
     return notes
 
 
-def _number(value: float | None) -> str:
+def _number_text(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _p(effect: AnovaRow) -> str:
+def _p_text(effect: AnovaRow) -> str:
     return "not known" if effect.p is None else f"{effect.p:.3g}"
 
 
-def _anova_part(found: AsymmetryResult) -> TablePart:
-    lengths = _lengths(found)
+def _anova_part(result: AsymmetryResult) -> TablePart:
+    lengths = _lengths(result)
     names = (lengths.label("SS", "²"), "df", lengths.label("MS", "²"), "F")
     numbers = (TableColumn(name=name, kind="number") for name in names)
     columns = (TableColumn(name="source"), *numbers, TableColumn(name="p", kind="p"))
-    rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in found.anova)
+    rows = tuple((e.source, e.ss, e.df, e.ms, e.f, e.p) for e in result.anova)
     return TablePart(
         title="Procrustes ANOVA", columns=columns, rows=rows, note="df are those of subjects times dimensions."
     )
 
 
-def _anova_rows(found: AsymmetryResult) -> Rows:
-    field = _lengths(found).field
+def _anova_rows(result: AsymmetryResult) -> Rows:
+    field = _lengths(result).field
     return ("source", field("ss", "2"), "df", field("ms", "2"), "f", "p"), [
-        (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in found.anova
+        (e.source, e.ss, e.df, e.ms, "" if e.f is None else e.f, "" if e.p is None else e.p) for e in result.anova
     ]
 
 
-def _subject_rows(found: AsymmetryResult) -> Rows:
-    field = _lengths(found).field
+def _subject_rows(result: AsymmetryResult) -> Rows:
+    field = _lengths(result).field
     header = (
         "subject", "shapes", *map(field, ("asymmetry", "low", "high", "measured")), "z", "z_low", "z_high",
         "in_reference", *map(field, ("vertices", "vertices_low", "vertices_high")),
     )  # fmt: skip
-    s, v = found.scores, found.vertex_scores
-    columns = (s.mm, s.low, s.high, s.raw_mm, found.z, found.z_low, found.z_high)
+    s, v = result.scores, result.vertex_scores
+    columns = (s.mm, s.low, s.high, s.raw_mm, result.z, result.z_low, result.z_high)
     rows = [
-        (name, int(found.counts[k]), *(_cell(c[k]) for c in columns), int(found.in_reference[k]), _cell(v.mm[k]),
+        (name, int(result.counts[k]), *(_cell(c[k]) for c in columns), int(result.in_reference[k]), _cell(v.mm[k]),
          _cell(v.low[k]), _cell(v.high[k]))
-        for k, name in enumerate(found.subjects)
+        for k, name in enumerate(result.subjects)
     ]  # fmt: skip
     return header, rows
 
@@ -208,80 +213,80 @@ def _cell(value: float) -> object:
     return "" if np.isnan(value) else float(value)
 
 
-def _histogram(found: AsymmetryResult) -> HistogramPart:
-    edges = np.histogram_bin_edges(found.scores.mm, bins=min(_BINS, max(4, len(found.subjects) // 3)))
-    series = [("reference group" if not found.in_reference.all() else "", found.in_reference)]
-    if not found.in_reference.all():
-        series.append(("others", ~found.in_reference))
+def _histogram(result: AsymmetryResult) -> HistogramPart:
+    edges = np.histogram_bin_edges(result.scores.mm, bins=min(_BINS, max(4, len(result.subjects) // 3)))
+    series = [("reference group" if not result.in_reference.all() else "", result.in_reference)]
+    if not result.in_reference.all():
+        series.append(("others", ~result.in_reference))
     return HistogramPart(
         title="Distances of subjects from their mirror images",
         edges=tuple(edges.tolist()),
         series=tuple(
-            Counts(label=label, counts=tuple(np.histogram(found.scores.mm[who], edges)[0].astype(float).tolist()))
-            for label, who in series
+            Counts(label=label, counts=tuple(np.histogram(result.scores.mm[members], edges)[0].astype(float).tolist()))
+            for label, members in series
         ),
-        x=f"asymmetry (RMS {_lengths(found).label(_direction(found))})",
+        x=f"asymmetry (RMS {_lengths(result).label(_direction(result))})",
     )
 
 
-def _listed(found: AsymmetryResult, order: Any) -> TablePart:
-    s, lengths = found.scores, _lengths(found)
+def _most_asymmetric(result: AsymmetryResult, order: Any) -> TablePart:
+    s, lengths = result.scores, _lengths(result)
     columns = (
         TableColumn(name="subject"), TableColumn(name="shapes", kind="count"), lengths.column("asymmetry"),
         lengths.column("low"), lengths.column("high"),
         TableColumn(name="standard deviations", kind="number"),
     )  # fmt: skip
     rows = tuple(
-        (found.subjects[k], int(found.counts[k]), *(_known(c[k]) for c in (s.mm, s.low, s.high, found.z)))
-        for k in map(int, order[:_LISTED])
+        (result.subjects[k], int(result.counts[k]), *(_finite_or_none(c[k]) for c in (s.mm, s.low, s.high, result.z)))
+        for k in map(int, order[:_MOST_ROWS])
     )
-    title = "The most asymmetric subjects" if len(order) > _LISTED else "Subjects"
+    title = "The most asymmetric subjects" if len(order) > _MOST_ROWS else "Subjects"
     return TablePart(title=title, columns=columns, rows=rows, note="All of them stand in subjects.csv.")
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
-    shown = [int(k) for k in order[:_SHOWN]]
-    half = found.difference.mean(axis=0) / 2.0
+def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part]]:
+    shown = [int(k) for k in order[:_MOST_MAPS]]
+    half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
-        "vertices": found.mean,
-        "directional_mm": blank_where(found.directional, found.blank),
-        "directional_p": found.directional_p,
-        "shown": found.directional_p <= _ALPHA,
-        "fluctuating_mm": blank_where(found.fluctuating, found.blank),
-        "subjects": np.array(found.subjects),
-        "maps_mm": blank_where(found.maps, _unobserved(found)).astype(np.float32),
-        "symmetric": found.symmetric.astype(np.float32),
-        "asymmetric": (found.difference / 2.0).astype(np.float32),
-        "vertex_of_cohort": found.sides.vertices,
+        "vertices": result.mean,
+        "directional_mm": blank_where(result.directional, result.blank),
+        "directional_p": result.directional_p,
+        "shown": result.directional_p <= _ALPHA,
+        "fluctuating_mm": blank_where(result.fluctuating, result.blank),
+        "subjects": np.array(result.subjects),
+        "maps_mm": blank_where(result.maps, _unobserved(result)).astype(np.float32),
+        "symmetric": result.symmetric.astype(np.float32),
+        "asymmetric": (result.difference / 2.0).astype(np.float32),
+        "vertex_of_cohort": result.sides.vertices,
     }
-    if found.sides.faces is None:
-        return arrays, [_points(found)]
-    arrays["faces"] = found.sides.faces
-    unshown = not found.permutations
+    if result.sides.faces is None:
+        return arrays, [_point_table(result)]
+    arrays["faces"] = result.sides.faces
+    untested = not result.permutations
     parts: list[Part] = [
         SurfaceMapPart(
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
-            mask="" if unshown else "shown",
+            mask="" if untested else "shown",
             note="Mean over the subjects, along the normals." + (
-                "" if unshown else f" Pale where the family-wise p is above {_ALPHA}.") + _blank_note(found),
+                "" if untested else f" Pale where the family-wise p is above {_ALPHA}.") + _blank_note(result),
         ),
         SurfaceMapPart(
             title="Fluctuating asymmetry", arrays=_FILE, values="fluctuating_mm", signed=False,
             note="Standard deviation over the subjects, about the directional asymmetry, with measurement error."
-            + _blank_note(found),
+            + _blank_note(result),
         ),
     ]  # fmt: skip
 
-    faces = found.sides.faces
+    faces = result.sides.faces
 
     def morph(title: str, key: str, middle: FloatArray, part: FloatArray, note: str, low: str, high: str) -> None:
         most = float(np.linalg.norm(part, axis=1).max())
         wanted = max(1.0, _MORPH_SHARE * rms_size(middle) / most) if most > 0 else 1.0
-        flips_at = min(flip_factor(middle, way * part, faces) for way in (1.0, -1.0))
+        flips_at = min(flip_factor(middle, sign * part, faces) for sign in (1.0, -1.0))
         times = factor_to_draw(wanted, flips_at)
         arrays[f"{key}_low"], arrays[f"{key}_high"] = middle - times * part, middle + times * part
         parts.append(
@@ -300,14 +305,14 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
     morph(
         title="The asymmetric mean",
         key="mean",
-        middle=found.mean,
-        part=half,
+        middle=result.mean,
+        part=half_difference,
         note="From its mirror image to the mean.",
         low="mirrored",
         high="mean",
     )
     try:
-        pattern, share, _ = first_pattern(found)
+        pattern, share, _ = first_pattern(result)
     except InputError:
         pass
     else:
@@ -317,31 +322,31 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
         morph(
             title="What subjects differ by most",
             key="pattern",
-            middle=found.mean,
+            middle=result.mean,
             part=pattern,
             note=note,
             low="two one way",
             high="two the other",
         )
     for rank, k in enumerate(shown, 1):
-        name = found.subjects[k]
-        hidden = _unobserved(found)
-        arrays[f"subject_{rank}_mm"] = blank_where(found.maps[k], None if hidden is None else hidden[k])
+        name = result.subjects[k]
+        hidden = _unobserved(result)
+        arrays[f"subject_{rank}_mm"] = blank_where(result.maps[k], None if hidden is None else hidden[k])
         parts.append(
             SurfaceMapPart(
                 title=f"{name}: the sides",
                 level=2 if rank == 1 else None,
                 arrays=_FILE,
                 values=f"subject_{rank}_mm",
-                note=f"{_told(found, k)}.",
+                note=f"{_score_text(result, k)}.",
             )
         )
     k = shown[0]
     morph(
-        title=f"{found.subjects[k]} and its mirror image",
+        title=f"{result.subjects[k]} and its mirror image",
         key="subject",
-        middle=found.symmetric[k],
-        part=found.difference[k] / 2.0,
+        middle=result.symmetric[k],
+        part=result.difference[k] / 2.0,
         note="The middle is the symmetric part.",
         low="mirrored",
         high="as it is",
@@ -349,35 +354,35 @@ def _pictures(found: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], li
     return arrays, parts
 
 
-def _unobserved(found: AsymmetryResult) -> BoolArray | None:
-    return None if found.observed is None else ~found.observed
+def _unobserved(result: AsymmetryResult) -> BoolArray | None:
+    return None if result.observed is None else ~result.observed
 
 
-def _blank_note(found: AsymmetryResult) -> str:
-    return "" if found.blank is None else f" {blank_sentence(int(found.blank.sum()), len(found.blank))}"
+def _blank_note(result: AsymmetryResult) -> str:
+    return "" if result.blank is None else f" {blank_sentence(int(result.blank.sum()), len(result.blank))}"
 
 
-def _points(found: AsymmetryResult) -> TablePart:
-    of = {vertex: name for name, vertex in (found.cohort.landmarks or SurfaceLandmarks()).items()}
+def _point_table(result: AsymmetryResult) -> TablePart:
+    of = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
     columns = (
-        TableColumn(name="point"), _lengths(found).column("directional"), TableColumn(name="p", kind="p"),
-        _lengths(found).column("fluctuating"),
+        TableColumn(name="point"), _lengths(result).column("directional"), TableColumn(name="p", kind="p"),
+        _lengths(result).column("fluctuating"),
     )  # fmt: skip
     rows = tuple(
-        (of.get(int(v), str(int(v))), float(found.directional[k]), _known(found.directional_p[k]),
-         float(found.fluctuating[k]))
-        for k, v in enumerate(found.sides.vertices)
+        (of.get(int(v), str(int(v))), float(result.directional[k]), _finite_or_none(result.directional_p[k]),
+         float(result.fluctuating[k]))
+        for k, v in enumerate(result.sides.vertices)
     )  # fmt: skip
     return TablePart(title="Points", columns=columns, rows=rows, note="p is family-wise.")
 
 
-def _meshes(found: AsymmetryResult, order: Any) -> dict[str, Mesh]:
-    faces, first = found.sides.faces, int(order[0])
-    half = found.difference / 2.0
+def _meshes(result: AsymmetryResult, order: Any) -> dict[str, Mesh]:
+    faces, first = result.sides.faces, int(order[0])
+    half = result.difference / 2.0
     shapes = {
-        "symmetric_mean": found.mean,
-        "asymmetric_mean": found.mean + half.mean(axis=0),
-        "most_asymmetric": found.symmetric[first] + half[first],
-        "most_asymmetric_symmetric_part": found.symmetric[first],
+        "symmetric_mean": result.mean,
+        "asymmetric_mean": result.mean + half.mean(axis=0),
+        "most_asymmetric": result.symmetric[first] + half[first],
+        "most_asymmetric_symmetric_part": result.symmetric[first],
     }
     return {f"{name}.ply": Mesh(vertices, faces, name=name) for name, vertices in shapes.items()}

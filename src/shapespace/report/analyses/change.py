@@ -1,4 +1,4 @@
-"""What changed, as a report: sentences, maps, tables, and the change as a morph."""
+"""Report of changes between visits: sentences, maps, tables, and the mean change as a morph."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import FloatArray, Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
-SHOWN = 6
+MOST_MAPS = 6
 """Subjects whose maps the report draws."""
-LISTED, CURVES = 50, 12
+MOST_ROWS, MOST_CURVES = 50, 12
 _LEVEL = LEVEL
 _MM3_PER_ML = 1000.0
 _LEAST_ML_MM3 = 100.0
@@ -119,9 +119,10 @@ def _summary(change: ChangeResult) -> list[str]:
     subjects = change.subjects
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
-    who = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
+    subjects_text = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
     sentences = [
-        f"{who} changed by {rms:.2f} mm (RMS along the normals{'' if len(subjects) == 1 else ', median'}), and on "
+        f"{subjects_text} changed by {rms:.2f} mm (RMS along the "
+        f"normals{'' if len(subjects) == 1 else ', median'}), and on "
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     ]
     if change.mean_change is not None:
@@ -129,11 +130,11 @@ def _summary(change: ChangeResult) -> list[str]:
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
         sentences.append(_test_sentence(change, change.mean_change.surface, "the mean change", "none"))
-        what = "The volume changed by" if change.is_closed else "The open surface swept"
+        verb = "The volume changed by" if change.is_closed else "The open surface swept"
         sentences.append(
-            f"{what} {unit.text(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.text(low)} to "
+            f"{verb} {unit.text(volumes.mean())} {unit.name}{_per_time(change)} on average (95 %: {unit.text(low)} to "
             f"{unit.text(high)}), "
-            f"{_p(float(change.mean_change.volumes.p[0]))}."
+            f"{_p_text(float(change.mean_change.volumes.p[0]))}."
         )
     if change.group_difference is not None:
         first, second = change.group_difference.groups
@@ -143,8 +144,8 @@ def _summary(change: ChangeResult) -> list[str]:
         difference = float(change.group_difference.volumes.effect[0])
         unit = _VolumeUnit.of(difference)
         sentences.append(
-            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per(change)} "
-            f"more than that of {first}, {_p(float(change.group_difference.volumes.p[0]))}."
+            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per_time(change)} "
+            f"more than that of {first}, {_p_text(float(change.group_difference.volumes.p[0]))}."
         )
         unequal = change.config.unequal_variances
         sentences += [
@@ -155,11 +156,12 @@ def _summary(change: ChangeResult) -> list[str]:
     if change.repeatability is None:
         sentences.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:
-        known, smallest = change.repeatability, change.repeatability.smallest_mm
-        least = float(known.volumes_smallest_mm3[0])
+        repeatability, smallest = change.repeatability, change.repeatability.smallest_mm
+        least = float(repeatability.volumes_smallest_mm3[0])
         unit = _VolumeUnit.of(least)
         sentences.append(
-            f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
+            f"By {repeatability.scans} scans of {repeatability.visits} "
+            f"{'visit' if repeatability.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
             f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
@@ -187,37 +189,39 @@ class _VolumeUnit:
         return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
 
 
-def _test_sentence(change: ChangeResult, test: MapTest, what: str, other: str) -> str:
-    at = int(np.abs(test.t).argmax())
-    found = test.p <= _LEVEL
-    low, high = test.interval(at)
-    where = (
-        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * found.mean():.0f} % of the vertices differ, "
-        f"clearest by {test.effect[at]:+.2f} mm{_per(change)} (simultaneous 95 % interval {low:+.2f} to {high:+.2f} "
+def _test_sentence(change: ChangeResult, test: MapTest, quantity: str, other: str) -> str:
+    vertex = int(np.abs(test.t).argmax())
+    significant = test.p <= _LEVEL
+    low, high = test.interval(vertex)
+    vertices = (
+        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * significant.mean():.0f} % of the vertices "
+        "differ, "
+        f"clearest by {test.effect[vertex]:+.2f} mm{_per_time(change)} (simultaneous 95 % interval {low:+.2f} to "
+        f"{high:+.2f} "
         "mm)"
-        if found.any()
-        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[at]:.3g})"
+        if significant.any()
+        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[vertex]:.3g})"
     )
     differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
-    if found.any() and test.omnibus_p > _LEVEL:
-        where = f"exploratory, since the test of the whole surface is not significant: {where}"
-    few = (
+    if significant.any() and test.omnibus_p > _LEVEL:
+        vertices = f"exploratory, since the test of the whole surface is not significant: {vertices}"
+    limit = (
         f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
     )
-    return f"As a whole {what} {differs} {other} ({_p(test.omnibus_p)}); {where}{few}."
+    return f"As a whole {quantity} {differs} {other} ({_p_text(test.omnibus_p)}); {vertices}{limit}."
 
 
-def _p(p: float) -> str:
+def _p_text(p: float) -> str:
     return f"p = {p:.3g}"
 
 
-def _per(change: ChangeResult) -> str:
+def _per_time(change: ChangeResult) -> str:
     return f" per {change.time_unit}" if change.config.rate else ""
 
 
 def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     test = tests.surface
-    unit = f"mm{_per(change)}"
+    unit = f"mm{_per_time(change)}"
     arrays |= {
         "mean": blank_where(test.effect, change.blank),
         "mean_t": test.t,
@@ -259,9 +263,9 @@ def _region_table(change: ChangeResult, test: MapTest) -> Part:
     rows: list[tuple[Any, ...]] = []
     volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
-    for at, name in enumerate(change.regions):
-        own = volumes[:, at] / unit.mm3
-        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[at])))
+    for k, name in enumerate(change.regions):
+        own = volumes[:, k] / unit.mm3
+        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
     return TablePart(
         title="Volumes swept",
         columns=(
@@ -277,9 +281,9 @@ def _region_table(change: ChangeResult, test: MapTest) -> Part:
 def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
     rows: list[list[Any]] = []
     maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
-    for at, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
+    for k, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
         low, high = interval_of_mean(values)
-        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[at]])
+        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[k]])
     return ("landmark", "mean", "stddev", "low", "high", "p"), rows
 
 
@@ -301,50 +305,55 @@ def _group_difference_parts(
     return [
         SurfaceMapPart(
             title=f"{second} beside {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
-            mask="difference_found", unit=f"mm{_per(change)}", note=note,
+            mask="difference_found", unit=f"mm{_per_time(change)}", note=note,
         )
     ]  # fmt: skip
 
 
 def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    found = change.repeatability
-    if found is None:
+    repeatability = change.repeatability
+    if repeatability is None:
         text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
         return [TextPart(title="What is noise", level=2, text=text)]
-    arrays |= {"smallest_mm": found.smallest_mm, "icc": found.icc}
+    arrays |= {"smallest_mm": repeatability.smallest_mm, "icc": repeatability.icc}
     rows: list[tuple[Any, ...]] = [
         (
             "surface (mm, median)",
-            *(float(np.median(of)) for of in (found.within_mm, found.smallest_mm)),
-            found.shape_icc,
+            *(float(np.median(of)) for of in (repeatability.within_mm, repeatability.smallest_mm)),
+            repeatability.shape_icc,
         ),
         *(
             (
                 f"volume of {name} (mm3)",
-                float(found.volumes_within_mm3[at]),
-                float(found.volumes_smallest_mm3[at]),
-                found.volume_icc if at == 0 else None,
+                float(repeatability.volumes_within_mm3[k]),
+                float(repeatability.volumes_smallest_mm3[k]),
+                repeatability.volume_icc if k == 0 else None,
             )
-            for at, name in enumerate(change.regions)
+            for k, name in enumerate(change.regions)
         ),
         *(
             (f"{name} (mm)", float(within), float(smallest), float(icc))
             for name, within, smallest, icc in zip(
                 change.landmarks.names,
-                found.landmarks_within_mm,
-                found.landmarks_smallest_mm,
-                change.landmarks.interpolate(found.icc),
+                repeatability.landmarks_within_mm,
+                repeatability.landmarks_smallest_mm,
+                change.landmarks.interpolate(repeatability.icc),
                 strict=True,
             )
         ),
     ]
-    few = f" {found.freedom} degrees of freedom are few, so these are rough." if found.freedom < _FEW else ""
+    few = (
+        f" {repeatability.freedom} degrees of freedom are few, so these are rough."
+        if repeatability.freedom < _FEW
+        else ""
+    )
     return [
         SurfaceMapPart(
             title="What is noise", level=2, arrays=ARRAYS, vertices="before",
             values="smallest_mm", signed=False,
             note="The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of "
-            f"{found.scans} scans of {found.visits} visits. A change of one scan against another that is "
+            f"{repeatability.scans} scans of {repeatability.visits} visits. A change of one scan against another "
+            "that is "
             f"smaller is noise.{few}",
         ),
         TablePart(
@@ -360,8 +369,8 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
 
 def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     every = len(change.subjects)
-    more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
-    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:LISTED])
+    more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
+    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS])
     unit = _VolumeUnit.of(*volumes)
     columns = [
         TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
@@ -374,10 +383,10 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
     if has_groups:
         columns.append(TableColumn(name="group"))
     rows: list[tuple[Any, ...]] = []
-    for one in change.subjects[:LISTED]:
+    for one in change.subjects[:MOST_ROWS]:
         volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
         row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
-        row += [volume / unit.mm3, _or_none(stddev / unit.mm3)]
+        row += [volume / unit.mm3, _finite_or_none(stddev / unit.mm3)]
         row += [volume / one.volume_before_mm3] if change.is_closed else []
         rows.append((*row, *([one.group] if has_groups else [])))
     parts: list[Part] = [
@@ -386,7 +395,7 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
             note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
         )
     ]  # fmt: skip
-    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:SHOWN]
+    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
         before, after = change.surfaces(subject.name)
         key = f"subject{number}"
@@ -411,7 +420,7 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
                     subject.visits[0].label, subject.visits[-1].label,
                 )
             )  # fmt: skip
-    if len(change.subjects) > SHOWN:
+    if len(change.subjects) > MOST_MAPS:
         parts.append(TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}."))
     return parts
 
@@ -434,17 +443,17 @@ def _morph(
 def _time_series(change: ChangeResult) -> list[Part]:
     if not change.time_unit or all(len(one.visits) < 3 for one in change.subjects):
         return []
-    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:CURVES] for visit in one.visits))
+    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:MOST_CURVES] for visit in one.visits))
     series = tuple(
         Series(
             label=one.name,
             x=tuple(visit.time for visit in one.visits),
             y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
         )
-        for one in change.subjects[:CURVES]
+        for one in change.subjects[:MOST_CURVES]
     )
     every = len(change.subjects)
-    more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
+    more = f" The first {MOST_CURVES} of {every}; all are in visits.csv." if every > MOST_CURVES else ""
     return [
         CurvePart(
             title="Over time",
@@ -475,8 +484,8 @@ def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
             _largest(one),
             one.beyond_share,
             float(one.change.volumes_mm3[0]),
-            _or_none(one.change.volumes_stddev_mm3[0]),
-            _or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
+            _finite_or_none(one.change.volumes_stddev_mm3[0]),
+            _finite_or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
             len(one.visits),
             sum(visit.scans for visit in one.visits),
             float(np.median(one.change.stddev_mm)),
@@ -485,7 +494,7 @@ def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
             row += [
                 float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
                 float(one.rate.volumes_mm3[0]),
-                _or_none(one.rate.volumes_stddev_mm3[0]),
+                _finite_or_none(one.rate.volumes_stddev_mm3[0]),
                 change.time_unit,
             ]
         rows.append(row)
@@ -506,9 +515,9 @@ def _tables(change: ChangeResult) -> dict[str, Rows]:
         tables["regions.csv"] = (
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
-                (one.name, name, float(one.change.volumes_mm3[at]), _or_none(one.change.volumes_stddev_mm3[at]))
+                (one.name, name, float(one.change.volumes_mm3[k]), _finite_or_none(one.change.volumes_stddev_mm3[k]))
                 for one in change.subjects
-                for at, name in enumerate(change.regions)
+                for k, name in enumerate(change.regions)
             ],
         )
     if change.landmarks:
@@ -523,21 +532,25 @@ def _tables(change: ChangeResult) -> dict[str, Rows]:
 
 
 def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequence[object]]:
-    found, known = subject.change, change.repeatability
-    along, stddev = change.landmarks.interpolate(np.stack([found.along_mm, found.stddev_mm], axis=1)).T
-    smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
+    estimate, repeatability = subject.change, change.repeatability
+    along, stddev = change.landmarks.interpolate(np.stack([estimate.along_mm, estimate.stddev_mm], axis=1)).T
+    smallest = (
+        [None] * len(change.landmarks)
+        if repeatability is None
+        else list(map(float, repeatability.landmarks_smallest_mm))
+    )
     return [
         (
             subject.name,
             name,
-            *map(float, found.landmarks_mm[at]),
-            float(np.linalg.norm(found.landmarks_mm[at])),
-            float(found.landmarks_stddev_mm[at]),
-            float(along[at]),
-            float(stddev[at]),
-            smallest[at],
+            *map(float, estimate.landmarks_mm[k]),
+            float(np.linalg.norm(estimate.landmarks_mm[k])),
+            float(estimate.landmarks_stddev_mm[k]),
+            float(along[k]),
+            float(stddev[k]),
+            smallest[k],
         )
-        for at, name in enumerate(change.landmarks.names)
+        for k, name in enumerate(change.landmarks.names)
     ]
 
 
@@ -548,19 +561,19 @@ def _largest(subject: SubjectChange) -> float:
 
 
 def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
-    found = {
+    maps = {
         "subjects": np.array([one.name for one in change.subjects]),
         "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
             np.float32
         ),
         "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
     }
-    found["beyond"] = np.stack([one.change.beyond for one in change.subjects])
+    maps["beyond"] = np.stack([one.change.beyond for one in change.subjects])
     if change.time_unit:
         rates = [change_or_rate(one, rate=True) for one in change.subjects]
-        found["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
-        found["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
-    return found
+        maps["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
+        maps["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
+    return maps
 
 
 def _notes(change: ChangeResult) -> list[str]:
@@ -572,8 +585,8 @@ def _notes(change: ChangeResult) -> list[str]:
         )
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
     if not change.time_unit and len(ends) > 1:
-        told = named([f"{first} to {last}" for first, last in sorted(ends)])
-        notes.append(f"Not all subjects have the same first and last visit ({told}).")
+        pairs_of_visits = named([f"{first} to {last}" for first, last in sorted(ends)])
+        notes.append(f"Not all subjects have the same first and last visit ({pairs_of_visits}).")
     if change.is_model_only:
         notes.append(
             "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
@@ -582,5 +595,5 @@ def _notes(change: ChangeResult) -> list[str]:
     return notes
 
 
-def _or_none(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None

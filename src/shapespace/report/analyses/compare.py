@@ -1,4 +1,4 @@
-"""A comparison as an answer: sentences, tables, maps and morphs of its report."""
+"""Report of a comparison: sentences, tables, maps and morphs."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import BoolArray, FloatArray, Mesh
 
-_SHOWN_SHARE = 0.05
+_LARGEST_SHARE = 0.05
 """A morph shows changes exaggerated to about this share of the size."""
-_TIMES = (1, 2, 3, 5, 10, 20, 50)
+_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)
 _BINS = 40
 _FEWEST_ARRANGEMENTS = 20
 """Number of different arrangements below which no p value can be small."""
@@ -47,92 +47,92 @@ _PALE = "Vertices that are not found to differ are pale."
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
-def compare_report(comparison: CompareResult) -> AnalysisReport:
+def compare_report(result: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
-    effects = comparison.effects
+    effects = result.effects
     parts: list[Part] = [
-        *_of_terms(comparison),
-        *_of_pairs(comparison),
-        *_of_angles(comparison),
-        *(part for at, effect in enumerate(effects, 1) for part in _of_effect(comparison, effect, at)),
-        *methods_parts(comparison.methods),
+        *_term_parts(result),
+        *_pair_parts(result),
+        *_angle_parts(result),
+        *(part for number, effect in enumerate(effects, 1) for part in _effect_parts(result, effect, number)),
+        *methods_parts(result.methods),
     ]
     report = AnalysisReport(
         question="compare",
-        title=f"Shape {comparison.design.formula.strip()}",
-        summary=tuple(_summary(comparison)),
+        title=f"Shape {result.design.formula.strip()}",
+        summary=tuple(_summary(result)),
         parts=tuple(parts),
-        tables=_tables(comparison),
-        arrays={f"effect_{at}.npz": _arrays(comparison, effect) for at, effect in enumerate(effects, 1)},
-        meshes=dict(_meshes(comparison)),
-        notes=(*comparison.cohort.notes, *_repeated_measures_notes(comparison)),
+        tables=_tables(result),
+        arrays={f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
+        meshes=dict(_meshes(result)),
+        notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
         settings={
-            "formula": comparison.design.formula,
-            "squares": comparison.config.anova_type,
-            "blocks": comparison.config.blocks,
-            "random": comparison.config.random,
-            "permutations": comparison.config.permutations,
-            "seed": comparison.config.seed,
-            "bump_width_mm": comparison.config.bump_width_mm,
-            "level": comparison.config.alpha,
-            "unequal_variances": comparison.config.unequal_variances,
-            "effect_size": comparison.config.effect_size,
-            "gauge": comparison.cohort.gauge,
-            "shapes": len(comparison.cohort),
-            "subjects": comparison.n_subjects,
+            "formula": result.design.formula,
+            "squares": result.config.anova_type,
+            "blocks": result.config.blocks,
+            "random": result.config.random,
+            "permutations": result.config.permutations,
+            "seed": result.config.seed,
+            "bump_width_mm": result.config.bump_width_mm,
+            "level": result.config.alpha,
+            "unequal_variances": result.config.unequal_variances,
+            "effect_size": result.config.effect_size,
+            "gauge": result.cohort.gauge,
+            "shapes": len(result.cohort),
+            "subjects": result.n_subjects,
         },
-        model_hashes=model_hashes(comparison.cohort),
-        methods=comparison.methods,
+        model_hashes=model_hashes(result.cohort),
+        methods=result.methods,
     )
-    return add_shape_data(report, comparison.cohort)
+    return add_shape_data(report, result.cohort)
 
 
-def _summary(comparison: CompareResult) -> Iterator[str]:
-    level, shapes = comparison.config.alpha, len(comparison.cohort)
-    kind = {"box-cox": "Box-Cox", "log": "log F"}[comparison.config.effect_size]
-    for test in comparison.tests:
-        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p(test.p)}"
-        where = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
+def _summary(result: CompareResult) -> Iterator[str]:
+    level, shapes = result.config.alpha, len(result.cohort)
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
+    for test in result.tests:
+        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
+        stratum = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
         if test.p <= level:
-            yield f"Shape differs with {test.term}{where} ({figures})."
+            yield f"Shape differs with {test.term}{stratum} ({figures})."
         else:
-            yield f"No difference of shape with {test.term}{where} is found ({figures})."
-    for effect in comparison.effects:
+            yield f"No difference of shape with {test.term}{stratum} is found ({figures})."
+    for effect in result.effects:
         if effect.map is not None:
-            yield _of_map(comparison, effect, effect.map)
+            yield _map_sentence(result, effect, effect.map)
             if effect.map.blank is not None:
                 yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
-                yield _of_bumps(comparison, effect, effect.map.bump, effect.map.bump_mm)
-    yield from compare_warnings(comparison)
-    of = f" of {comparison.n_subjects} subjects" if comparison.n_subjects < shapes else ""
-    yield f"{shapes} shapes{of}, {comparison.config.permutations} arrangements, the observed one among them."
-    yield multiplicity_sentence(comparison.methods)
+                yield _bump_sentence(result, effect, effect.map.bump, effect.map.bump_mm)
+    yield from compare_warnings(result)
+    of_subjects = f" of {result.n_subjects} subjects" if result.n_subjects < shapes else ""
+    yield f"{shapes} shapes{of_subjects}, {result.config.permutations} arrangements, the observed one among them."
+    yield multiplicity_sentence(result.methods)
 
 
-def compare_warnings(comparison: CompareResult) -> tuple[str, ...]:
+def compare_warnings(result: CompareResult) -> tuple[str, ...]:
     """Return sentences on limitations of the tests."""
-    unequal = comparison.config.unequal_variances
+    unequal = result.config.unequal_variances
     return (
         *(
-            dispersion_sentence(dispersion, unequal, comparison.cohort.unit)
-            for dispersion in comparison.methods.dispersions
+            dispersion_sentence(dispersion, unequal, result.cohort.unit)
+            for dispersion in result.methods.dispersions
             if is_dispersion_warning(dispersion, unequal_variances=unequal)
         ),
-        *_subject_warnings(comparison),
-        *_arrangement_warnings(comparison),
-        *_repeated_measures_warnings(comparison),
-        *_uncentred_warnings(comparison),
+        *_subject_warnings(result),
+        *_arrangement_warnings(result),
+        *_repeated_measures_warnings(result),
+        *_uncentred_warnings(result),
         *(
             f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
-            for one in comparison.design.variables
+            for one in result.design.variables
             if len(one.levels) > MOST_LEVELS
         ),
     )
 
 
-def _subject_warnings(comparison: CompareResult) -> Iterator[str]:
-    table, blocks = comparison.cohort.table, comparison.config.blocks
+def _subject_warnings(result: CompareResult) -> Iterator[str]:
+    table, blocks = result.cohort.table, result.config.blocks
     if blocks is None:
         names = table.columns.get("subject", ())
         if all(names) and len(set(names)) < len(names):
@@ -144,15 +144,15 @@ def _subject_warnings(comparison: CompareResult) -> Iterator[str]:
     counts = Counter(table.texts(blocks))
     if max(counts.values()) == 1:
         yield f"No {blocks} has two shapes, so --blocks changes nothing."
-    elif len(set(counts.values())) > 1 and comparison.strata[0].stratum.startswith("between"):
+    elif len(set(counts.values())) > 1 and result.strata[0].stratum.startswith("between"):
         yield (
             f"There are {min(counts.values())} to {max(counts.values())} shapes of a {blocks}; each counts "
             "once, by its mean, and p is approximate where means of few scans are noisier."
         )
 
 
-def _arrangement_warnings(comparison: CompareResult) -> Iterator[str]:
-    for stratum in comparison.strata:
+def _arrangement_warnings(result: CompareResult) -> Iterator[str]:
+    for stratum in result.strata:
         if stratum.log_arrangements < math.log(_FEWEST_ARRANGEMENTS):
             name = f" {stratum.stratum}" if stratum.stratum else ""
             yield (
@@ -161,8 +161,8 @@ def _arrangement_warnings(comparison: CompareResult) -> Iterator[str]:
             )
 
 
-def _repeated_measures_warnings(comparison: CompareResult) -> Iterator[str]:
-    repeated, blocks = comparison.repeated_measures, comparison.config.blocks
+def _repeated_measures_warnings(result: CompareResult) -> Iterator[str]:
+    repeated, blocks = result.repeated_measures, result.config.blocks
     if repeated is None:
         return
     if repeated.common_effects:
@@ -172,33 +172,33 @@ def _repeated_measures_warnings(comparison: CompareResult) -> Iterator[str]:
         )
     for effect, count in repeated.subjects_without_effect.items():
         yield (
-            f"{count} of {comparison.n_subjects} {blocks}s lack conditions from which {effect} can be estimated, and "
+            f"{count} of {result.n_subjects} {blocks}s lack conditions from which {effect} can be estimated, and "
             "are left out of its test."
         )
 
 
-def _uncentred_warnings(comparison: CompareResult) -> Iterator[str]:
-    design = comparison.design
+def _uncentred_warnings(result: CompareResult) -> Iterator[str]:
+    design = result.design
     for one in design.variables:
         # A function of the variable, such as center(age), defines its own zero.
         has_interaction = any(
             one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
             for term in design.terms
         )
-        if comparison.config.anova_type == "III" and has_interaction and not one.levels and one.low * one.high > 0:
+        if result.config.anova_type == "III" and has_interaction and not one.levels and one.low * one.high > 0:
             yield (
                 f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
                 f"center({one.name}) in the formula, or take type II."
             )
 
 
-def _repeated_measures_notes(comparison: CompareResult) -> Iterator[str]:
-    repeated, blocks = comparison.repeated_measures, comparison.config.blocks
+def _repeated_measures_notes(result: CompareResult) -> Iterator[str]:
+    repeated, blocks = result.repeated_measures, result.config.blocks
     if repeated is None:
         return
-    if repeated.n_cells < len(comparison.cohort):
+    if repeated.n_cells < len(result.cohort):
         yield (
-            f"{len(comparison.cohort)} shapes are averaged to {repeated.n_cells} cells of one {blocks} and condition; "
+            f"{len(result.cohort)} shapes are averaged to {repeated.n_cells} cells of one {blocks} and condition; "
             "repeated shapes of a cell do not count as further observations."
         )
     if repeated.random_effects:
@@ -218,71 +218,73 @@ def _repeated_measures_notes(comparison: CompareResult) -> Iterator[str]:
 _EXPLORATORY = "exploratory, since its term is not significant: "
 
 
-def _of_map(comparison: CompareResult, effect: ShapeEffect, shown: EffectMap) -> str:
+def _map_sentence(result: CompareResult, effect: ShapeEffect, shown: EffectMap) -> str:
     """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
-    level = comparison.config.alpha
+    level = result.config.alpha
     scope = f"family-wise error {100 * level:g} % within this map"
     significant = shown.shown.p_family <= level
     if not significant.any():
         return f"{effect.label}: no vertex differs ({scope})."
     return (
         f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
-        f"differ ({scope}), the clearest by {_clearest(comparison, shown)}."
+        f"differ ({scope}), the clearest by {_clearest(result, shown)}."
     )
 
 
-def _clearest(comparison: CompareResult, shown: EffectMap) -> str:
+def _clearest(result: CompareResult, shown: EffectMap) -> str:
     """Return the change at the vertex with the largest F, with its simultaneous interval."""
-    lengths, at = _lengths(comparison), int(shown.shown.f.argmax())
-    low, high = shown.interval_mm(at)
+    lengths, vertex = _lengths(result), int(shown.shown.f.argmax())
+    low, high = shown.interval_mm(vertex)
     sign = "" if shown.normal_mm is None else "+"
     return (
-        f"{lengths.text(shown.shown_mm[at], sign)} (simultaneous {100 * (1 - comparison.config.alpha):g} % interval "
-        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near(comparison.cohort, at)}"
+        f"{lengths.text(shown.shown_mm[vertex], sign)} (simultaneous {100 * (1 - result.config.alpha):g} % interval "
+        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near_landmark(result.cohort, vertex)}"
     )
 
 
-def _of_bumps(comparison: CompareResult, effect: ShapeEffect, bump: Tested, bump_mm: FloatArray) -> str:
-    level, at = comparison.config.alpha, int(bump.f.argmax())
+def _bump_sentence(result: CompareResult, effect: ShapeEffect, bump: Tested, bump_mm: FloatArray) -> str:
+    level, vertex = result.config.alpha, int(bump.f.argmax())
     scope = f"family-wise error {100 * level:g} % within this map"
-    if bump.p_family[at] > level:
+    if bump.p_family[vertex] > level:
         return f"{effect.label}: no bump is found beyond the variation between shapes ({scope})."
     return (
-        f"{effect.label}: a bump of {_lengths(comparison).text(bump_mm[at], '+')} or more is found"
-        f"{_near(comparison.cohort, at)} ({scope})."
+        f"{effect.label}: a bump of {_lengths(result).text(bump_mm[vertex], '+')} or more is found"
+        f"{_near_landmark(result.cohort, vertex)} ({scope})."
     )
 
 
-def _lengths(comparison: CompareResult) -> LengthFormat:
-    return LengthFormat(comparison.cohort.unit)
+def _lengths(result: CompareResult) -> LengthFormat:
+    return LengthFormat(result.cohort.unit)
 
 
-def _p(p: float) -> str:
+def _p_text(p: float) -> str:
     return f"p {p:.3g}"
 
 
-def _near(cohort: Cohort, vertex: int) -> str:
+def _near_landmark(cohort: Cohort, vertex: int) -> str:
     """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
     if not cohort.landmarks:
         return ""
-    places = cohort.landmarks.interpolate(cohort.reference)
-    far = np.linalg.norm(places - cohort.reference[vertex], axis=1)
-    return f" near {cohort.landmarks.names[int(far.argmin())]}"
+    landmarks = cohort.landmarks.interpolate(cohort.reference)
+    distances = np.linalg.norm(landmarks - cohort.reference[vertex], axis=1)
+    return f" near {cohort.landmarks.names[int(distances.argmin())]}"
 
 
 def _column(name: str, kind: Any = "text") -> TableColumn:
     return TableColumn(name=name, kind=kind)
 
 
-def _of_terms(comparison: CompareResult) -> Iterator[Part]:
-    strata, lengths = any(test.stratum for test in comparison.tests), _lengths(comparison)
+def _term_parts(result: CompareResult) -> Iterator[Part]:
+    strata, lengths = any(test.stratum for test in result.tests), _lengths(result)
     rows: list[tuple[Any, ...]] = []
-    for left in comparison.strata:
-        own = [test for test in comparison.tests if test.stratum == left.stratum]
-        rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in own]
-        share = left.squares / left.squares_total
-        rows.append(("residual", left.stratum, left.df, left.squares, left.squares / left.df, share, *[None] * 3))
-        rows.append(("total", left.stratum, left.df_total, left.squares_total, None, None, *[None] * 3))
+    for stratum in result.strata:
+        tests = [test for test in result.tests if test.stratum == stratum.stratum]
+        rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in tests]
+        share = stratum.squares / stratum.squares_total
+        rows.append(
+            ("residual", stratum.stratum, stratum.df, stratum.squares, stratum.squares / stratum.df, share, *[None] * 3)
+        )
+        rows.append(("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, *[None] * 3))
     columns = (
         _column("term"), _column("tested"), _column("df", "count"),
         _column(lengths.label("sum of squares", "²"), "number"),
@@ -293,11 +295,11 @@ def _of_terms(comparison: CompareResult) -> Iterator[Part]:
         columns = (*columns[:1], *columns[2:])
         rows = [(*row[:1], *row[2:]) for row in rows]
     note = (
-        f"Type {comparison.config.anova_type} sums of squares of Procrustes distances. {_of_f(comparison)} "
-        f"{effect_size_sentence(comparison.config.effect_size)} R² is the share of the total of its stratum."
+        f"Type {result.config.anova_type} sums of squares of Procrustes distances. {_f_sentence(result)} "
+        f"{effect_size_sentence(result.config.effect_size)} R² is the share of the total of its stratum."
     )
     yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
-    for test in comparison.tests:
+    for test in result.tests:
         f = np.log10(np.maximum(test.arrangements, 1e-12))
         counts, edges = np.histogram(f, bins=_BINS)
         yield HistogramPart(
@@ -310,41 +312,41 @@ def _of_terms(comparison: CompareResult) -> Iterator[Part]:
         )
 
 
-def _of_pairs(comparison: CompareResult) -> Iterator[Part]:
-    rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in comparison.effects)
+def _pair_parts(result: CompareResult) -> Iterator[Part]:
+    rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in result.effects)
     yield TablePart(
         title="How far apart",
         level=2,
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
         columns=(
-            _column("variable"), _column("from, to"), _lengths(comparison).column("Procrustes distance"),
-            _lengths(comparison).column("RMS"),
+            _column("variable"), _column("from, to"), _lengths(result).column("Procrustes distance"),
+            _lengths(result).column("RMS"),
             _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
         ),
         rows=rows,
     )  # fmt: skip
 
 
-def _of_angles(comparison: CompareResult) -> Iterator[Part]:
-    if comparison.angles:
+def _angle_parts(result: CompareResult) -> Iterator[Part]:
+    if result.angles:
         yield TablePart(
             title="Angles between changes of shape",
             note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes.",
             columns=(_column("one"), _column("other"), _column("angle, degrees", "number"), _column("p", "p")),
-            rows=tuple((a.first, a.second, a.degrees, a.p) for a in comparison.angles),
+            rows=tuple((a.first, a.second, a.degrees, a.p) for a in result.angles),
         )
 
 
-def _of_effect(comparison: CompareResult, effect: ShapeEffect, at: int) -> Iterator[Part]:
-    file, level = f"effect_{at}.npz", f"{100 * comparison.config.alpha:g} %"
+def _effect_parts(result: CompareResult, effect: ShapeEffect, number: int) -> Iterator[Part]:
+    file, level = f"effect_{number}.npz", f"{100 * result.config.alpha:g} %"
     yield TextPart(
         title=effect.label,
         level=2,
-        text=_of_size(comparison, effect),
+        text=_size_sentence(result, effect),
     )
     if effect.map is not None:
-        kept = _arrays(comparison, effect)
+        arrays = _arrays(result, effect)
         blank = effect.map.blank
         note = _PALE if blank is None else f"{_PALE} {blank_sentence(int(blank.sum()), len(blank))}"
         for title, values, mask in (
@@ -353,18 +355,18 @@ def _of_effect(comparison: CompareResult, effect: ShapeEffect, at: int) -> Itera
             (f"In any direction, family-wise error {level}", "length_mm", "length_family"),
             (f"Bumps beside how shapes vary, family-wise error {level}", "bump_mm", "bump_family"),
         ):
-            if values in kept:
+            if values in arrays:
                 yield SurfaceMapPart(
                     title=title,
                     arrays=file,
                     values=values,
                     mask=mask,
                     signed=values != "length_mm",
-                    unit=_lengths(comparison).of_map,
+                    unit=_lengths(result).of_map,
                     note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {note}" if effect.exploratory else note,
                 )
-    if comparison.cohort.faces is not None:
-        times = _times(comparison, effect)
+    if result.cohort.faces is not None:
+        times = _exaggeration(result, effect)
         yield MorphPart(
             title="From low to high",
             note="" if times == 1 else f"Exaggerated {times} times.",
@@ -373,21 +375,21 @@ def _of_effect(comparison: CompareResult, effect: ShapeEffect, at: int) -> Itera
             high_label=effect.high,
             times=float(times),
         )
-    yield from _of_scores(comparison, effect)
+    yield from _score_parts(result, effect)
 
 
-def _of_size(comparison: CompareResult, effect: ShapeEffect) -> str:
+def _size_sentence(result: CompareResult, effect: ShapeEffect) -> str:
     """Return how large a change is: over all vertices, and where it is clearest."""
-    whole = f"The change is {_lengths(comparison).text(effect.rms_mm)} (RMS over vertices)."
+    size = f"The change is {_lengths(result).text(effect.rms_mm)} (RMS over vertices)."
     if effect.map is None:
-        return whole
-    way = "" if effect.map.normal_mm is None else ", outwards positive"
+        return size
+    direction = "" if effect.map.normal_mm is None else ", outwards positive"
     label = " The map is exploratory, since no term of this effect is significant." if effect.exploratory else ""
-    return f"{whole} It is clearest by {_clearest(comparison, effect.map)}{way}.{label}"
+    return f"{size} It is clearest by {_clearest(result, effect.map)}{direction}.{label}"
 
 
-def _of_f(comparison: CompareResult) -> str:
-    if comparison.config.unequal_variances:
+def _f_sentence(result: CompareResult) -> str:
+    if result.config.unequal_variances:
         return (
             "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
             "squared Welch t), compared with sign flips of residuals."
@@ -395,21 +397,21 @@ def _of_f(comparison: CompareResult) -> str:
     return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
 
 
-def _of_scores(comparison: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
+def _score_parts(result: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
     """Yield regression scores against a number: shapes projected on what it changes."""
-    one = next((v for v in comparison.design.variables if v.name == effect.name and not v.levels), None)
+    one = next((v for v in result.design.variables if v.name == effect.name and not v.levels), None)
     length = float(np.linalg.norm(effect.change))
     if one is None or length == 0:
         return
-    x = np.array(comparison.design.values[one.column], dtype=np.float64)
-    y = (comparison.cohort.coefficients - comparison.mean) @ effect.change / length
+    x = np.array(result.design.values[one.column], dtype=np.float64)
+    y = (result.cohort.coefficients - result.mean) @ effect.change / length
     slope = length / (one.high - one.low)
     ends = np.array([one.low, one.high])
     yield CurvePart(
         title=f"Regression score of {one.name}",
         note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
         x=one.name,
-        y=_lengths(comparison).label("score"),
+        y=_lengths(result).label("score"),
         series=(
             Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
             Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
@@ -417,36 +419,36 @@ def _of_scores(comparison: CompareResult, effect: ShapeEffect) -> Iterator[Part]
     )
 
 
-def _times(comparison: CompareResult, effect: ShapeEffect) -> int:
-    cohort = comparison.cohort
+def _exaggeration(result: CompareResult, effect: ShapeEffect) -> int:
+    cohort = result.cohort
     moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
     size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
-    return max((one for one in _TIMES if one * moved <= _SHOWN_SHARE * size), default=1)
+    return max((one for one in _EXAGGERATIONS if one * moved <= _LARGEST_SHARE * size), default=1)
 
 
-def _arrays(comparison: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:
-    cohort, level = comparison.cohort, comparison.config.alpha
-    times = _times(comparison, effect)
+def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:
+    cohort, level = result.cohort, result.config.alpha
+    times = _exaggeration(result, effect)
     half = (times - 1) / 2 * effect.change
     out: dict[str, npt.NDArray[Any]] = {
-        "vertices": cohort.vertices(comparison.mean),
+        "vertices": cohort.vertices(result.mean),
         "faces": _NO_FACES if cohort.faces is None else cohort.faces,
         "low": cohort.vertices(effect.at_low - half),
         "high": cohort.vertices(effect.at_high + half),
     }
-    made = effect.map
-    if made is None:
+    effect_map = effect.map
+    if effect_map is None:
         return out
-    out |= {"change_mm": made.change_mm, "length_mm": blank_where(made.length_mm, made.blank)}
-    if made.weight is not None:
-        out["information"] = made.weight
-    named = {"length": made.any_way}
-    if made.along is not None and made.normal_mm is not None:
-        out["normal_mm"] = blank_where(made.normal_mm, made.blank)
-        named["normal"] = made.along
-    if made.bump is not None and made.bump_mm is not None:
-        out["bump_mm"] = blank_where(made.bump_mm, made.blank)
-        named["bump"] = made.bump
+    out |= {"change_mm": effect_map.change_mm, "length_mm": blank_where(effect_map.length_mm, effect_map.blank)}
+    if effect_map.weight is not None:
+        out["information"] = effect_map.weight
+    named = {"length": effect_map.any_way}
+    if effect_map.along is not None and effect_map.normal_mm is not None:
+        out["normal_mm"] = blank_where(effect_map.normal_mm, effect_map.blank)
+        named["normal"] = effect_map.along
+    if effect_map.bump is not None and effect_map.bump_mm is not None:
+        out["bump_mm"] = blank_where(effect_map.bump_mm, effect_map.blank)
+        named["bump"] = effect_map.bump
     for name, test in named.items():
         out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}
         masks: dict[str, BoolArray] = {f"{name}_family": test.p_family <= level, f"{name}_fdr": test.q <= level}
@@ -454,23 +456,21 @@ def _arrays(comparison: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.
     return out
 
 
-def _meshes(comparison: CompareResult) -> Iterator[tuple[str, Mesh]]:
-    if comparison.cohort.faces is None:
+def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
+    if result.cohort.faces is None:
         return
-    for at, effect in enumerate(comparison.effects, 1):
+    for at, effect in enumerate(result.effects, 1):
         for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
-            yield f"effect_{at}_{end}.ply", comparison.cohort.mesh(shape, name)
+            yield f"effect_{at}_{end}.ply", result.cohort.mesh(shape, name)
 
 
-def _tables(comparison: CompareResult) -> Mapping[str, Rows]:
-    terms: list[tuple[object, ...]] = [
-        (t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in comparison.tests
-    ]
-    for left in comparison.strata:
+def _tables(result: CompareResult) -> Mapping[str, Rows]:
+    terms: list[tuple[object, ...]] = [(t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in result.tests]
+    for left in result.strata:
         share = left.squares / left.squares_total
         terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
         terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
-    field = _lengths(comparison).field
+    field = _lengths(result).field
     tables: dict[str, Rows] = {
         "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p"), terms),
         "effects.csv": (
@@ -489,12 +489,12 @@ def _tables(comparison: CompareResult) -> Mapping[str, Rows]:
             ),
             [
                 (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
-                for at, e in enumerate(comparison.effects, 1)
+                for at, e in enumerate(result.effects, 1)
             ],
         ),
     }
-    if comparison.angles:
-        rows = [(a.first, a.second, a.degrees, "" if a.p is None else a.p) for a in comparison.angles]
+    if result.angles:
+        rows = [(a.first, a.second, a.degrees, "" if a.p is None else a.p) for a in result.angles]
         tables["angles.csv"] = (("first", "second", "degrees", "p"), rows)
     return tables
 
