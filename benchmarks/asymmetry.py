@@ -28,7 +28,7 @@ from shapespace.geometry.mirror import FLIP, mirrored
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
-from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
+from shapespace.statistics.asymmetry import AsymmetryResult, measure_asymmetry
 from shapespace.types import FloatArray, IntArray, Mesh
 
 LEVELS_MM = (1.0, 2.0, 3.0)
@@ -111,7 +111,7 @@ def organs() -> Kind:
 KINDS = {"faces": faces, "organs": organs}
 
 
-def judged(found: Asymmetry, truth: FloatArray) -> list[str]:
+def judged(found: AsymmetryResult, truth: FloatArray) -> list[str]:
     """Return bias at each level, coverage and median width of the interval, as text."""
     scores, mm = found.scores, np.asarray(truth)
     cells = [f"{100 * ((scores.mm - mm) / mm)[np.isclose(mm, level)].mean():+.1f} %" for level in LEVELS_MM]

@@ -42,9 +42,9 @@ from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate
 from shapespace.geometry.surface import vertex_normals
 from shapespace.io.landmarks import write_landmark_indices
 from shapespace.io.meshes import write_mesh
-from shapespace.statistics.change import Change, change
-from shapespace.statistics.change_found import ChangeSettings
+from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_maps import volume_mm3
+from shapespace.statistics.change_result import ChangeConfig
 from shapespace.types import FloatArray, Mesh
 
 PEAKS_MM, SHARES, WIDTH_MM, NEAR = (1.0, 2.0, 3.0), (0.02, 0.05, 0.10), 10.0, 0.05
@@ -88,12 +88,12 @@ def write_table(plan: Plan, after: int, *, rescans: bool) -> Path:
 
 def asked(
     plan: Plan, after: int, surfaces: Any, stable: str, *, rescans: bool, bumps: dict[str, FloatArray] | None = None
-) -> Change:
+) -> ChangeResult:
     """Return what `change` says of it, with the volume of the place of each subject's bump."""
     options = CohortOptions(plan.folder / "fits", plan.folder / "model.h5", surfaces, "form", doubtful=True)
     cohort = read_cohort(write_table(plan, after, rescans=rescans), options)
     regions = {name: np.flatnonzero(bump > NEAR).tolist() for name, bump in (bumps or {}).items()}
-    settings = ChangeSettings(order=("before", "after"), stable=stable, regions=regions, permutations=1)
+    settings = ChangeConfig(order=("before", "after"), stable=stable, regions=regions, permutations=1)
     return change(cohort, settings)
 
 
@@ -148,7 +148,7 @@ def face_rows(plan: Plan, truth: dict[str, FloatArray]) -> list[dict[str, Any]]:
                 for one, other, is_large in zip(by_rescans.subjects, by_fits.subjects, large, strict=True):
                     bump, area = truth[one.name], one.area_mm2
                     core, none = bump > 0.5, bump < 0.01
-                    at = by_fits.parts.index(one.name)
+                    at = by_fits.regions.index(one.name)
                     for name, value in {
                         "peak": float(area * bump @ other.change.along_mm / (area * bump @ bump)),
                         "elsewhere": float(np.sqrt(np.average(other.change.along_mm[none] ** 2, weights=area[none]))),
@@ -229,17 +229,17 @@ def organ_rows(plan: Plan, truth: dict[str, list[float]]) -> list[dict[str, Any]
             row: dict[str, Any] = {"kind": "organs", "surfaces": surfaces, "stable": "all", "change": 100 * share}
             for one, other in zip(by_rescans.subjects, by_fits.subjects, strict=True):
                 true = truth[one.name][after]
-                found = float(other.change.volumes_mm3[0]) / other.before_mm3
+                found = float(other.change.volumes_mm3[0]) / other.volume_before_mm3
                 # A share of the volume before, as the true one is, so that the size of the fit's own error drops out.
                 for name, value in {
                     "off": 100 * (found - true),
-                    "smallest": 100 * smallest / other.before_mm3,
+                    "smallest": 100 * smallest / other.volume_before_mm3,
                     "covered_rescans": float(
-                        abs(float(one.change.volumes_mm3[0]) - true * one.before_mm3)
+                        abs(float(one.change.volumes_mm3[0]) - true * one.volume_before_mm3)
                         <= one.change.quantile * float(one.change.volumes_stddev_mm3[0])
                     ),
                     "covered_fits": float(
-                        abs(float(other.change.volumes_mm3[0]) - true * other.before_mm3)
+                        abs(float(other.change.volumes_mm3[0]) - true * other.volume_before_mm3)
                         <= 1.96 * float(other.change.volumes_stddev_mm3[0])
                     ),
                     "found": float(float(other.change.volumes_mm3[0]) > smallest),

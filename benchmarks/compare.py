@@ -27,7 +27,7 @@ from shapespace.datasets.simulated_scan import Cut
 from shapespace.errors import FitError
 from shapespace.fit.fit import FitConfig
 from shapespace.geometry.surface import vertex_normals
-from shapespace.statistics.compare import CompareOptions, Comparison, compare
+from shapespace.statistics.compare import CompareConfig, CompareResult, compare
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 GROUP = 40
@@ -156,12 +156,12 @@ class Found:
     omnibus: int = 0
     somewhere: int = 0
 
-    def count(self, study: Comparison, term: str) -> None:
+    def count(self, study: CompareResult, term: str) -> None:
         made = next(effect.map for effect in study.effects if effect.name == term)
         assert made is not None
         self.studies += 1
-        self.omnibus += study.test(term).p <= study.options.level
-        self.somewhere += bool((made.shown.p_family <= study.options.level).any())
+        self.omnibus += study.test(term).p <= study.config.alpha
+        self.somewhere += bool((made.shown.p_family <= study.config.alpha).any())
 
     def told(self) -> str:
         return f"{100 * self.omnibus / self.studies:5.1f} %   {100 * self.somewhere / self.studies:5.1f} %"
@@ -177,7 +177,7 @@ def null_studies(folders: list[Path], studies: int, permutations: int) -> Mappin
     found = {name: Found() for name in ("independent people", "between subjects", "within subjects", "blocks ignored")}
     for seed in range(studies):
         rng = np.random.default_rng([11, seed])
-        options = CompareOptions(permutations=permutations, seed=seed)
+        options = CompareConfig(permutations=permutations, seed=seed)
         chosen = [people[int(k)] for k in rng.permutation(len(people))[:ALONE]]
         rows = [int(rng.choice(scans[one])) for one in chosen]
         sex = rng.choice(["f", "m"], ALONE)
@@ -224,16 +224,16 @@ def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
     for seed in range(studies):
         rng = np.random.default_rng([7, seed])
         one, other = (rng.permutation(np.flatnonzero(used))[:GROUP] for used in pool.used)
-        options = CompareOptions(permutations=permutations, seed=seed, bump_width_mm=WIDTH_MM)
+        options = CompareConfig(permutations=permutations, seed=seed, bump_width_mm=WIDTH_MM)
         study = compare(cohort.take([*one.tolist(), *(count + other).tolist()]), "~ group", options)
         made = study.effects[0].map
         assert made is not None and made.bump is not None
-        found = made.bump.p_family <= options.level
+        found = made.bump.p_family <= options.alpha
         both, some = float((found & truth).sum()), float(found.sum())
         rows.append(
             (
-                float(study.test("group").p <= options.level),
-                float((made.shown.p_family <= options.level).any()),
+                float(study.test("group").p <= options.alpha),
+                float((made.shown.p_family <= options.alpha).any()),
                 float(found.any()),
                 float(truth[int(made.bump.f.argmax())]),
                 2 * both / (some + float(truth.sum())) if some else np.nan,
@@ -266,7 +266,7 @@ def speed(shapes: int, vertices: int, permutations: int) -> str:
         names, x, basis, coefficients, np.full(shapes, np.nan), Table(known, names), "shape", faces
     )  # fmt: skip
     start = time.process_time()
-    compare(cohort, "~ sex + age", CompareOptions(permutations=permutations))
+    compare(cohort, "~ sex + age", CompareConfig(permutations=permutations))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
     return f"{time.process_time() - start:.1f} CPU s, {peak:.2f} GiB at the peak"
 

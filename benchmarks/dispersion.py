@@ -18,11 +18,11 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.statistics import compare as compare_module
-from shapespace.statistics.change_group import difference_test
-from shapespace.statistics.compare import CompareOptions, compare
+from shapespace.statistics.compare import CompareConfig, compare
 from shapespace.statistics.compare_formula import Design as FormulaDesign
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.dispersion import dispersion_test
+from shapespace.statistics.map_tests import difference_test
 from shapespace.types import FloatArray
 
 POINTS = 40
@@ -118,7 +118,7 @@ def compared(design: Design, study: int, permutations: int) -> FloatArray:
     cohort = Cohort.of_shapes(curve + noise.reshape(len(codes), POINTS, 3), table, align=False)
     out: list[bool] = []
     for unequal in (False, True):
-        options = CompareOptions(permutations=permutations, seed=study, unequal_variances=unequal)
+        options = CompareConfig(permutations=permutations, seed=study, unequal_variances=unequal)
         found = compare(cohort, "~ group + age" if design.covariate else "~ group", options)
         maps = [effect.map for effect in found.effects if effect.name == "group" and effect.map is not None]
         # The family-wise error does not include the pairs of three groups, so only the first pair is counted.

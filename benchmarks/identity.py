@@ -25,11 +25,11 @@ from identity_scans import CONDITIONS, fit_harder, people_there, read_harder, st
 
 from shapespace.model.additive import AdditiveModel
 from shapespace.statistics.identity.calibration import cllr
-from shapespace.statistics.identity.identify import Searches, identified, joined, search
-from shapespace.statistics.identity.rates import Figure, Pairs, Sweep, people_drawn
+from shapespace.statistics.identity.identify import Searches, identification_rates, joined, search
+from shapespace.statistics.identity.rates import Pairs, RateEstimate, Sweep, people_drawn
 from shapespace.statistics.identity.samples import Samples
 from shapespace.statistics.identity.scores import SCORES
-from shapespace.statistics.identity.verify import Verified, verified
+from shapespace.statistics.identity.verify import VerificationRates, verification_rates
 from shapespace.types import FloatArray, IntArray
 from simulated import StudyConfig, prepare_folder, run_fits
 from study_fits import STATUSES, model_path, person_path, read_fits
@@ -134,9 +134,9 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
             for k in modes:
                 flat = np.concatenate([m.ravel() for m in score_matrices(folds, name, k)])
                 curve[k] = Sweep(flat, pairs.same).roc().eer
-        told = verified(name, np.concatenate([m.ravel() for m in matrices]), pairs, group, drawn, curve=curve)
+        told = verification_rates(name, np.concatenate([m.ravel() for m in matrices]), pairs, group, drawn, curve=curve)
         found: list[Searches] = [search(m, *row) for m, row in zip(matrices, rows, strict=True)]
-        ranks = identified(name, joined(found), min(len(np.unique(g)) for g, _ in rows), drawn)
+        ranks = identification_rates(name, joined(found), min(len(np.unique(g)) for g, _ in rows), drawn)
         out[name] = row_of(told) | {"rank_1": shown(ranks.rank_1)}
         out[name] |= {f"fnir_at_fpir_{rate:g}": shown(ranks.fnir[rate]) for rate in ranks.fnir}
         least = float(told.score[pairs.same].min() - told.score[~pairs.same].max()) / float(
@@ -150,7 +150,7 @@ def measured(folds: Sequence[Fold], names: Sequence[str], modes: Sequence[int], 
     return out
 
 
-def row_of(told: Verified) -> dict[str, Any]:
+def row_of(told: VerificationRates) -> dict[str, Any]:
     """Return the figures of a score as JSON has them."""
     return {
         "eer": shown(told.eer),
@@ -161,7 +161,7 @@ def row_of(told: Verified) -> dict[str, Any]:
     }
 
 
-def shown(one: Figure) -> list[float | None]:
+def shown(one: RateEstimate) -> list[float | None]:
     return [one.value, one.low, one.high]
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.statistics.compare import CompareOptions, compare
+from shapespace.statistics.compare import CompareConfig, compare
 from shapespace.types import BoolArray, FloatArray
 
 VERTICES, MODES = 60, 6
@@ -89,7 +89,7 @@ class Population:
 def false_positives(design: Design, studies: int, seed: int) -> tuple[float, float, float]:
     """Return the share of studies with p at most 5 %: of the term, of any vertex; and the share of estimates."""
     population, found = Population(), np.zeros((studies, 3))
-    options = CompareOptions(permutations=PERMUTATIONS + 1)
+    options = CompareConfig(permutations=PERMUTATIONS + 1)
     for k in range(studies):
         rng = np.random.default_rng([seed, k])
         shapes, groups = population.study(design, rng)

@@ -21,7 +21,7 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
-from shapespace.statistics.compare import CompareOptions, TermTest, compare, term_tests
+from shapespace.statistics.compare import CompareConfig, TermTest, compare, term_tests
 from shapespace.statistics.compare_formula import Design, design_of
 from shapespace.statistics.compare_within import strata_of
 from shapespace.types import FloatArray
@@ -188,7 +188,7 @@ def check() -> None:
         table = row.table(rng)
         shapes = simulated(row, table, rng)
         cohort = Cohort.of_shapes(shapes, table)
-        options = CompareOptions(blocks="subject", random=row.random, permutations=ARRANGEMENTS, maps=False)
+        options = CompareConfig(blocks="subject", random=row.random, permutations=ARRANGEMENTS, maps=False)
         expected = [test.p for test in compare(cohort, row.formula, options).tests]
         found = [test.p for test in tests_of(row, aligned(shapes), design_of_table(row.formula, table), table, 0)]
         if np.abs(np.array(expected) - found).max() > 1.5 / ARRANGEMENTS:
@@ -215,7 +215,7 @@ def tests_of(
         frozenset({part.strip()}) for part in row.random.partition("|")[0].split("+")[1:]
     )  # fmt: skip
     strata = strata_of(flat - flat.mean(axis=0), design, table["subject"], "subject", "II", random)
-    options = CompareOptions(permutations=ARRANGEMENTS, maps=False, seed=seed)
+    options = CompareConfig(permutations=ARRANGEMENTS, maps=False, seed=seed)
     return [test for stratum in strata.every for test in term_tests(stratum, options)]
 
 

@@ -18,7 +18,7 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.fit.posterior import new_shapes
 from shapespace.model.shape_model import ShapeModel
-from shapespace.statistics.score import ScoreOptions, Scores, score
+from shapespace.statistics.score import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray
 
 LEVELS = (0.05, 0.1, 0.2, 0.5)
@@ -36,7 +36,7 @@ Kept = dict[str, list[FloatArray]]
 """By name of a column: p values of subjects, and whether their maps pass the limit."""
 
 
-def add(kept: Kept, scores: Scores, rows: Sequence[int]) -> None:
+def add(kept: Kept, scores: ScoreResult, rows: Sequence[int]) -> None:
     """Add those of some subjects."""
     at = list(rows)
     for which in ("farther", "p_value", "rest_farther"):
@@ -101,7 +101,7 @@ def of_study(folder: Path, fold: int, most: int | None, found: dict[float, Kept]
         subjects = cohort(
             model, z[person][scans] * model.stddev, stddev[person][scans] * model.stddev, [str(k) for k in scans]
         )
-        scores = score(reference, subjects, ScoreOptions(draws=10))
+        scores = score(reference, subjects, ScoreConfig(draws=10))
         for strength in (0.0, 0.5, 1.0):
             rows = [row for row, k in enumerate(scans) if strengths[k] == strength]
             if rows:

@@ -2,6 +2,7 @@
 
 from importlib import import_module
 from typing import TYPE_CHECKING
+from warnings import warn
 
 from shapespace.version import __version__
 
@@ -30,44 +31,44 @@ if TYPE_CHECKING:
     from shapespace.recognise.classifiers import CLASSIFIERS
     from shapespace.recognise.predict import train_classifier
     from shapespace.recognise.shape_space import ShapeSpace
-    from shapespace.statistics.asymmetry import Asymmetry, measure_asymmetry
-    from shapespace.statistics.change import Change, change
-    from shapespace.statistics.change_found import ChangeSettings
-    from shapespace.statistics.compare import CompareOptions, Comparison, compare
+    from shapespace.statistics.asymmetry import AsymmetryResult, measure_asymmetry
+    from shapespace.statistics.change import change
+    from shapespace.statistics.change_result import ChangeConfig, ChangeResult
+    from shapespace.statistics.compare import CompareConfig, CompareResult, compare
     from shapespace.statistics.identity.identify import identify
-    from shapespace.statistics.identity.rounds import IdentityOptions
+    from shapespace.statistics.identity.trial import IdentityConfig
     from shapespace.statistics.identity.verify import verify
     from shapespace.statistics.predictor import Predictor
-    from shapespace.statistics.regression import Regression, regress
-    from shapespace.statistics.score import ScoreOptions, Scores, score
+    from shapespace.statistics.regression import RegressionResult, regress
+    from shapespace.statistics.score import ScoreConfig, ScoreResult, score
     from shapespace.store.results import Results
     from shapespace.types import LabelVolume, Mesh, Similarity, SurfaceLandmarks
 
 __all__ = [
     "CLASSIFIERS",
     "AdditiveModel",
-    "Asymmetry",
-    "Change",
-    "ChangeSettings",
+    "AsymmetryResult",
+    "ChangeConfig",
+    "ChangeResult",
     "Cohort",
     "CohortOptions",
-    "CompareOptions",
-    "Comparison",
+    "CompareConfig",
+    "CompareResult",
     "CorrespondSettings",
     "FitConfig",
     "FitResult",
-    "IdentityOptions",
+    "IdentityConfig",
     "LabelVolume",
     "Mesh",
     "ModelQuality",
     "Paper",
     "Predictor",
     "QualitySettings",
-    "Regression",
+    "RegressionResult",
     "Results",
     "Robust",
-    "ScoreOptions",
-    "Scores",
+    "ScoreConfig",
+    "ScoreResult",
     "ShapeModel",
     "ShapeSpace",
     "ShapespaceError",
@@ -100,30 +101,30 @@ __all__ = [
 ]
 
 _HOMES = {
+    "AsymmetryResult": "statistics.asymmetry",
+    "ChangeConfig": "statistics.change_result",
+    "ChangeResult": "statistics.change_result",
+    "CompareConfig": "statistics.compare",
+    "CompareResult": "statistics.compare",
+    "IdentityConfig": "statistics.identity.trial",
+    "RegressionResult": "statistics.regression",
+    "ScoreConfig": "statistics.score",
+    "ScoreResult": "statistics.score",
     "AdditiveModel": "model.additive",
-    "Asymmetry": "statistics.asymmetry",
     "CLASSIFIERS": "recognise.classifiers",
-    "Change": "statistics.change",
-    "ChangeSettings": "statistics.change_found",
     "Cohort": "cohort.cohort",
     "CohortOptions": "cohort.read",
-    "CompareOptions": "statistics.compare",
-    "Comparison": "statistics.compare",
     "CorrespondSettings": "correspondence.settings",
     "FitConfig": "fit.fit",
     "FitResult": "fit.result",
-    "IdentityOptions": "statistics.identity.rounds",
     "LabelVolume": "types",
     "Mesh": "types",
     "ModelQuality": "model.quality",
     "Paper": "fit.paper_method",
     "Predictor": "statistics.predictor",
     "QualitySettings": "model.quality",
-    "Regression": "statistics.regression",
     "Results": "store.results",
     "Robust": "fit.robust_method",
-    "ScoreOptions": "statistics.score",
-    "Scores": "statistics.score",
     "ShapeModel": "model.shape_model",
     "ShapeSpace": "recognise.shape_space",
     "ShapespaceError": "errors",
@@ -155,7 +156,19 @@ _HOMES = {
 }
 
 
+_FORMER_NAMES = {
+    "ChangeSettings": "ChangeConfig",
+    "CompareOptions": "CompareConfig",
+    "IdentityOptions": "IdentityConfig",
+    "ScoreOptions": "ScoreConfig",
+}
+"""Former name -> current name, of classes in published examples."""
+
+
 def __getattr__(name: str) -> object:
+    if name in _FORMER_NAMES:
+        warn(f"shapespace.{name} is now called {_FORMER_NAMES[name]}.", DeprecationWarning, stacklevel=2)
+        name = _FORMER_NAMES[name]
     # SciPy takes most of a second to import, and `shapespace --help` needs none of it.
     if name not in _HOMES:
         raise AttributeError(f"module 'shapespace' has no attribute {name!r}")

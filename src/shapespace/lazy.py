@@ -8,19 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, overload
 
 from shapespace.errors import ShapespaceError
 
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
-        "answer_of_asymmetry": "statistics.asymmetry_answer",
-        "answer_of_comparison": "statistics.compare_answer",
-        "answer_of_identification": "statistics.identity.identify_answer",
-        "answer_of_regression": "statistics.regression_answer",
-        "answer_of_scores": "statistics.score_answer",
-        "answer_of_verification": "statistics.identity.verify_answer",
+        "analysis_report": "report.analyses.results",
         "html_of_additive_model": "report.notebook_results",
         "html_of_analysis": "report.notebook_results",
         "html_of_cohort": "report.notebook_results",
@@ -35,6 +31,7 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "plot_fit": "report.notebook",
         "plot_model": "report.notebook",
         "plot_quality": "report.notebook",
+        "save_analysis": "report.analyses.results",
         "save_fit": "batch.save",
         "to_menpo": "io.interop",
         "to_meshio": "io.interop",
@@ -61,6 +58,29 @@ class OpenViewer(Protocol):
         ...
 
 
+class SavedReport(Protocol):
+    """The report of an analysis: its sentences, and files."""
+
+    @property
+    def summary(self) -> tuple[str, ...]:
+        """The main results, a sentence each."""
+        ...
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the report to a folder, and return the path of analysis.json."""
+        ...
+
+
+@overload
+def lazy_import(name: Literal["analysis_report"]) -> Callable[[object], SavedReport]: ...
+@overload
+def lazy_import(name: Literal["save_analysis"]) -> Callable[[object, Path | str], Path]: ...
+@overload
+def lazy_import(
+    name: Literal["html_of_analysis", "html_of_predictions", "html_of_predictor"],
+) -> Callable[[object], str]: ...
+@overload
+def lazy_import(name: str) -> Callable[..., Any]: ...
 def lazy_import(name: str) -> Callable[..., Any]:
     """Return the function `name` of `LAZY_FUNCTIONS`."""
     return getattr(import_module(f"shapespace.{LAZY_FUNCTIONS[name]}"), name)

@@ -7,10 +7,10 @@ import pytest
 from pages import DESKTOP, PHONE
 from pictures import change, drawn_share
 
+from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.report.html import write_report
 from shapespace.schemas import Counts as CountsOf
 from shapespace.schemas import HistogramPart, MorphPart, SurfaceMapPart
-from shapespace.statistics.answer import Answer
 from synthetic_shapes import blob, sphere
 
 EVIL = "</script><script>window.wicked = true</script>"
@@ -27,7 +27,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     arrays = {"vertices": low, "faces": faces, "values": low[:, 1], "low": low, "high": high}
     folder = tmp_path_factory.mktemp("analysis")
-    Answer("compare", "An analysis", ("They differ.",), parts, arrays={"a.npz": arrays}).save(folder)
+    AnalysisReport("compare", "An analysis", ("They differ.",), parts, arrays={"a.npz": arrays}).save(folder)
     return write_report(folder)
 
 

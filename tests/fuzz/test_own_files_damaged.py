@@ -275,7 +275,7 @@ def learned(path: Path) -> Path:
     ways, rows, vertices = 4, 6, 5
     Predictor(
         target="age", gauge="form", model_hash="", method="pls", subjects=rows, lowest=1.0, highest=9.0,
-        farthest_mm=4.0, level=0.9, mean=np.ones((vertices, 3)), intercepts=np.zeros(ways),
+        farthest_mm=4.0, confidence=0.9, mean=np.ones((vertices, 3)), intercepts=np.zeros(ways),
         weights=np.zeros((ways, 3 * vertices)), residuals=np.ones(rows), fold=np.array([1, 2, 3, 1, 2, 3]),
         share=np.ones(rows),
     ).save(path)  # fmt: skip

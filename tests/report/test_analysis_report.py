@@ -16,6 +16,7 @@ from test_recognition_report import EVIL, words_under
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.report import figures
+from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
 from shapespace.report.recognition import MOST_ANALYSES
 from shapespace.report.scene import pack_morph
@@ -29,7 +30,6 @@ from shapespace.schemas import (
     SurfaceMapPart,
     TextPart,
 )
-from shapespace.statistics.answer import Answer
 from shapespace.types import Mesh
 
 PARTS: dict[str, Part] = {
@@ -58,9 +58,9 @@ def save(folder: Path, mesh: Mesh, parts: dict[str, Part] = PARTS, **known: Any)
         "low": mesh.vertices, "high": 1.1 * mesh.vertices, "cut": up[:-1],
     }  # fmt: skip
     given = {"summary": ("They differ.",), "notes": (NOTE,), "settings": {"seed": 3}, **known}
-    Answer("compare", f"Do they differ {EVIL}", parts=tuple(parts.values()), arrays={"a.npz": arrays}, **given).save(
-        folder
-    )
+    AnalysisReport(
+        "compare", f"Do they differ {EVIL}", parts=tuple(parts.values()), arrays={"a.npz": arrays}, **given
+    ).save(folder)
     return folder
 
 

@@ -12,6 +12,7 @@ from identity_people import cohort as people_cohort
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.io.meshes import write_mesh
+from shapespace.report.analyses.results import analysis_report
 from shapespace.report.figures import spectrum_figure
 from shapespace.statistics.predictor import Predictions
 from symmetric_object import symmetric_object
@@ -39,19 +40,17 @@ def shapes(n: int = 24, gauge: Literal["shape", "form"] = "shape") -> Cohort:
 def results() -> dict[str, object]:
     pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
     cohort, people, thing = shapes(), people_cohort(10, 3), symmetric_object()
-    identity = ss.IdentityOptions(folds=2, draws=20)
+    identity = ss.IdentityConfig(folds=2, draws=20)
     regression = ss.regress(cohort, "age", subject="subject", folds=3, permutations=3, draws=20)
     return {
         "cohort": cohort,
-        "comparison": ss.compare(cohort, "age + sex", ss.CompareOptions(permutations=20, maps=False)),
-        "change": ss.change(
-            shapes(gauge="form"), ss.ChangeSettings(time="visit", order=("one", "two"), permutations=20)
-        ),
+        "comparison": ss.compare(cohort, "age + sex", ss.CompareConfig(permutations=20, maps=False)),
+        "change": ss.change(shapes(gauge="form"), ss.ChangeConfig(time="visit", order=("one", "two"), permutations=20)),
         "asymmetry": ss.measure_asymmetry(cohort, subject="subject", pairs=thing.pairs, permutations=19),
         "regression": regression,
         "predictor": regression.predictor,
         "predictions": Predictions((EVIL,), np.ones(1), np.zeros(1), np.ones(1), ("",)),
-        "scores": ss.score(cohort, shapes(4), ss.ScoreOptions(modes=3, draws=2)),
+        "scores": ss.score(cohort, shapes(4), ss.ScoreConfig(modes=3, draws=2)),
         "verification": ss.verify(people, identity),
         "identification": ss.identify(people, identity),
         "model": blob_model(60),
@@ -95,7 +94,7 @@ def test_a_notebook_shows_a_result_as_a_page_in_which_everything_is_text(results
 def test_the_page_of_an_analysis_says_what_its_report_says_first(results: dict[str, object], kind: str) -> None:
     from html import escape
 
-    answer, page = results[kind].answer(), results[kind]._repr_html_()  # type: ignore[attr-defined]
+    answer, page = analysis_report(results[kind]), results[kind]._repr_html_()  # type: ignore[attr-defined]
     assert escape(answer.summary[0], quote=False) in page.replace("&#39;", "'").replace("&#34;", '"')
     assert "<table" in page
 

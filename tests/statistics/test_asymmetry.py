@@ -18,8 +18,15 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.mirror import find_mirror, mirror_pairs
 from shapespace.geometry.surface import face_vectors, vertex_normals
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report.analyses.results import analysis_report
 from shapespace.schemas import read_part
-from shapespace.statistics.asymmetry import ERROR_ASYMMETRIC, ERROR_SYMMETRIC, Scores, first_pattern, measure_asymmetry
+from shapespace.statistics.asymmetry import (
+    ERROR_ASYMMETRIC,
+    ERROR_SYMMETRIC,
+    AsymmetryScores,
+    first_pattern,
+    measure_asymmetry,
+)
 from shapespace.statistics.sides import find_sides, given_sides, read_pairs
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 from symmetric_object import FLIP, Symmetric, cohort_of, posed, symmetric_object
@@ -138,7 +145,7 @@ def test_what_fits_know_of_themselves_makes_intervals_that_hold_the_truth(thing:
     b = rng.standard_normal((150, model.n_modes)) * model.stddev
     stddev = np.full_like(b, 0.1 * float(np.linalg.norm(model.stddev)) / np.sqrt(model.n_modes))
 
-    def measured(b: np.ndarray) -> Scores:
+    def measured(b: np.ndarray) -> AsymmetryScores:
         names = [f"fit {k}" for k in range(len(b))]
         fitted = Fitted(model, read_only(b), read_only(stddev), ("converged",) * len(b), "fits")
         cohort = Cohort.of_fits(fitted, names, Table({}, tuple(names)), read_only(np.full(len(b), np.nan)))
@@ -297,14 +304,14 @@ def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:
     found = measure_asymmetry(named, pairs=pairs, permutations=9)
     assert len(found.sides) == 6 and found.normals is None
     assert "are left out" in found.sides.notes[0]
-    answer = found.answer()
+    answer = analysis_report(found)
     points = next(p for p in answer.parts if p.title == "Points")
     assert {row[0] for row in points.rows} >= {"left", "right", "chin"}  # type: ignore[attr-defined]
 
 
 def test_landmarks_without_a_unit_are_never_in_mm_and_the_methods_name_each_test(thing: Symmetric) -> None:
     found = measure_asymmetry(replace(people(thing, 6, 2, 3), unit=""), pairs=thing.pairs, permutations=9)
-    answer = found.answer()
+    answer = analysis_report(found)
     assert not any(re.search(r"\bmm\b|mm²", sentence) for sentence in answer.summary)
     assert not any(head.endswith(("_mm", "_mm2")) for header, _ in answer.tables.values() for head in header)
     schemes = {one.tested: (one.resampling, one.arrangements) for one in found.methods.tests}
@@ -315,10 +322,10 @@ def test_landmarks_without_a_unit_are_never_in_mm_and_the_methods_name_each_test
 
 
 def test_the_answer_can_be_read_and_says_what_is_not_known(thing: Symmetric, tmp_path: Path) -> None:
-    once = measure_asymmetry(people(thing, 6, 1, 3), pairs=thing.pairs, permutations=9).answer()
+    once = analysis_report(measure_asymmetry(people(thing, 6, 1, 3), pairs=thing.pairs, permutations=9))
     assert "No subject was measured twice" in " ".join(once.summary)
     assert any("6 subjects are few" in note for note in once.notes)
-    twice = measure_asymmetry(people(thing, 20, 2, 3), pairs=thing.pairs, permutations=9).answer()
+    twice = analysis_report(measure_asymmetry(people(thing, 20, 2, 3), pairs=thing.pairs, permutations=9))
     assert "fluctuating asymmetry" in twice.summary[2] and not twice.notes
     path = twice.save(tmp_path)
     told = json.loads(path.read_text())

@@ -16,13 +16,14 @@ from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
+from shapespace.report.analyses.results import analysis_report
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
-from shapespace.statistics.change import Change, change
+from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_align import align_by, align_robustly
-from shapespace.statistics.change_found import ChangeSettings
-from shapespace.statistics.change_group import difference_test, mean_test
-from shapespace.statistics.change_maps import aligned, swept_mm3, volume_mm3
+from shapespace.statistics.change_maps import align_visits, swept_mm3, volume_mm3
+from shapespace.statistics.change_result import ChangeConfig
 from shapespace.statistics.change_visits import visits_of
+from shapespace.statistics.map_tests import difference_test, mean_test
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob, blob_model, sphere
 
@@ -81,8 +82,8 @@ def pairs(
     return cohort_of(scans, told)
 
 
-def asked(cohort: Cohort, **settings: object) -> Change:
-    return change(cohort, ChangeSettings(order=ORDER, **settings))  # type: ignore[arg-type]
+def asked(cohort: Cohort, **settings: object) -> ChangeResult:
+    return change(cohort, ChangeConfig(order=ORDER, **settings))  # type: ignore[arg-type]
 
 
 # Alignment and maps
@@ -170,7 +171,7 @@ def test_a_surface_that_grew_as_a_whole_tells_its_volume_and_share() -> None:
     scans = [mesh.vertices, 1.02 * mesh.vertices, person(1).vertices, nearly]
     cohort = cohort_of(scans, {"subject": ["a", "a", "b", "b"], "visit": ["before", "after"] * 2})
     grown = asked(cohort, stable="all").by_name["a"]
-    assert grown.change.volumes_mm3[0] / grown.before_mm3 == pytest.approx(1.02**3 - 1, rel=1e-6)
+    assert grown.change.volumes_mm3[0] / grown.volume_before_mm3 == pytest.approx(1.02**3 - 1, rel=1e-6)
     still = asked(cohort, stable="all").by_name["b"]
     assert still.rms_mm < 1e-3 and abs(still.change.volumes_mm3[0]) < 10
 
@@ -179,7 +180,7 @@ def test_regions_and_landmarks_tell_where_it_changed() -> None:
     near = np.flatnonzero(bump() > 0.05)
     far = np.flatnonzero(bump() < 0.01)
     found = asked(pairs([3.0 * bump()] * 2, noise_mm=0.02), regions={"nose": near, "rest": far})
-    assert found.parts == ("whole", "nose", "rest")
+    assert found.regions == ("whole", "nose", "rest")
     for subject in found.subjects:
         whole, nose, rest = subject.change.volumes_mm3
         assert abs(rest) < 0.05 * nose and whole == pytest.approx(nose, rel=0.1)
@@ -196,9 +197,14 @@ def test_a_landmark_between_vertices_moves_as_its_place_in_the_triangle_does() -
     one, three = (asked(replace(cohort, landmarks=marks), stable="all") for marks in (whole, corners))
     for subject, parts in zip(one.subjects, three.subjects, strict=True):
         np.testing.assert_allclose(subject.change.landmarks_mm[0], weights @ parts.change.landmarks_mm, atol=1e-12)
-    assert one.group_landmarks is not None and one.repeatability is not None and three.repeatability is not None
+    assert (
+        one.mean_change is not None
+        and one.mean_change.landmarks is not None
+        and one.repeatability is not None
+        and three.repeatability is not None
+    )
     maps = np.stack([subject.change.along_mm[face] @ weights for subject in one.subjects])
-    np.testing.assert_allclose(one.group_landmarks.effect, [maps.mean()])
+    np.testing.assert_allclose(one.mean_change.landmarks.effect, [maps.mean()])
     # Noise of a weighted mean is at most the weighted mean of the noise.
     within = three.repeatability.landmarks_within_mm
     assert 0.3 * within.min() < one.repeatability.landmarks_within_mm[0] < weights @ within
@@ -213,8 +219,8 @@ def test_the_smallest_detectable_change_is_the_formula_by_brute_force() -> None:
     assert found is not None and (found.scans, found.visits, found.freedom) == (12, 6, 6)
     squares, moved, volumes = np.zeros(V), 0.0, 0.0
     visits = visits_of(cohort.table, "subject", None, ORDER)
-    for own in visits.of.values():
-        subject = aligned(cohort, own, np.arange(V, dtype=np.int32))
+    for own in visits.by_subject.values():
+        subject = align_visits(cohort, own, np.arange(V, dtype=np.int32))
         base = subject.means[0]
         for scans in subject.scans:
             for v in range(V):
@@ -247,8 +253,8 @@ def test_the_intraclass_correlation_is_that_of_an_analysis_of_variance() -> None
     assert found is not None
     area = vertex_areas(Mesh(cohort.reference, cohort.faces))
     groups: list[FloatArray] = []
-    for own in visits_of(cohort.table, "subject", None, ORDER).of.values():
-        scans = aligned(cohort, own, np.arange(V, dtype=np.int32)).scans[0]
+    for own in visits_of(cohort.table, "subject", None, ORDER).by_subject.values():
+        scans = align_visits(cohort, own, np.arange(V, dtype=np.int32)).scans[0]
         T = fit_similarity(scans.mean(axis=0), cohort.reference, area, with_scale=False)
         groups.append(np.stack([T.apply(scan) for scan in scans]))
     grand = np.concatenate(groups).mean(axis=0)
@@ -277,8 +283,8 @@ def fitted_pairs(subjects: int, stddev_mm: float, stated_mm: float) -> Cohort:
 
 def test_standard_deviations_of_fits_are_the_spread_that_their_coefficients_make() -> None:
     found = asked(fitted_pairs(150, 4.0, 4.0), stable="landmarks:back,100", permutations=1)
-    assert found.uncertainty == "fits" and found.model_only
-    assert any("--surfaces dense" in note for note in found.answer().notes)
+    assert found.uncertainty == "fits" and found.is_model_only
+    assert any("--surfaces dense" in note for note in analysis_report(found).notes)
     observed = np.sqrt(np.mean([one.change.along_mm**2 for one in found.subjects], axis=0))
     told = np.sqrt(np.mean([one.change.stddev_mm**2 for one in found.subjects], axis=0))
     largest = told > 0.3 * told.max()
@@ -306,7 +312,7 @@ def test_without_rescans_it_says_so_and_goes_by_the_stable_part() -> None:
     for subject in found.subjects:
         assert np.ptp(subject.change.stddev_mm) == 0 and subject.change.stddev_mm[0] == pytest.approx(0.28, abs=0.08)
         assert np.isnan(subject.change.volumes_stddev_mm3[0])
-    assert any("no rescans" in sentence for sentence in found.answer().summary)
+    assert any("no rescans" in sentence for sentence in analysis_report(found).summary)
 
 
 # Series
@@ -323,16 +329,16 @@ def test_a_series_gives_rates_and_dates_give_years() -> None:
     })  # fmt: skip
     weights = bump()
     for time, per_unit, unit in (("date", 0.5, "year"), ("months", 0.5 / 12, "unit of months")):
-        found = change(cohort, ChangeSettings(time=time, rate=True, stable="landmarks:back,90"))
+        found = change(cohort, ChangeConfig(time=time, rate=True, stable="landmarks:back,90"))
         for subject in found.subjects:
             assert subject.rate is not None
             assert weights @ subject.rate.along_mm / (weights @ weights) == pytest.approx(
                 per_unit, rel=0.12 if subject.name == "b" else 0.02
             )
-        assert found.unit == unit and found.group is not None
-        assert found.group.effect[TIP] == pytest.approx(per_unit, rel=0.15)
+        assert found.time_unit == unit and found.mean_change is not None
+        assert found.mean_change.surface.effect[TIP] == pytest.approx(per_unit, rel=0.15)
     assert [visit.label for visit in found.by_name["a"].visits] == ["0", "12", "24", "48"]
-    assert any(part.title == "Over time" for part in found.answer().parts)
+    assert any(part.title == "Over time" for part in analysis_report(found).parts)
 
 
 # Groups
@@ -388,11 +394,15 @@ def test_treatment_against_control_is_found_where_it_is() -> None:
     arms = ["treated"] * 5 + ["control"] * 5
     cohort = pairs([(1.0 if arm == "treated" else 0.0) * bump() for arm in arms], noise_mm=0.1, arm=arms)
     found = asked(cohort, group="arm", permutations=300)
-    assert not found.model_only
-    assert found.groups == ("control", "treated") and found.between is not None and found.between_volumes is not None
-    assert found.between.effect[TIP] == pytest.approx(1.0, abs=0.2)
-    assert found.between.p[TIP] <= 0.05 and found.between.omnibus_p <= 0.02 and found.between_volumes.p[0] <= 0.02
-    assert (found.between.p[bump() < 0.01] <= 0.05).mean() < 0.05
+    assert not found.is_model_only
+    assert found.group_difference is not None and found.group_difference.groups == ("control", "treated")
+    assert found.group_difference.surface.effect[TIP] == pytest.approx(1.0, abs=0.2)
+    assert (
+        found.group_difference.surface.p[TIP] <= 0.05
+        and found.group_difference.surface.omnibus_p <= 0.02
+        and found.group_difference.volumes.p[0] <= 0.02
+    )
+    assert (found.group_difference.surface.p[bump() < 0.01] <= 0.05).mean() < 0.05
     assert {subject.name: subject.group for subject in found.subjects}["s9"] == "control"
 
 
@@ -404,7 +414,7 @@ def test_the_answer_is_the_same_by_its_seed_and_its_parts_are_bounded(tmp_path: 
     cohort = pairs([k / 5 * bump() for k in range(10)], rescans=True, arm=arms)
     told = []
     for folder in ("one", "two"):
-        answer = asked(cohort, group="arm", permutations=50, seed=4, stable="all").answer()
+        answer = analysis_report(asked(cohort, group="arm", permutations=50, seed=4, stable="all"))
         path, parts = answer.save(tmp_path / folder), answer.parts
         told.append({**json.loads(path.read_text()), "created": ""})
     assert told[0] == told[1]
@@ -427,7 +437,7 @@ def test_a_noisy_change_is_drawn_as_a_part_so_that_no_triangle_turns_over() -> N
     noise = np.random.default_rng(5).normal(0, 12.0, (V, 3))
     x = person(1).vertices
     found = asked(cohort_of([x, x + noise], {"subject": ["a", "a"], "time": ["before", "after"]}), stable="all")
-    answer = found.answer()
+    answer = analysis_report(found)
     [morph] = [part for part in answer.parts if isinstance(part, MorphPart)]
     arrays = answer.arrays["change.npz"]
     low, high, faces = (arrays[name] for name in (morph.low, morph.high, morph.faces))
@@ -441,7 +451,7 @@ def test_a_noisy_change_is_drawn_as_a_part_so_that_no_triangle_turns_over() -> N
 
 @pytest.mark.parametrize(("mm", "unit"), [(2.0, "ml"), (0.002, "mm³")])
 def test_volumes_below_a_tenth_of_a_millilitre_are_stated_in_cubic_millimetres(mm: float, unit: str) -> None:
-    answer = asked(pairs([mm * bump() for _ in range(4)], rescans=True, noise_mm=0.002)).answer()
+    answer = analysis_report(asked(pairs([mm * bump() for _ in range(4)], rescans=True, noise_mm=0.002)))
     assert any(f" {unit} on average" in sentence for sentence in answer.summary)
     tables = [part for part in answer.parts if isinstance(part, TablePart) and part.title == "Subjects"]
     columns = [column.name for table in tables for column in table.columns]
@@ -459,16 +469,26 @@ def uneven(arms: int = 16) -> Cohort:
 def test_unequal_dispersion_of_two_groups_is_a_warning_in_the_summary_and_the_analysis(tmp_path: Path) -> None:
     found = asked(uneven(), group="arm", permutations=199, stable="all")
     (one,) = found.methods.dispersions
-    assert not one.equal and one.smaller_is_more_variable and one.counts == (12, 4) and found.dispersion is not None
-    answer = found.answer()
+    assert (
+        not one.equal
+        and one.smaller_is_more_variable
+        and one.counts == (12, 4)
+        and found.group_difference is not None
+        and found.group_difference.dispersion is not None
+    )
+    answer = analysis_report(found)
     (warning,) = [sentence for sentence in answer.summary if sentence.startswith("Warning: dispersion")]
     assert "differences are found that do not exist" in warning and "--unequal-variances" in warning
     kept = json.loads(answer.save(tmp_path).read_text())
     assert kept["methods"]["dispersions"][0]["equal"] is False
     allowed = asked(uneven(), group="arm", permutations=199, stable="all", unequal_variances=True)
-    assert allowed.between is not None and allowed.between.unequal_variances
-    assert not [sentence for sentence in allowed.answer().summary if sentence.startswith("Warning: dispersion")]
-    assert allowed.between.omnibus_p > found.between.omnibus_p if found.between is not None else False
+    assert allowed.group_difference is not None and allowed.group_difference.surface.unequal_variances
+    assert not [sentence for sentence in analysis_report(allowed).summary if sentence.startswith("Warning: dispersion")]
+    assert (
+        allowed.group_difference.surface.omnibus_p > found.group_difference.surface.omnibus_p
+        if found.group_difference is not None
+        else False
+    )
 
 
 def test_the_methods_count_subjects_of_each_group_and_name_each_test() -> None:
@@ -480,7 +500,7 @@ def test_the_methods_count_subjects_of_each_group_and_name_each_test() -> None:
         ("permutation", "t"),
     ]
     assert found.methods.unit == "mm" and found.methods.unequal_variances is False
-    last = [part.title for part in found.answer().parts][-4:]
+    last = [part.title for part in analysis_report(found).parts][-4:]
     assert last == ["Methods", "Sample sizes", "Tests", "Equal dispersion of groups"]
 
 
@@ -496,8 +516,8 @@ def test_an_interval_of_a_map_holds_the_effect_and_not_0_where_p_is_small() -> N
 
 def test_one_subject_alone_has_maps_and_no_test() -> None:
     found = asked(pairs([2 * bump()], rescans=True))
-    assert found.group is None
-    assert any(isinstance(part, MorphPart) for part in found.answer().parts)
+    assert found.mean_change is None
+    assert any(isinstance(part, MorphPart) for part in analysis_report(found).parts)
     before, after = found.surfaces("s0")
     assert before.vertices.shape == after.vertices.shape == (V, 3)
 
@@ -513,7 +533,7 @@ def cells(**columns: Sequence[object]) -> Cohort:
 
 def refusal(cohort: Cohort, **settings: object) -> str:
     with pytest.raises(InputError) as caught:
-        change(cohort, ChangeSettings(**settings))  # type: ignore[arg-type]
+        change(cohort, ChangeConfig(**settings))  # type: ignore[arg-type]
     text = str(caught.value)
     assert text.endswith(".") and ". " not in text, text
     return text
@@ -524,8 +544,8 @@ PAIR = {"subject": [*"aabb"], "visit": ["before", "after"] * 2}
 
 def test_subjects_with_one_visit_are_counted_and_left_out() -> None:
     found = asked(cells(subject=[*"aabbc"], visit=[*["before", "after"] * 2, "before"]))
-    assert found.single == ("c",) and len(found.subjects) == 2
-    assert "1 of 3 subjects are left out, who have one visit (c)." in found.answer().notes
+    assert found.single_visit_subjects == ("c",) and len(found.subjects) == 2
+    assert "1 of 3 subjects are left out, who have one visit (c)." in analysis_report(found).notes
     assert "none of its 3 subjects has two visits" in refusal(cells(subject=[*"abc"], visit=[1, 1, 1]))
 
 
@@ -589,4 +609,4 @@ def test_a_stable_region_is_read_from_a_file_and_found_in_the_model(tmp_path: Pa
     model = replace(fits.fitted.model, regions={"back": far.astype(np.int32)})
     named = asked(replace(fits, fitted=replace(fits.fitted, model=model)), stable="back")
     np.testing.assert_array_equal(np.flatnonzero(named.subjects[0].stable), far)
-    assert named.parts == ("whole", "back")
+    assert named.regions == ("whole", "back")

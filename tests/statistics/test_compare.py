@@ -15,9 +15,11 @@ from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report.analyses.compare import compare_warnings
+from shapespace.report.analyses.results import analysis_report
 from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps
-from shapespace.statistics.compare import CompareOptions, SquaresType, compare
+from shapespace.statistics.compare import CompareConfig, SquaresType, compare
 from shapespace.statistics.compare_formula import FUNCTIONS, design_of, random_effects_of
 from shapespace.statistics.compare_within import strata_of
 from shapespace.statistics.effect_size import EFFECT_SIZES, effect_size
@@ -25,7 +27,7 @@ from shapespace.types import FloatArray, IntArray, Mesh
 
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 
-QUICK = CompareOptions(permutations=20, maps=False)
+QUICK = CompareConfig(permutations=20, maps=False)
 SIDE = 6
 
 
@@ -107,7 +109,7 @@ FORMULAS = {
 def test_sums_of_squares_r2_and_f_are_those_of_plain_least_squares(formula: str, squares: SquaresType) -> None:
     table, terms = people(), FORMULAS[formula]
     shapes = cohort(table)
-    found = compare(shapes, formula, CompareOptions(anova_type=squares, permutations=20, maps=False))
+    found = compare(shapes, formula, CompareConfig(anova_type=squares, permutations=20, maps=False))
     columns = pieces(table, terms)
     flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
     total = left(flat, [])[0]
@@ -120,9 +122,9 @@ def test_sums_of_squares_r2_and_f_are_those_of_plain_least_squares(formula: str,
         expected = (without - with_it, (without - with_it) / total, (without - with_it) / df / (error / df_error))
         assert test.df == df
         np.testing.assert_allclose((test.squares, test.r2, test.f), expected, rtol=1e-8)
-    assert found.remainders[0].df == df_error
-    np.testing.assert_allclose(found.remainders[0].squares, error, rtol=1e-8)
-    np.testing.assert_allclose(found.remainders[0].squares_total, total, rtol=1e-8)
+    assert found.strata[0].df == df_error
+    np.testing.assert_allclose(found.strata[0].squares, error, rtol=1e-8)
+    np.testing.assert_allclose(found.strata[0].squares_total, total, rtol=1e-8)
 
 
 @pytest.mark.parametrize("squares", ["I", "II", "III"])
@@ -137,7 +139,7 @@ def test_one_number_a_shape_gives_the_tables_of_statsmodels(squares: SquaresType
     shapes = points + y[:, None, None] * np.eye(3)[2] * (np.arange(len(points)) == 7)[:, None]
     found = compare(
         Cohort.of_shapes(shapes, table, align=False), "~ sex * age + site",
-        CompareOptions(anova_type=squares, permutations=20, maps=False),
+        CompareConfig(anova_type=squares, permutations=20, maps=False),
     )  # fmt: skip
     fitted = smf.ols("y ~ C(sex, Sum) * age + C(site, Sum)", pandas.DataFrame({**table, "y": y})).fit()
     expected = anova.anova_lm(fitted, typ=("I", "II", "III").index(squares) + 1)
@@ -154,7 +156,7 @@ def test_p_and_z_are_those_of_a_plain_loop_over_permuted_residuals() -> None:
     table = people(30)
     shift = 0.35 * (np.array(table["sex"]) == "male")[:, None, None] * np.ones((1, SIDE * SIDE, 1)) * [0, 0, 1]
     shapes = cohort(table, shift)
-    test = compare(shapes, "~ age + sex", CompareOptions(permutations=2000, maps=False)).test("sex")
+    test = compare(shapes, "~ age + sex", CompareConfig(permutations=2000, maps=False)).test("sex")
     flat = np.stack([shapes.vertices(k).ravel() for k in range(len(shapes))])
     columns = pieces(table, [("age",), ("sex",)])
     x0 = np.hstack([np.ones((30, 1)), columns["age",]])
@@ -174,9 +176,9 @@ def test_p_and_z_are_those_of_a_plain_loop_over_permuted_residuals() -> None:
 def test_a_seed_gives_the_same_numbers_and_another_one_others() -> None:
     shapes = cohort(people())
     one, same, other = (
-        compare(shapes, "~ sex + age", CompareOptions(permutations=100, seed=seed)) for seed in (3, 3, 4)
+        compare(shapes, "~ sex + age", CompareConfig(permutations=100, seed=seed)) for seed in (3, 3, 4)
     )
-    assert json_text(one.answer().analysis().parts) == json_text(same.answer().analysis().parts)
+    assert json_text(analysis_report(one).analysis().parts) == json_text(analysis_report(same).analysis().parts)
     for a, b in zip(one.effects, same.effects, strict=True):
         assert a.map is not None and b.map is not None
         np.testing.assert_array_equal(a.map.shown.p_family, b.map.shown.p_family)
@@ -187,7 +189,7 @@ def test_a_seed_gives_the_same_numbers_and_another_one_others() -> None:
 def test_the_observed_arrangement_counts_so_no_p_is_zero() -> None:
     table = people()
     shift = 30.0 * (np.array(table["sex"]) == "male")[:, None, None] * np.ones((1, SIDE * SIDE, 3))
-    found = compare(cohort(table, shift), "~ sex", CompareOptions(permutations=50))
+    found = compare(cohort(table, shift), "~ sex", CompareConfig(permutations=50))
     assert found.test("sex").p == 1 / 50
     assert found.effects[0].map is not None
     assert found.effects[0].map.any_way.p_family.min() == 1 / 50
@@ -212,13 +214,13 @@ def repeated(subjects: int, scans: int, seed: int, between: float = 1.0, within:
 
 def test_a_difference_of_subjects_is_tested_on_their_means() -> None:
     table, noise = repeated(14, 3, 0)
-    found = compare(cohort(table, noise, stddev=0.0), "~ sex", CompareOptions(blocks="subject", permutations=20))
+    found = compare(cohort(table, noise, stddev=0.0), "~ sex", CompareConfig(blocks="subject", permutations=20))
     means = noise.reshape(14, 3, -1).mean(axis=1)
     sex = coded(table["sex"][::3])
     (without, df), (with_it, df_error) = left(means, []), left(means, [sex])
     test = found.test("sex")
     assert test.stratum == "between subject"
-    assert (found.remainders[0].df, found.remainders[0].df_total) == (df_error, df) == (12, 13)
+    assert (found.strata[0].df, found.strata[0].df_total) == (df_error, df) == (12, 13)
     np.testing.assert_allclose(
         (test.squares, test.f), (without - with_it, (without - with_it) / (with_it / df_error)), rtol=1e-8
     )
@@ -226,9 +228,7 @@ def test_a_difference_of_subjects_is_tested_on_their_means() -> None:
 
 def test_a_difference_of_scans_is_tested_within_subjects() -> None:
     table, noise = repeated(9, 4, 1)
-    found = compare(
-        cohort(table, noise, stddev=0.0), "~ sex * smile", CompareOptions(blocks="subject", permutations=20)
-    )
+    found = compare(cohort(table, noise, stddev=0.0), "~ sex * smile", CompareConfig(blocks="subject", permutations=20))
     # Two scans of each smile are one observation of it.
     flat = noise.reshape(9, 2, 2, -1).mean(axis=1).reshape(18, -1)
     cells = {name: np.array(table[name]).reshape(9, 2, 2)[:, 0].ravel().tolist() for name in ("sex", "smile")}
@@ -242,7 +242,7 @@ def test_a_difference_of_scans_is_tested_within_subjects() -> None:
     assert [one.stratum for one in found.tests] == ["between subject", *["within subject: smile"] * 2]
     np.testing.assert_allclose(test.squares, without - with_it, rtol=1e-8)
     np.testing.assert_allclose(test.f, (without - with_it) / error, rtol=1e-8)
-    assert found.remainders[1].df == df == 7
+    assert found.strata[1].df == df == 7
 
 
 def test_cells_are_permuted_only_within_their_subject_where_all_respond_alike() -> None:
@@ -269,7 +269,7 @@ def test_repeated_scans_taken_for_independent_find_what_is_not_there_and_blocks_
     for seed in range(40):
         table, noise = repeated(12, 4, seed)
         for blocks in found:
-            options = CompareOptions(blocks=blocks, permutations=60, maps=False)
+            options = CompareConfig(blocks=blocks, permutations=60, maps=False)
             found[blocks] += compare(cohort(table, noise, stddev=0.0), "~ sex", options).test("sex").p <= 0.05
     assert found["subject"] <= 6
     assert found[None] >= 20
@@ -277,19 +277,19 @@ def test_repeated_scans_taken_for_independent_find_what_is_not_there_and_blocks_
 
 def test_that_repeated_scans_are_taken_for_independent_is_said() -> None:
     table, noise = repeated(8, 2, 0)
-    assert any("--blocks subject" in one for one in compare(cohort(table, noise), "~ sex", QUICK).warnings)
+    assert any("--blocks subject" in one for one in compare_warnings(compare(cohort(table, noise), "~ sex", QUICK)))
 
 
 def test_that_few_arrangements_differ_is_said() -> None:
     table = {"sex": ["female", "female", "male", "male"], "subject": list("abcd")}
-    assert any("only 6 arrangements" in one for one in compare(cohort(table), "~ sex", QUICK).warnings)
-    assert not compare(cohort(people()), "~ sex", QUICK).warnings
+    assert any("only 6 arrangements" in one for one in compare_warnings(compare(cohort(table), "~ sex", QUICK)))
+    assert not compare_warnings(compare(cohort(people()), "~ sex", QUICK))
 
 
 def test_type_iii_with_an_interaction_says_where_it_tests() -> None:
-    options = CompareOptions(anova_type="III", permutations=20, maps=False)
-    assert any("center(age)" in one for one in compare(cohort(people()), "~ sex * age", options).warnings)
-    assert not compare(cohort(people()), "~ sex * center(age)", options).warnings
+    options = CompareConfig(anova_type="III", permutations=20, maps=False)
+    assert any("center(age)" in one for one in compare_warnings(compare(cohort(people()), "~ sex * age", options)))
+    assert not compare_warnings(compare(cohort(people()), "~ sex * center(age)", options))
 
 
 def test_subjects_who_lack_a_smile_do_not_seem_to_differ_by_it() -> None:
@@ -299,11 +299,11 @@ def test_subjects_who_lack_a_smile_do_not_seem_to_differ_by_it() -> None:
     # All men but one lack half of their smiles.
     kept = [k for k in range(48) if not (table["sex"][k] == "male" and smile[k] and k % 4 == 1)]
     kept_table = {name: [cells[k] for k in kept] for name, cells in table.items()}
-    options = CompareOptions(blocks="subject", permutations=20, maps=False)
+    options = CompareConfig(blocks="subject", permutations=20, maps=False)
     whole = compare(cohort(table, shown, stddev=0.0), "~ sex + smile", options).test("sex")
     found = compare(cohort(kept_table, shown[kept], stddev=0.0), "~ sex + smile", options)
     np.testing.assert_allclose(found.test("sex").squares, whole.squares, rtol=0.05)
-    assert any("2 to 4" in one or "3 to 4" in one for one in found.warnings)
+    assert any("2 to 4" in one or "3 to 4" in one for one in compare_warnings(found))
 
 
 # Maps and effects.
@@ -314,7 +314,7 @@ def test_maps_are_those_of_a_plain_test_at_each_vertex(monkeypatch: pytest.Monke
     monkeypatch.setattr(compare_maps, "_BYTES", 7 * 3 * 8 * 2 * 11)
     table = people(25)
     shapes = cohort(table)
-    found = compare(shapes, "~ age + sex", CompareOptions(permutations=60)).effects[1]
+    found = compare(shapes, "~ age + sex", CompareConfig(permutations=60)).effects[1]
     stratum = strata_of(shapes.coefficients, design_of("~ age + sex", shapes.table), None, "").every[0]
     every = np.stack([shapes.vertices(k) for k in range(25)])
     normals = vertex_normals(Mesh(every.mean(axis=0), shapes.faces))
@@ -351,7 +351,7 @@ def test_a_change_that_was_put_in_comes_back_where_and_as_large_as_it_is() -> No
     male = (np.array(table["sex"]) == "male")[:, None, None]
     older = (np.array(table["age"]) - 40.0)[:, None, None] / 10
     effect = male * where[:, None] * [0, 0, 3.0] + older * ~where[:, None] * [2.0, 0, 0]
-    found = compare(cohort(table, effect, stddev=0.5), "~ sex + age", CompareOptions(permutations=200))
+    found = compare(cohort(table, effect, stddev=0.5), "~ sex + age", CompareConfig(permutations=200))
     sex, age = found.effects
     assert sex.map is not None and age.map is not None
     assert sex.label == "sex female to male"
@@ -368,7 +368,7 @@ def test_a_change_that_was_put_in_comes_back_where_and_as_large_as_it_is() -> No
 def test_pairs_of_three_groups_are_compared_and_the_family_of_them_held() -> None:
     table = people(60)
     c = (np.array(table["site"]) == "c")[:, None, None] * np.ones((1, SIDE * SIDE, 1)) * [0, 0, 2.0]
-    found = compare(cohort(table, c), "~ site", CompareOptions(permutations=200, maps=False)).effects
+    found = compare(cohort(table, c), "~ site", CompareConfig(permutations=200, maps=False)).effects
     assert [one.label for one in found] == ["site a to b", "site a to c", "site b to c"]
     assert found[0].p > 0.05 > max(found[1].p_family, found[2].p_family)
     assert all(one.p_family >= one.p for one in found)
@@ -379,7 +379,7 @@ def test_slopes_that_are_parallel_are_told_from_those_that_are_not() -> None:
     table = people(80)
     age = (np.array(table["age"]) - 40.0)[:, None, None] / 10 * np.ones((1, SIDE * SIDE, 1))
     male = (np.array(table["sex"]) == "male")[:, None, None]
-    options = CompareOptions(permutations=200, maps=False)
+    options = CompareConfig(permutations=200, maps=False)
     same = compare(cohort(table, age * [1.0, 0, 0]), "~ sex * age", options)
     other = compare(cohort(table, age * np.where(male, [1.0, 0, 0], [0, 1.0, 0])), "~ sex * age", options)
     angles = [next(one for one in found.angles if one.p is not None) for found in (same, other)]
@@ -396,7 +396,7 @@ def test_allometry_finds_that_larger_shapes_are_of_another_shape() -> None:
     shapes = size[:, None, None] * points + rng.normal(size=(40, len(points), 3)) * 0.3
     shapes[..., 2] += 10 * (size - 1)[:, None] * np.sin(points[:, 0] / 10)
     found = compare(
-        Cohort.of_shapes(shapes, {"age": range(40)}, faces=faces), "~ log_size", CompareOptions(permutations=100)
+        Cohort.of_shapes(shapes, {"age": range(40)}, faces=faces), "~ log_size", CompareConfig(permutations=100)
     )
     assert found.test("log_size").p == 0.01
     assert found.effects[0].map is not None
@@ -406,14 +406,14 @@ def test_points_without_triangles_are_tested_by_the_length_of_their_change() -> 
     points, _ = surface()
     table = people(30)
     shapes = points + np.random.default_rng(0).normal(size=(30, len(points), 3))
-    found = compare(Cohort.of_shapes(shapes, table, align=False), "~ sex", CompareOptions(permutations=50))
+    found = compare(Cohort.of_shapes(shapes, table, align=False), "~ sex", CompareConfig(permutations=50))
     assert found.effects[0].map is not None and found.effects[0].map.along is None
-    assert {type(part).__struct_config__.tag for part in found.answer().parts} <= set(PARTS)
+    assert {type(part).__struct_config__.tag for part in analysis_report(found).parts} <= set(PARTS)
 
 
 def test_an_answer_is_written_with_all_that_its_parts_name(tmp_path: Path) -> None:
-    found = compare(cohort(people()), "~ sex * age", CompareOptions(permutations=50))
-    answer = found.answer()
+    found = compare(cohort(people()), "~ sex * age", CompareConfig(permutations=50))
+    answer = analysis_report(found)
     assert answer.save(tmp_path).name == Analysis.FILE
     for part in answer.parts:
         file = getattr(part, "arrays", "")
@@ -462,7 +462,7 @@ def test_a_formula_runs_nothing_and_ends_in_a_sentence(
     assert not list(tmp_path.iterdir())
 
 
-def refused(table: dict[str, Any], formula: str, *words: str, options: CompareOptions = QUICK) -> None:
+def refused(table: dict[str, Any], formula: str, *words: str, options: CompareConfig = QUICK) -> None:
     with pytest.raises(InputError) as caught:
         compare(cohort(table), formula, options)
     text = str(caught.value)
@@ -513,9 +513,9 @@ def test_tables_and_formulas_that_cannot_be_are_refused(formula: str, words: tup
 
 def test_missing_rows_are_left_out_when_asked_and_said() -> None:
     table = people() | {"holes": [None, None, *people()["age"][2:]]}
-    found = compare(cohort(table), "~ holes", CompareOptions(permutations=20, maps=False, drop_missing=True))
+    found = compare(cohort(table), "~ holes", CompareConfig(permutations=20, maps=False, drop_missing=True))
     assert len(found.cohort) == 35
-    assert any("2 of 37" in note for note in found.answer().notes)
+    assert any("2 of 37" in note for note in analysis_report(found).notes)
 
 
 def test_sizes_that_are_not_known_are_asked_for() -> None:
@@ -526,16 +526,16 @@ def test_sizes_that_are_not_known_are_asked_for() -> None:
 
 def test_blocks_that_cannot_be_are_refused() -> None:
     table = people() | {"who": ["anna"] * 37, "pair": [f"p{k // 19}" for k in range(37)]}
-    of = {name: CompareOptions(blocks=name, permutations=20, maps=False) for name in ("who", "pair", "nobody")}
+    of = {name: CompareConfig(blocks=name, permutations=20, maps=False) for name in ("who", "pair", "nobody")}
     refused(table, "~ sex", "one who", options=of["who"])
     refused(table, "~ pair", "too many", "between pair", options=of["pair"])
     refused(table, "~ sex", "'nobody'", options=of["nobody"])
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    for wrong in ({"permutations": 5}, {"seed": -1}, {"level": 0.0}, {"anova_type": "IV"}):
+    for wrong in ({"permutations": 5}, {"seed": -1}, {"alpha": 0.0}, {"anova_type": "IV"}):
         with pytest.raises(InputError):
-            CompareOptions(**wrong)  # pyright: ignore[reportArgumentType]
+            CompareConfig(**wrong)  # pyright: ignore[reportArgumentType]
 
 
 def test_what_a_formula_may_call_is_called() -> None:
@@ -548,7 +548,7 @@ def test_what_a_formula_may_call_is_called() -> None:
     found = compare(cohort(table), "~ C(group)", QUICK)
     assert found.tests[0].df == 9
     assert len(found.effects) == 15
-    assert any("pairs of the first 6" in one for one in found.warnings)
+    assert any("pairs of the first 6" in one for one in compare_warnings(found))
 
 
 # Bumps.
@@ -575,7 +575,7 @@ def fits_with_a_bump(mm: float, seed: int = 0) -> tuple[Cohort, FloatArray]:
 
 def test_a_bump_is_found_where_it_is_though_shapes_vary_more_than_it() -> None:
     shapes, near = fits_with_a_bump(1.0)
-    made = compare(shapes, "~ group", CompareOptions(permutations=200, bump_width_mm=8.0)).effects[0].map
+    made = compare(shapes, "~ group", CompareConfig(permutations=200, bump_width_mm=8.0)).effects[0].map
     assert made is not None and made.bump is not None and made.bump_mm is not None and made.along is not None
     assert not (made.along.p_family <= 0.05).any()
     found = made.bump.p_family <= 0.05
@@ -588,7 +588,7 @@ def test_no_bump_is_found_where_there_is_none() -> None:
     found = 0
     for seed in range(20):
         shapes, _ = fits_with_a_bump(0.0, seed)
-        made = compare(shapes, "~ group", CompareOptions(permutations=20, bump_width_mm=8.0)).effects[0].map
+        made = compare(shapes, "~ group", CompareConfig(permutations=20, bump_width_mm=8.0)).effects[0].map
         assert made is not None and made.bump is not None
         found += bool((made.bump.p_family <= 0.05).any())
     assert found <= 4
@@ -610,7 +610,7 @@ def unequal_groups(spread: float = 2.0, seed: int = 0, effect: float = 0.0) -> C
 
 def test_with_unequal_variances_f_of_two_classes_is_the_squared_welch_t_of_the_whole_and_of_each_vertex() -> None:
     shapes = unequal_groups()
-    found = compare(shapes, "~ sex", CompareOptions(permutations=20, unequal_variances=True))
+    found = compare(shapes, "~ sex", CompareConfig(permutations=20, unequal_variances=True))
     flat = np.stack([shapes.vertices(k) for k in range(24)])
     one, other = flat[:6], flat[6:]
     variance = one.var(axis=0, ddof=1) / 6 + other.var(axis=0, ddof=1) / 18
@@ -635,17 +635,17 @@ def test_a_covariate_and_three_classes_keep_their_estimates_with_unequal_varianc
 
 
 def test_unequal_dispersion_warns_unless_the_test_allows_it_and_stands_in_the_analysis() -> None:
-    found = compare(unequal_groups(), "~ sex + age", CompareOptions(permutations=200, maps=False))
+    found = compare(unequal_groups(), "~ sex + age", CompareConfig(permutations=200, maps=False))
     (test,) = found.dispersions
     assert test.variable == "sex" and test.p <= 0.01 and test.ratio == pytest.approx(2.0, abs=0.3)
-    assert found.warnings[0].startswith("Warning: dispersion is unequal")
-    assert "differences are found that do not exist" in found.warnings[0]
-    analysis = json.loads(json_text(found.answer().analysis()))
-    assert analysis["methods"]["dispersions"][0]["equal"] is False and found.warnings[0] in analysis["summary"]
-    allowed = CompareOptions(permutations=200, maps=False, unequal_variances=True)
-    assert not [one for one in compare(unequal_groups(), "~ sex", allowed).warnings if "ispersion" in one]
-    equal = compare(unequal_groups(1.0), "~ sex", CompareOptions(permutations=200, maps=False))
-    assert equal.methods.dispersions[0].equal and not [one for one in equal.warnings if "ispersion" in one]
+    assert compare_warnings(found)[0].startswith("Warning: dispersion is unequal")
+    assert "differences are found that do not exist" in compare_warnings(found)[0]
+    analysis = json.loads(json_text(analysis_report(found).analysis()))
+    assert analysis["methods"]["dispersions"][0]["equal"] is False and compare_warnings(found)[0] in analysis["summary"]
+    allowed = CompareConfig(permutations=200, maps=False, unequal_variances=True)
+    assert not [one for one in compare_warnings(compare(unequal_groups(), "~ sex", allowed)) if "ispersion" in one]
+    equal = compare(unequal_groups(1.0), "~ sex", CompareConfig(permutations=200, maps=False))
+    assert equal.methods.dispersions[0].equal and not [one for one in compare_warnings(equal) if "ispersion" in one]
 
 
 def test_groups_coded_as_two_numbers_are_groups() -> None:
@@ -657,7 +657,7 @@ def test_groups_coded_as_two_numbers_are_groups() -> None:
         (one,), (other,) = by_words.dispersions, by_numbers.dispersions
         assert (other.counts, other.p) == (one.counts, one.p) and other.groups == ("1", "2")
         np.testing.assert_allclose(other.stddev_mm, one.stddev_mm, rtol=1e-9)
-        assert len(by_numbers.warnings) == len(by_words.warnings)
+        assert len(compare_warnings(by_numbers)) == len(compare_warnings(by_words))
         np.testing.assert_allclose(by_numbers.tests[0].arrangements, by_words.tests[0].arrangements, rtol=1e-6)
         assert [size.subjects for size in by_numbers.methods.sizes] == [
             size.subjects for size in by_words.methods.sizes
@@ -672,8 +672,8 @@ def test_a_rare_one_of_two_numbers_is_compared_with_the_other() -> None:
 
 def test_the_number_of_arrangements_is_that_of_sign_flips_with_unequal_variances() -> None:
     table = {"group": ["a"] * 2 + ["b"] * 2}
-    assert any("only 6 arrangements" in one for one in compare(cohort(table), "~ group", QUICK).warnings)
-    flipped = compare(cohort(table), "~ group", replace(QUICK, unequal_variances=True)).warnings
+    assert any("only 6 arrangements" in one for one in compare_warnings(compare(cohort(table), "~ group", QUICK)))
+    flipped = compare_warnings(compare(cohort(table), "~ group", replace(QUICK, unequal_variances=True)))
     assert any("only 8 arrangements" in one for one in flipped)
 
 
@@ -691,8 +691,8 @@ def test_random_terms_may_stand_in_brackets() -> None:
 
 def test_unequal_variances_warn_about_a_class_of_fewer_than_five() -> None:
     shapes = unequal_groups().take(range(2, 24))
-    found = compare(shapes, "~ sex", CompareOptions(permutations=40, maps=False, unequal_variances=True))
-    assert found.warnings[0].startswith("Warning: sex has a class of 4 subjects")
+    found = compare(shapes, "~ sex", CompareConfig(permutations=40, maps=False, unequal_variances=True))
+    assert compare_warnings(found)[0].startswith("Warning: sex has a class of 4 subjects")
 
 
 def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_variances() -> None:
@@ -708,7 +708,7 @@ def test_means_of_subjects_and_their_contrasts_between_groups_allow_unequal_vari
     noise = 0.3 * rng.normal(size=(56, *points.shape))
     shapes = points + noise + own[np.arange(56) // 4, (np.arange(56) // 2) % 2]
     given = Cohort.of_shapes(shapes, table, align=False)
-    options = CompareOptions(blocks="subject", permutations=40, maps=False, unequal_variances=True)
+    options = CompareConfig(blocks="subject", permutations=40, maps=False, unequal_variances=True)
     found = compare(given, "~ sex * visit", options)
     assert [(one.variable, one.stratum) for one in found.dispersions] == [
         ("sex", "between subject"), ("sex", "within subject: visit")
@@ -735,7 +735,9 @@ def test_the_methods_name_the_sample_the_residuals_and_the_unit() -> None:
     reduced = {one.tested: one.reduced_model for one in methods.tests}
     assert reduced["sex",] == ("site", "age") and reduced["sex:site",] == ("sex", "site", "age")
     assert {one.resampling for one in methods.tests} == {"permutation"} and methods.r2_strata == ("",)
-    (stated,) = [part for part in found.answer().parts if isinstance(part, TextPart) and part.title == "Methods"]
+    (stated,) = [
+        part for part in analysis_report(found).parts if isinstance(part, TextPart) and part.title == "Methods"
+    ]
     text = " ".join(stated.text)
     for words in ("37 shapes of 37 subjects", "Exchangeability", "R² is the share", "Box-Cox", "Lengths are in mm"):
         assert words in text
@@ -748,8 +750,8 @@ def test_lengths_of_landmarks_without_a_unit_are_never_mm() -> None:
     scaled = scaled - scaled.mean(axis=1, keepdims=True)
     scaled /= np.linalg.norm(scaled, axis=(1, 2), keepdims=True)
     table = {name: list(values) for name, values in shapes.table.columns.items() if name in ("sex", "age")}
-    found = compare(Cohort.of_shapes(scaled, table, faces=shapes.faces), "~ sex + age", CompareOptions(permutations=40))
-    answer = found.answer()
+    found = compare(Cohort.of_shapes(scaled, table, faces=shapes.faces), "~ sex + age", CompareConfig(permutations=40))
+    answer = analysis_report(found)
     assert found.cohort.unit == "" and not any(re.search(r"\bmm", one) for one in answer.summary)
     parts = json_text([replace_arrays(part) for part in answer.parts])
     assert not re.search(r"\bmm\b|mm²", parts) and "no unit" in parts
@@ -766,12 +768,12 @@ def replace_arrays(part: Any) -> Any:
 
 def test_a_map_is_exploratory_unless_its_term_is_significant_and_has_an_interval() -> None:
     def sentences(effect: float, seed: int) -> list[str]:
-        found = compare(unequal_groups(1.0, seed, effect), "~ sex", CompareOptions(permutations=200, level=0.05))
-        return [one for one in found.answer().summary if "of the vertices differ" in one]
+        found = compare(unequal_groups(1.0, seed, effect), "~ sex", CompareConfig(permutations=200, alpha=0.05))
+        return [one for one in analysis_report(found).summary if "of the vertices differ" in one]
 
     (shown,) = sentences(2.0, 0)
     assert "exploratory" not in shown and re.search(r"simultaneous 95 % interval [+-]\d.* to [+-]\d", shown)
-    found = compare(unequal_groups(1.0), "~ sex", CompareOptions(permutations=200))
+    found = compare(unequal_groups(1.0), "~ sex", CompareConfig(permutations=200))
     (effect,) = found.effects
     assert effect.exploratory == (found.test("sex").p > 0.05)
     assert effect.map is not None
@@ -788,4 +790,4 @@ def test_z_by_logarithms_is_an_option() -> None:
     for kind, test in found.items():
         assert test.z == effect_size(test.arrangements, kind)
     with pytest.raises(InputError, match="no effect size 'cube'"):
-        CompareOptions(effect_size="cube")  # type: ignore[arg-type]
+        CompareConfig(effect_size="cube")  # type: ignore[arg-type]

@@ -9,7 +9,8 @@ import pytest
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
-from shapespace.statistics.compare import CompareOptions, Comparison, compare, term_tests
+from shapespace.report.analyses.results import analysis_report
+from shapespace.statistics.compare import CompareConfig, CompareResult, compare, term_tests
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.compare_within import strata_of
 from shapespace.types import FloatArray
@@ -17,7 +18,7 @@ from shapespace.types import FloatArray
 pytest.importorskip("formulaic", reason="the extra `statistics` is not installed")
 
 V = 12
-BLOCKS = CompareOptions(blocks="subject", permutations=100, maps=False)
+BLOCKS = CompareConfig(blocks="subject", permutations=100, maps=False)
 
 
 def table(subjects: int, conditions: dict[str, int], scans: int = 1, numbers: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -40,7 +41,9 @@ def noise(count: int, seed: int = 0) -> FloatArray:
     return np.random.default_rng([4, seed]).normal(size=(count, V, 3))
 
 
-def compared(shapes: FloatArray, columns: dict[str, Any], formula: str, options: CompareOptions = BLOCKS) -> Comparison:
+def compared(
+    shapes: FloatArray, columns: dict[str, Any], formula: str, options: CompareConfig = BLOCKS
+) -> CompareResult:
     return compare(Cohort.of_shapes(shapes, columns, align=False), formula, options)
 
 
@@ -61,7 +64,7 @@ def test_p_of_two_visits_is_the_share_of_all_sign_flips() -> None:
     d = noise(8, 1) + 0.2
     visits = np.stack([noise(8, 2), np.zeros_like(d)], axis=1)
     visits[:, 1] = visits[:, 0] + d
-    options = CompareOptions(blocks="subject", permutations=4000, maps=False)
+    options = CompareConfig(blocks="subject", permutations=4000, maps=False)
     found = compared(visits.reshape(16, V, 3) + 30 * noise(1, 3), table(8, {"visit": 2}), "~ visit", options)
     flat = d.reshape(8, -1)
     drawn = np.array([np.sum((np.array(s) @ flat) ** 2) for s in itertools.product((1.0, -1.0), repeat=8)])
@@ -120,9 +123,9 @@ def test_growth_is_tested_on_the_slopes_of_subjects() -> None:
 
 def test_an_interaction_with_groups_is_the_one_way_test_of_difference_shapes() -> None:
     shapes, columns = noise(20), table(10, {"visit": 2})
-    found = compared(shapes, columns, "~ sex * visit", CompareOptions(blocks="subject", permutations=2000, maps=False))
+    found = compared(shapes, columns, "~ sex * visit", CompareConfig(blocks="subject", permutations=2000, maps=False))
     change = shapes[1::2] - shapes[::2] + 30 * noise(1, 3)
-    alone = compared(change, {"sex": columns["sex"][::2]}, "~ sex", CompareOptions(permutations=2000, maps=False)).test(
+    alone = compared(change, {"sex": columns["sex"][::2]}, "~ sex", CompareConfig(permutations=2000, maps=False)).test(
         "sex"
     )
     np.testing.assert_allclose(found.test("sex:visit").f, alone.f, rtol=1e-9)
@@ -143,13 +146,13 @@ def test_repeated_scans_of_a_condition_are_one_observation_of_it() -> None:
         np.testing.assert_allclose((a.f, a.p, a.squares), (b.f, b.p, b.squares), rtol=1e-9)
     for a, b in zip(one.effects, two.effects, strict=True):
         np.testing.assert_allclose((a.f, a.p, a.distance_mm), (b.f, b.p, b.distance_mm), rtol=1e-9)
-    assert any("48 shapes are averaged to 24 cells" in note for note in two.answer().notes)
+    assert any("48 shapes are averaged to 24 cells" in note for note in analysis_report(two).notes)
 
 
 def test_tests_within_subjects_do_not_depend_on_what_subjects_are_like() -> None:
     shapes, columns = noise(30), table(10, {"visit": 3})
     own = 50.0 * np.repeat(noise(10, 7), 3, axis=0)
-    one, other = (compared(made, columns, "~ sex * visit", CompareOptions(blocks="subject", permutations=50))
+    one, other = (compared(made, columns, "~ sex * visit", CompareConfig(blocks="subject", permutations=50))
                   for made in (shapes, shapes + own))  # fmt: skip
     for term in ("visit", "sex:visit"):
         np.testing.assert_allclose(one.test(term).arrangements, other.test(term).arrangements, rtol=1e-6)
@@ -206,16 +209,16 @@ def test_all_effects_within_subjects_are_random_unless_others_are_given() -> Non
     shapes, columns = noise(50), table(10, {"time": 5}, numbers=("time",))
     blocks = compared(shapes, columns, "~ sex * time")
     random = compared(
-        shapes, columns, "~ sex * time", CompareOptions(random="1 + time | subject", permutations=100, maps=False)
+        shapes, columns, "~ sex * time", CompareConfig(random="1 + time | subject", permutations=100, maps=False)
     )
     for one, other in zip(blocks.tests, random.tests, strict=True):
         np.testing.assert_array_equal(one.arrangements, other.arrangements)
-    assert random.answer().settings["random"] == "1 + time | subject"
+    assert analysis_report(random).settings["random"] == "1 + time | subject"
 
 
 def test_effects_that_are_assumed_alike_are_tested_on_the_cells_and_the_answer_says_so() -> None:
     y = np.random.default_rng(9).normal(size=(8, 4))
-    options = CompareOptions(random="1 | subject", permutations=60, maps=False)
+    options = CompareConfig(random="1 | subject", permutations=60, maps=False)
     found = compared(of_numbers(y.ravel()), table(8, {"visit": 4}), "~ sex * visit", options)
     inside = y - y.mean(axis=1, keepdims=True)
     each = np.stack([inside[::2].mean(axis=0), inside[1::2].mean(axis=0)])
@@ -223,18 +226,18 @@ def test_effects_that_are_assumed_alike_are_tested_on_the_cells_and_the_answer_s
     interaction = 4 * np.sum((each - mean) ** 2)
     error = (np.sum(inside**2) - 8 * np.sum(mean**2) - interaction) / (24 - 6)
     np.testing.assert_allclose(found.test("visit").f, 8 * np.sum(mean**2) / 3 / error, rtol=1e-9)
-    assert any("assumed to respond alike to visit" in one for one in found.answer().summary)
+    assert any("assumed to respond alike to visit" in one for one in analysis_report(found).summary)
 
 
 def test_an_effect_is_alike_beside_slopes_that_are_not() -> None:
     columns = table(12, {"time": 3, "pose": 2}, numbers=("time",))
     slopes = np.repeat(noise(12, 20), 6, axis=0) * np.array(columns["time"])[:, None, None]
     pose = np.array([cell == "c1" for cell in columns["pose"]])[:, None, None]
-    options = CompareOptions(random="1 + time | subject", permutations=100, maps=False)
+    options = CompareConfig(random="1 + time | subject", permutations=100, maps=False)
     found = compared(noise(72) + slopes + pose * 0.6 * noise(1, 21), columns, "~ time + pose", options)
     assert found.test("pose").stratum == "within subject"
     assert found.test("time").stratum == "within subject: time"
-    assert found.remainders[1].df == 12 * 4 - 1
+    assert found.strata[1].df == 12 * 4 - 1
     assert found.test("pose").p == 0.01
 
 
@@ -252,7 +255,7 @@ def test_an_effect_is_alike_beside_slopes_that_are_not() -> None:
 )
 def test_random_terms_that_cannot_be_are_refused(random: str, words: tuple[str, ...]) -> None:
     with pytest.raises(InputError) as caught:
-        compared(noise(18), table(6, {"time": 3}, numbers=("time",)), "~ sex * time", CompareOptions(random=random))
+        compared(noise(18), table(6, {"time": 3}, numbers=("time",)), "~ sex * time", CompareConfig(random=random))
     assert all(word in str(caught.value) for word in words), caught.value
 
 
@@ -270,7 +273,7 @@ def test_subjects_without_all_conditions_are_left_out_of_their_test_and_counted(
     complete = [row for row in range(20) if row not in (0, 1, 4, 5)]
     alone = compared(shapes[complete], without(table(10, {"visit": 2}), [0, 1, 4, 5])[0], "~ visit")
     np.testing.assert_allclose(found.test("visit").f, alone.test("visit").f, rtol=1e-9)
-    assert any("2 of 10 subjects lack conditions" in one for one in found.answer().summary)
+    assert any("2 of 10 subjects lack conditions" in one for one in analysis_report(found).summary)
 
 
 def test_a_pair_of_conditions_uses_all_subjects_that_have_both() -> None:
@@ -317,7 +320,7 @@ def test_adjusting_for_conditions_of_subjects_finds_a_difference_and_is_said() -
     np.testing.assert_allclose(
         found.cohort.vertices(sex.at_high) - found.cohort.vertices(sex.at_low), 2.0 * noise(1, 30)[0], atol=0.5
     )
-    assert any("means of smile per subject are covariates" in note for note in found.answer().notes)
+    assert any("means of smile per subject are covariates" in note for note in analysis_report(found).notes)
 
 
 @pytest.mark.parametrize(

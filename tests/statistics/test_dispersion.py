@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from shapespace.errors import InputError
-from shapespace.statistics.change_group import difference_test
 from shapespace.statistics.dispersion import UnequalVariances, dispersion_test, unequal_variances
+from shapespace.statistics.map_tests import difference_test
 from shapespace.types import FloatArray
 
 STUDIES = 150
@@ -28,7 +28,9 @@ def one_way(counts: tuple[int, ...]) -> tuple[np.ndarray, FloatArray, FloatArray
 
 def flips(shapes: FloatArray, counts: tuple[int, ...], permutations: int = 40, seed: int = 0) -> UnequalVariances:
     codes, mean, full = one_way(counts)
-    return unequal_variances(shapes, full, mean, codes, permutations, seed, "group")
+    return unequal_variances(
+        shapes=shapes, full=full, reduced=mean, groups=codes, permutations=permutations, seed=seed, where="group"
+    )
 
 
 def test_the_statistic_of_two_groups_is_the_squared_distance_by_its_welch_variance() -> None:
@@ -57,7 +59,9 @@ def test_each_sign_flip_is_that_of_a_plain_loop_over_refitted_models() -> None:
     reduced = np.linalg.qr(np.column_stack([np.ones(20), age]))[0]
     own = np.linalg.qr(whole - reduced @ (reduced.T @ whole))[0][:, 1:3]
     own = np.linalg.svd(whole - reduced @ (reduced.T @ whole), full_matrices=False)[0][:, :2]
-    made = unequal_variances(shapes, whole, reduced, codes, 30, 5, "group")
+    made = unequal_variances(
+        shapes=shapes, full=whole, reduced=reduced, groups=codes, permutations=30, seed=5, where="group"
+    )
     estimate = made.estimate(own)
     found = estimate.statistic()
     at_vertices = np.concatenate([estimate.statistic_of(np.eye(6), 3, start, start + 10) for start in (0, 10, 20)])
@@ -77,8 +81,12 @@ def test_each_sign_flip_is_that_of_a_plain_loop_over_refitted_models() -> None:
 def test_the_observed_statistic_does_not_depend_on_the_weights_of_the_reduced_model() -> None:
     shapes = np.random.default_rng(3).normal(size=(12, 5))
     codes, mean, full = one_way((4, 8))
-    weighted = unequal_variances(shapes, full, mean, codes, 20, 0, "group")
-    plain = unequal_variances(shapes, full, mean, None, 20, 0, "group")
+    weighted = unequal_variances(
+        shapes=shapes, full=full, reduced=mean, groups=codes, permutations=20, seed=0, where="group"
+    )
+    plain = unequal_variances(
+        shapes=shapes, full=full, reduced=mean, groups=None, permutations=20, seed=0, where="group"
+    )
     own = full[:, 1:]
     np.testing.assert_allclose(weighted.estimate(own).statistic()[0], plain.estimate(own).statistic()[0], rtol=1e-10)
     assert not np.allclose(weighted.residual, plain.residual)
@@ -105,7 +113,9 @@ def rejected(counts: tuple[int, ...], spread: tuple[float, ...], *, standard: bo
             f = explained / ((residual**2).sum(axis=0) - explained)
             whole = explained.sum(axis=1)
         else:
-            made = unequal_variances(shapes, full, full[:, :1], codes, 100, study, "group").estimate(own)
+            made = unequal_variances(
+                shapes=shapes, full=full, reduced=full[:, :1], groups=codes, permutations=100, seed=study, where="group"
+            ).estimate(own)
             whole, f = made.statistic(), made.statistic_of(np.eye(30), 3, 0, 100)
         found += [(whole >= whole[0] * (1 - 1e-9)).mean() <= 0.05, (f.max(axis=1) >= f[0].max()).mean() <= 0.05]
     share = found / STUDIES
@@ -127,7 +137,16 @@ def test_equal_dispersions_are_rejected_at_the_level_and_unequal_ones_found() ->
     for study, spread in itertools.product(range(STUDIES), p):
         shapes = np.random.default_rng([study, 1]).normal(size=(40, 12)) * np.where(codes == 0, spread, 1.0)[:, None]
         residual = shapes - full @ (full.T @ shapes)
-        found = dispersion_test("sex", residual, leverage, codes, ("f", "m"), 4, 99, study)
+        found = dispersion_test(
+            variable="sex",
+            residual=residual,
+            leverage=leverage,
+            codes=codes,
+            groups=("f", "m"),
+            n_vertices=4,
+            permutations=99,
+            seed=study,
+        )
         assert found is not None
         p[spread].append(found.p)
     assert np.mean(np.array(p[1.0]) <= 0.05) <= 0.05 + 2.5 * (0.05 * 0.95 / STUDIES) ** 0.5
@@ -138,13 +157,34 @@ def test_dispersions_are_standard_deviations_about_the_group_mean_and_classes_of
     codes, _, full = one_way((3, 8, 1))
     shapes = np.random.default_rng(4).normal(size=(12, 6)) * np.array([4.0, 1.0, 1.0])[codes][:, None]
     residual = shapes - full @ (full.T @ shapes)
-    found = dispersion_test("site", residual, (full**2).sum(axis=1), codes, ("a", "b", "c"), 2, 50, 0)
+    found = dispersion_test(
+        variable="site",
+        residual=residual,
+        leverage=(full**2).sum(axis=1),
+        codes=codes,
+        groups=("a", "b", "c"),
+        n_vertices=2,
+        permutations=50,
+        seed=0,
+    )
     assert found is not None and found.groups == ("a", "b") and found.counts == (3, 8)
     expected = [np.sqrt(shapes[codes == k].var(axis=0, ddof=1).sum() / 2) for k in (0, 1)]
     np.testing.assert_allclose(found.stddev_mm, expected, rtol=1e-10)
     assert found.ratio == pytest.approx(expected[0] / expected[1])
     assert found.smaller_is_more_variable is True
-    assert dispersion_test("site", residual[:4] * 0, np.zeros(4), codes[:4], ("a", "b"), 2, 50, 0) is None
+    assert (
+        dispersion_test(
+            variable="site",
+            residual=residual[:4] * 0,
+            leverage=np.zeros(4),
+            codes=codes[:4],
+            groups=("a", "b"),
+            n_vertices=2,
+            permutations=50,
+            seed=0,
+        )
+        is None
+    )
 
 
 def test_dispersions_and_their_p_are_those_of_morphol_disparity(shared_data: Path) -> None:
@@ -159,7 +199,16 @@ def test_dispersions_and_their_p_are_those_of_morphol_disparity(shared_data: Pat
     counts = np.bincount(codes)
     residual = shapes - np.stack([shapes[codes == k].mean(axis=0) for k in range(4)])[codes]
     names = tuple(expected["groups"])
-    found = dispersion_test("group", residual, 1 / counts[codes], codes, names, 12, 999, 0)
+    found = dispersion_test(
+        variable="group",
+        residual=residual,
+        leverage=1 / counts[codes],
+        codes=codes,
+        groups=names,
+        n_vertices=12,
+        permutations=999,
+        seed=0,
+    )
     assert found is not None
     # Theirs is divided by n, ours by n - 1.
     np.testing.assert_allclose(12 * np.array(found.stddev_mm) ** 2 * (counts - 1) / counts, expected["var"], rtol=1e-6)

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.statistics.compare import CompareOptions, SquaresType, compare
+from shapespace.statistics.compare import CompareConfig, SquaresType, compare
 from shapespace.statistics.effect_size import box_cox_exponent, effect_size
 
 MONTE_CARLO = 0.35
@@ -67,7 +67,7 @@ def test_published_z_of_plethodon_are_reproduced(squares: SquaresType, reference
     table = {name: data["plethodon_table"][name] for name in ("species", "site")}
     cohort = Cohort.of_shapes(shapes, table, align=False)
     expected = data["plethodon_lm_raw_landmark_gpa"][f"pleth_{squares}"]
-    options = CompareOptions(anova_type=squares, permutations=10_000, maps=False)
+    options = CompareConfig(anova_type=squares, permutations=10_000, maps=False)
     found = compare(cohort, "~ species * site", options)
     for term, z, log in zip(expected["terms"], expected["Z"], expected["zlog"], strict=True):
         test = found.test(term)

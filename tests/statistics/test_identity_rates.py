@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import binomtest, norm
 
 from shapespace.errors import InputError
-from shapespace.statistics.identity.identify import Searches, identified, search
-from shapespace.statistics.identity.rates import Pairs, Sweep, figure, people_drawn, resampled
-from shapespace.statistics.identity.rounds import IdentityOptions
-from shapespace.statistics.identity.verify import verified
+from shapespace.statistics.identity.identify import Searches, identification_rates, search
+from shapespace.statistics.identity.rates import Pairs, Sweep, people_drawn, rate_estimate, resampled
+from shapespace.statistics.identity.trial import IdentityConfig
+from shapespace.statistics.identity.verify import verification_rates
 
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 
@@ -123,7 +123,7 @@ def test_an_interval_over_people_covers_the_truth():
             lambda w, s=sweep: s.roc(w).tar_at(np.array([0.1])),
             1,
         )
-        told = figure(float(sweep.roc().tar_at(0.1)), drawn[:, 0])
+        told = rate_estimate(float(sweep.roc().tar_at(0.1)), drawn[:, 0])
         truth = norm.cdf((2 - norm.ppf(0.9)) / np.sqrt(2))
         covered += told.low <= truth <= told.high
     assert covered >= 20
@@ -132,18 +132,18 @@ def test_an_interval_over_people_covers_the_truth():
 @pytest.mark.parametrize("n", [1, 12, 300])
 def test_no_error_among_people_has_the_interval_of_clopper_and_pearson(n):
     exact = binomtest(0, n).proportion_ci(0.95, method="exact")
-    found = figure(0.0, np.zeros(50), n)
+    found = rate_estimate(0.0, np.zeros(50), n)
     assert (found.low, found.high) == (0.0, pytest.approx(exact.high, rel=1e-9))
-    found = figure(1.0, np.ones(50), n)
+    found = rate_estimate(1.0, np.ones(50), n)
     assert (found.low, found.high) == (pytest.approx(1 - exact.high, rel=1e-9), 1.0)
-    assert figure(0.0, [], n) == figure(0.0, np.zeros(50), n), "no draw is needed"
+    assert rate_estimate(0.0, [], n) == rate_estimate(0.0, np.zeros(50), n), "no draw is needed"
 
 
 def test_few_errors_are_no_better_known_than_none_and_many_keep_their_interval():
-    none, few = figure(0.0, np.zeros(50), 100), figure(0.001, np.linspace(0, 0.003, 50), 100)
+    none, few = rate_estimate(0.0, np.zeros(50), 100), rate_estimate(0.001, np.linspace(0, 0.003, 50), 100)
     assert few.low == pytest.approx(0, abs=1e-4) and few.high == none.high
     drawn = np.random.default_rng(0).normal(0.2, 0.02, 500)
-    assert figure(0.2, drawn, 100) == figure(0.2, drawn)
+    assert rate_estimate(0.2, drawn, 100) == rate_estimate(0.2, drawn)
 
 
 def test_an_interval_of_rare_errors_covers_the_truth():
@@ -154,7 +154,7 @@ def test_an_interval_of_rare_errors_covers_the_truth():
         shares = rng.binomial(20, rates) / 20
         drawn = (rng.multinomial(30, np.full(30, 1 / 30), size=100) @ shares) / 30
         for people in (None, 30):
-            told = figure(float(shares.mean()), drawn, people)
+            told = rate_estimate(float(shares.mean()), drawn, people)
             covers = told.low <= 0.02 <= told.high
             alone, exact = alone + (people is None and covers), exact + (people == 30 and covers)
     assert exact >= 0.93 * 300 and alone < 0.7 * 300
@@ -169,7 +169,7 @@ def test_perfect_verification_and_identification_state_an_upper_bound_everywhere
     pairs, score = perfect()
     people = people_drawn(np.ones(20, dtype=bool), 20, 0)
     chosen = {"all": np.ones(len(pairs), dtype=bool)}
-    found = verified("cosine", score, pairs, np.arange(20, dtype=np.int32) % 4, people, chosen=chosen)
+    found = verification_rates("cosine", score, pairs, np.arange(20, dtype=np.int32) % 4, people, chosen=chosen)
     bound = binomtest(0, 20).proportion_ci(0.95, method="exact").high
     for eer, tar in ((found.eer, found.tar), (found.by["all"].eer, found.by["all"].tar)):
         assert (eer.value, eer.low, eer.high) == (0.0, 0.0, pytest.approx(bound))
@@ -177,14 +177,14 @@ def test_perfect_verification_and_identification_state_an_upper_bound_everywhere
         assert known and all((one.low, one.high) == (pytest.approx(1 - bound), 1.0) for one in known)
     assert found.band[0, -1] == pytest.approx(1 - bound) and found.band[1, -1] == 1.0
     searches = search(np.eye(20)[:, np.repeat(np.arange(20), 2)], np.arange(20), np.repeat(np.arange(20), 2))
-    ranks = identified("cosine", searches, 20, people)
+    ranks = identification_rates("cosine", searches, 20, people)
     assert (ranks.rank_1.low, ranks.rank_1.high) == (pytest.approx(1 - bound), 1.0)
     assert ranks.fnir[0.1].high == pytest.approx(bound) and ranks.band[0, 0] == pytest.approx(1 - bound)
 
 
 def test_the_former_name_of_the_plda_score_still_works_and_warns():
     with pytest.warns(DeprecationWarning, match="'likelihood-ratio' is now called 'plda'"):
-        assert IdentityOptions(scores=("likelihood-ratio", "cosine")).scores == ("plda", "cosine")
+        assert IdentityConfig(scores=("likelihood-ratio", "cosine")).scores == ("plda", "cosine")
 
 
 def test_the_same_seed_draws_the_same_people_and_only_those_tested():

@@ -11,15 +11,16 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.model.additive import AdditiveModel
+from shapespace.report.analyses.results import analysis_report
 from shapespace.schemas import Analysis
 from shapespace.statistics.identity.identify import identify
-from shapespace.statistics.identity.rounds import IdentityOptions, rows_of, trial_of
 from shapespace.statistics.identity.samples import samples_of
+from shapespace.statistics.identity.trial import IdentityConfig, rows_of, trial_of
 from shapespace.statistics.identity.verify import verify
 
 pytest.importorskip("sklearn", reason="the extra `statistics` is not installed")
 
-FEW = IdentityOptions(draws=20)
+FEW = IdentityConfig(draws=20)
 
 
 def names_of(trial, rows):
@@ -131,7 +132,7 @@ def test_scans_of_nobody_are_refused_or_left_out():
         verify(shapes, FEW)
     found = verify(shapes, replace(FEW, drop_missing=True))
     assert len(found.trial.cohort) == 35
-    assert any("left out" in note for note in found.answer().notes)
+    assert any("left out" in note for note in analysis_report(found).notes)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def test_a_rate_that_the_pairs_cannot_show_is_not_stated(found):
     assert 100 < impostors < 1000
     assert found.scores[0].tar[1e-3].value is None
     assert found.scores[0].tar[1e-2].value is not None
-    assert any("30 are wanted" in note for note in found.answer().notes)
+    assert any("30 are wanted" in note for note in analysis_report(found).notes)
 
 
 def test_the_same_seed_gives_the_same_and_another_parts_the_people_anew():
@@ -209,7 +210,7 @@ def test_surfaces_without_fits_are_whitened_by_people_who_are_not_tested():
 def test_identification_enrols_the_first_scan_of_each_person_and_says_so():
     found = identify(cohort(), FEW)
     assert found.enrolled == 3 and found.probes == 24 and found.trained_on == 9
-    assert any("first scan of each subject" in note for note in found.answer().notes)
+    assert any("first scan of each subject" in note for note in analysis_report(found).notes)
     by_hand = identify(cohort(), replace(FEW, gallery="expression=neutral"))
     np.testing.assert_array_equal(found.scores[0].cmc, by_hand.scores[0].cmc)
     assert found.scores[0].cmc[-1] == 1.0 and (np.diff(found.scores[0].cmc) >= 0).all()
@@ -221,12 +222,12 @@ def test_strangers_are_those_who_are_not_enrolled():
     searches = found.scores[0].searches
     assert found.enrolled == 4 and (~searches.enrolled).sum() == 6
     assert found.scores[0].fnir[0.01].value is None
-    assert not any("Nobody is a stranger" in note for note in found.answer().notes)
+    assert not any("Nobody is a stranger" in note for note in analysis_report(found).notes)
 
 
 @pytest.mark.parametrize("ask", [verify, identify])
 def test_an_answer_is_kept_with_all_that_it_depends_on(ask, tmp_path):
-    ask(cohort(), replace(FEW, gallery="expression=neutral", seed=5)).answer().save(tmp_path)
+    analysis_report(ask(cohort(), replace(FEW, gallery="expression=neutral", seed=5))).save(tmp_path)
     told = json.loads((tmp_path / "analysis.json").read_text())
     assert told["settings"]["seed"] == 5 and told["settings"]["gallery"] == "expression=neutral"
     assert Analysis.FILE == "analysis.json" and told["question"].startswith("recognise ")

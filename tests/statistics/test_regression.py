@@ -14,12 +14,12 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table, numbers_as_text
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report.analyses.methods import scheme_text
+from shapespace.report.analyses.regression import prediction_report, regression_report
 from shapespace.schemas import read_part
-from shapespace.statistics.linear_regressors import Choice, Decomposed, folds_of
-from shapespace.statistics.methods_answer import scheme_text
+from shapespace.statistics.linear_regressors import Regularisation, TrainingDecomposition, folds_of
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known
-from shapespace.statistics.regression import Regression, compare_with, permutation_scheme, regress, share_of
-from shapespace.statistics.regression_answer import predicted_answer
+from shapespace.statistics.regression import RegressionResult, compare_with, permutation_scheme, regress, share_of
 from shapespace.types import Mesh, read_only
 from symmetric_object import cohort_of, posed, symmetric_object
 
@@ -47,7 +47,7 @@ def drawn(n: int, seed: int, *, repeats: int = 1, noise: float = 5.0, told: bool
 
 
 @pytest.fixture(scope="module")
-def learned() -> Regression:
+def learned() -> RegressionResult:
     return regress(drawn(60, 1), "age", permutations=19)
 
 
@@ -56,7 +56,7 @@ def test_raw_coefficients_are_those_of_ridge_regression() -> None:
     X, y = cohort.coefficients, cohort.table.numbers("age")
     penalty = 0.01 * np.linalg.svd(X - X.mean(axis=0))[1][0] ** 2
     other = Ridge(alpha=float(penalty), solver="svd").fit(X, y)
-    beta, intercept = Decomposed.of(X, np.ones(len(X))).weights(y, Choice("raw", 0.01))
+    beta, intercept = TrainingDecomposition.of(X, np.ones(len(X))).weights(y, Regularisation("raw", 0.01))
     assert np.allclose(beta, other.coef_, rtol=1e-8) and intercept == pytest.approx(other.intercept_, rel=1e-8)
 
 
@@ -65,7 +65,9 @@ def test_whitened_coefficients_are_those_of_principal_component_regression() -> 
     X, y = cohort.coefficients, cohort.table.numbers("age")
     pca = PCA(5, whiten=True, svd_solver="full").fit(X)
     expected = LinearRegression().fit(pca.transform(X), y).predict(pca.transform(X[:7]))
-    found = Decomposed.of(X, np.ones(len(X))).predict(X[:7], y[:, None], [Choice("whitened", 5)])[0, :, 0]
+    found = TrainingDecomposition.of(X, np.ones(len(X))).predict(X[:7], y[:, None], [Regularisation("whitened", 5)])[
+        0, :, 0
+    ]
     assert np.allclose(found, expected, rtol=1e-8)
 
 
@@ -79,12 +81,12 @@ def unequal_scans(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_weighted_ridge_regression_is_that_of_scikit_learn() -> None:
     X, y, weight = unequal_scans(0)
-    found = Decomposed.of(X, weight)
+    found = TrainingDecomposition.of(X, weight)
     penalty = 0.01 * found.singular[0] ** 2
     other = Ridge(alpha=float(penalty), solver="cholesky").fit(X, y, sample_weight=weight)
-    beta, intercept = found.weights(y, Choice("raw", 0.01))
+    beta, intercept = found.weights(y, Regularisation("raw", 0.01))
     assert np.allclose(beta, other.coef_, rtol=1e-9) and intercept == pytest.approx(other.intercept_, rel=1e-9)
-    predicted = found.predict(X[:5], y[:, None], [Choice("raw", 0.01)])[0, :, 0]
+    predicted = found.predict(X[:5], y[:, None], [Regularisation("raw", 0.01)])[0, :, 0]
     assert np.allclose(predicted, other.predict(X[:5]), rtol=1e-9)
 
 
@@ -93,7 +95,7 @@ def test_weighted_principal_component_regression_is_weighted_least_squares_on_we
     mean = np.average(X, axis=0, weights=weight)
     components = np.linalg.eigh(np.cov(X.T, aweights=weight))[1][:, ::-1][:, :4]
     expected = LinearRegression().fit((X - mean) @ components, y, sample_weight=weight).predict((X - mean) @ components)
-    found = Decomposed.of(X, weight).predict(X, y[:, None], [Choice("whitened", 4)])[0, :, 0]
+    found = TrainingDecomposition.of(X, weight).predict(X, y[:, None], [Regularisation("whitened", 4)])[0, :, 0]
     assert np.allclose(found, expected, rtol=1e-9)
 
 
@@ -177,7 +179,7 @@ def test_methods_state_the_scheme_of_targets_that_vary_within_subjects() -> None
     assert text == "values permuted within subjects, and between subjects with the same number of scans"
 
 
-def test_new_subjects_count_once_in_the_figures_of_new_shapes(learned: Regression) -> None:
+def test_new_subjects_count_once_in_the_figures_of_new_shapes(learned: RegressionResult) -> None:
     new = drawn(30, 50)
     many = new.take([*range(30), *[0] * 20])
     share = share_of(many.table.texts("subject"))
@@ -226,7 +228,7 @@ def test_a_number_that_shape_does_not_tell_is_rarely_claimed_to_be() -> None:
     assert claimed <= 6
 
 
-def test_a_number_that_shape_tells_is_claimed_to_be(learned: Regression) -> None:
+def test_a_number_that_shape_tells_is_claimed_to_be(learned: RegressionResult) -> None:
     assert learned.p == 1 / 20 and learned.measures["r2"].low > 0
 
 
@@ -238,7 +240,7 @@ def test_the_shape_that_goes_with_the_number_is_what_was_put_in() -> None:
     assert np.allclose(moved.ravel(), (found.high_at - found.low_at) * (found.pattern @ BASIS))
 
 
-def test_the_same_seed_gives_the_same_numbers(learned: Regression) -> None:
+def test_the_same_seed_gives_the_same_numbers(learned: RegressionResult) -> None:
     again, other = (regress(drawn(60, 1), "age", permutations=19, seed=seed) for seed in (0, 1))
     assert again.measures == learned.measures and again.p == learned.p
     assert np.array_equal(again.low, learned.low) and not np.array_equal(other.predicted, learned.predicted)
@@ -251,7 +253,7 @@ def test_intervals_count_each_subject_once() -> None:
     assert (low[0], high[0]) == (-2.0, 2.0)  # 4/3 of 3 subjects at 0.5 are 2
 
 
-def test_a_saved_predictor_predicts_the_same(learned: Regression, tmp_path: Path) -> None:
+def test_a_saved_predictor_predicts_the_same(learned: RegressionResult, tmp_path: Path) -> None:
     learned.predictor.save(tmp_path / "age.npz")
     new = drawn(5, 77)
     first, again = learned.predictor.predict(new), Predictor.load(tmp_path / "age.npz").predict(new)
@@ -260,7 +262,7 @@ def test_a_saved_predictor_predicts_the_same(learned: Regression, tmp_path: Path
 
 
 @pytest.mark.parametrize("harm", ["short", "empty", "not finite", "other folds", "object", "other facts", "shapes"])
-def test_a_damaged_predictor_is_refused(learned: Regression, tmp_path: Path, harm: str) -> None:
+def test_a_damaged_predictor_is_refused(learned: RegressionResult, tmp_path: Path, harm: str) -> None:
     path = tmp_path / "age.npz"
     learned.predictor.save(path)
     with np.load(path) as stored:
@@ -283,7 +285,7 @@ def test_a_damaged_predictor_is_refused(learned: Regression, tmp_path: Path, har
         Predictor.load(path)
 
 
-def test_a_predictor_with_pickles_is_never_run(learned: Regression, tmp_path: Path) -> None:
+def test_a_predictor_with_pickles_is_never_run(learned: RegressionResult, tmp_path: Path) -> None:
     path = tmp_path / "age.npz"
     learned.predictor.save(path)
     with zipfile.ZipFile(path) as archive:
@@ -308,7 +310,7 @@ def test_new_surfaces_are_predicted_alike_in_any_pose(gauge: str) -> None:
     assert first.value[0] == pytest.approx(amount[3], abs=0.3)
 
 
-def test_what_lies_outside_is_said(learned: Regression) -> None:
+def test_what_lies_outside_is_said(learned: RegressionResult) -> None:
     far, near = 20 * np.ones(K), np.zeros(K)
     steep = 20 * SLOPES / STDDEV / np.linalg.norm(SLOPES / STDDEV)
     new = replace(drawn(3, 0), coefficients=read_only(np.stack([far * 5, near, steep])))
@@ -338,7 +340,7 @@ def test_fits_are_predicted_by_their_own_model_alone() -> None:
         found.predictor.predict(Cohort.of_shapes(shapes, {}, faces=thing.faces))
 
 
-def test_new_shapes_of_another_kind_are_refused(learned: Regression) -> None:
+def test_new_shapes_of_another_kind_are_refused(learned: RegressionResult) -> None:
     with pytest.raises(CorrespondenceError, match="have 4 vertices"):
         learned.predictor.predict(Cohort.of_shapes(np.random.default_rng(0).standard_normal((2, 4, 3)), {}))
     with pytest.raises(InputError, match="learned in the gauge form, not shape"):
@@ -369,15 +371,17 @@ def test_tables_that_teach_nothing_are_refused() -> None:
         regress(changed(cohort, subject=("", *("a",) * 11)), "age")
 
 
-@pytest.mark.parametrize("options", [{"folds": 2}, {"permutations": -1}, {"level": 1.0}, {"seed": -1}, {"draws": 0}])
+@pytest.mark.parametrize(
+    "options", [{"folds": 2}, {"permutations": -1}, {"confidence": 1.0}, {"seed": -1}, {"draws": 0}]
+)
 def test_options_that_cannot_be_are_refused(options: dict[str, int]) -> None:
     with pytest.raises(InputError, match=r"must|needs"):
         regress(drawn(12, 1), "age", **options)  # type: ignore[arg-type]
 
 
-def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regression, tmp_path: Path) -> None:
+def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: RegressionResult, tmp_path: Path) -> None:
     new = drawn(4, 9)
-    answer = learned.answer((new, learned.predictor.predict(new)))
+    answer = regression_report(learned, (new, learned.predictor.predict(new)))
     said = " ".join(answer.summary)
     assert "60 subjects are a small sample (fewer than 100)" in said and "4 new shapes are predicted" in said
     assert "Their age is known: RMSE" in said
@@ -387,7 +391,7 @@ def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regress
     assert {test["resampling"] for test in told["methods"]["tests"]} <= {"permutation", "bootstrap"}
     rows = (tmp_path / "predictions.csv").read_text().splitlines()
     assert rows[0] == "scan,subject,observed,predicted,low,high,baseline" and len(rows) == 61
-    alone = predicted_answer(learned.predictor, new, learned.predictor.predict(new))
+    alone = prediction_report(learned.predictor, new, learned.predictor.predict(new))
     assert "of 4 shapes" in alone.summary[0] and list(alone.tables) == ["new.csv"]
 
 

@@ -16,8 +16,9 @@ from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.surface import vertex_normals
 from shapespace.io.files import write_text
 from shapespace.io.meshes import write_mesh
+from shapespace.report.analyses.results import analysis_report
 from shapespace.schemas import Analysis
-from shapespace.statistics.score import ScoreOptions, Scores, score
+from shapespace.statistics.score import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
 from synthetic_shapes import similarity, training_meshes
@@ -44,7 +45,7 @@ def population(
     return Cohort.of_fits(fitted, names, Table({}, names), np.full(n, np.nan))
 
 
-def shares(found: list[Scores], which: str) -> FloatArray:
+def shares(found: list[ScoreResult], which: str) -> FloatArray:
     every = np.concatenate([getattr(one, which) for one in found])
     return np.array([(every <= level).mean() for level in LEVELS])
 
@@ -55,7 +56,7 @@ def shares(found: list[Scores], which: str) -> FloatArray:
 def test_distances_are_those_of_a_plain_oracle() -> None:
     rng = np.random.default_rng(0)
     reference, subjects = population(30, rng), population(4, rng, told=0.8, name="s")
-    found = score(reference, subjects, ScoreOptions(modes=3))
+    found = score(reference, subjects, ScoreConfig(modes=3))
     x, y = reference.coefficients, subjects.coefficients
     mean, S = x.mean(axis=0), np.cov(x.T)
     values, vectors = np.linalg.eigh(S)
@@ -77,7 +78,7 @@ def test_distances_are_those_of_a_plain_oracle() -> None:
 
 def test_the_reference_is_measured_by_the_others() -> None:
     reference = population(12, np.random.default_rng(1), told=1.0)
-    found = score(reference, population(2, np.random.default_rng(2), told=1.0, name="s"), ScoreOptions(modes=2))
+    found = score(reference, population(2, np.random.default_rng(2), told=1.0, name="s"), ScoreConfig(modes=2))
     for k in range(12):
         others = np.delete(reference.coefficients, k, axis=0)
         values, vectors = np.linalg.eigh(np.cov(others.T))
@@ -116,7 +117,7 @@ def left_out(along: FloatArray, k: int) -> FloatArray:
 @pytest.mark.parametrize("told", [0.99, np.array([0.9, 0.5, 0.3, 0.7])], ids=["as well seen", "badly seen"])
 def test_percentiles_of_members_held_out_are_uniform(told: FloatArray | float) -> None:
     rng = np.random.default_rng(5)
-    options = ScoreOptions(modes=2, draws=8)
+    options = ScoreConfig(modes=2, draws=8)
     found = [score(population(30, rng), population(16, rng, told=told, name="s"), options) for _ in range(30)]
     for which in ("farther", "rest_farther", "beyond_farther"):
         assert np.abs(shares(found, which) - LEVELS).max() < 0.08, which
@@ -128,7 +129,7 @@ def test_percentiles_of_members_held_out_are_uniform(told: FloatArray | float) -
 
 def test_the_f_distribution_holds_where_all_modes_are_taken() -> None:
     rng = np.random.default_rng(4)
-    options = ScoreOptions(modes=MODES)
+    options = ScoreConfig(modes=MODES)
     found = [score(population(30, rng, told=1.0), population(20, rng, told=1.0, name="s"), options) for _ in range(25)]
     assert np.abs(shares(found, "p_value") - LEVELS).max() < 0.06
     assert all(np.array_equal(one.rest_farther, np.ones(20)) for one in found)
@@ -150,7 +151,7 @@ def test_what_the_model_left_and_what_the_modes_cannot_make_are_said_to_be_outsi
     b[0] = [0, 0, 0, 12 * SPREAD[3]]
     odd = replace(usual.fitted, b=b, beyond_mm=np.array([0.3, 9.0, 0.3]), status=("converged", "converged", "doubtful"))
     subjects = Cohort.of_fits(odd, usual.names, usual.table, usual.sizes_mm)
-    found = score(reference, subjects, ScoreOptions(modes=2))
+    found = score(reference, subjects, ScoreConfig(modes=2))
     assert (
         "modes of the reference leave" in found.outside[0][0]
         and "more than of all of the reference" in found.outside[0][0]
@@ -159,7 +160,7 @@ def test_what_the_model_left_and_what_the_modes_cannot_make_are_said_to_be_outsi
     methods = found.methods
     assert methods.dimensions == 2 and methods.analysed_variance_ratio == found.variance_share
     assert [one.resampling for one in methods.tests] == ["leave-one-out", "none"]
-    summary = found.answer().summary
+    summary = analysis_report(found).summary
     assert sum("outside what is known" in sentence for sentence in summary) == 3
 
 
@@ -173,16 +174,16 @@ def test_repeated_scans_of_a_person_count_once_and_leave_together() -> None:
     names = tuple(f"scan{k}" for k in range(60))
     reference = Cohort.of_fits(fitted, names, Table({"who": who}, names), np.full(60, np.nan))
     subjects = replace(population(2, rng, name="s"), table=Table({"who": ("a", "b")}, ("s0", "s1")))
-    by_person = score(reference, subjects, ScoreOptions(subject="who", modes=4))
-    by_scan = score(reference, subjects, ScoreOptions(modes=4))
+    by_person = score(reference, subjects, ScoreConfig(subject="who", modes=4))
+    by_scan = score(reference, subjects, ScoreConfig(modes=4))
     assert (by_person.people, by_scan.people) == (12, 60)
-    assert score(reference, subjects, ScoreOptions(subject="who")).modes == 2
+    assert score(reference, subjects, ScoreConfig(subject="who")).modes == 2
     # Left out alone, a scan finds its own person among the others.
     assert by_person.reference_distance.mean() > 1.1 * by_scan.reference_distance.mean()
     assert by_person.farther.min() >= 1 / 13 and by_person.farther.max() <= 1
     both = replace(subjects, table=Table({"who": ("p3", "b")}, ("s0", "s1")))
     with pytest.raises(InputError, match="p3 of who is among the subjects and in the reference"):
-        score(reference, both, ScoreOptions(subject="who"))
+        score(reference, both, ScoreConfig(subject="who"))
 
 
 def test_the_same_seed_gives_the_same_scores_and_one_subject_those_among_many() -> None:
@@ -198,7 +199,7 @@ def test_a_small_reference_is_said_to_be_small() -> None:
     rng = np.random.default_rng(10)
     found = score(population(8, rng), population(2, rng, name="s"))
     assert "small" in found.notes[-1] and "8 subjects" in found.notes[-1] and np.isnan(found.z_limit)
-    assert "a small reference" in found.answer().summary[0]
+    assert "a small reference" in analysis_report(found).summary[0]
     large = score(population(30, rng), population(2, rng, name="s"))
     assert not any("small" in note for note in large.notes)
 
@@ -219,13 +220,13 @@ def test_who_cannot_be_scored_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match="reference of 4 shapes is too small"):
         score(reference.take(range(4)), subjects)
     with pytest.raises(InputError, match="has 1 to 4 modes, not 9"):
-        score(reference, subjects, ScoreOptions(modes=9))
+        score(reference, subjects, ScoreConfig(modes=9))
     with pytest.raises(InputError, match="r3 is in the reference too, as r3; leave it out"):
         score(reference, reference.take([3]))
     with pytest.raises(InputError, match="in the gauge shape, the subjects in form"):
         score(reference, replace(subjects, gauge="form"))
     with pytest.raises(InputError, match="no column 'who'"):
-        score(reference, subjects, ScoreOptions(subject="who"))
+        score(reference, subjects, ScoreConfig(subject="who"))
     with pytest.raises(InputError, match="cannot be compared with other surfaces"):
         score(reference, replace(subjects, fitted=None))
     other = replace(subjects, fitted=replace(subjects.fitted, model=replace(model(), stddev=2 * model().stddev)))  # type: ignore[type-var]

@@ -1,4 +1,4 @@
-"""What the commands about cohorts end in: the files of an answer, and its report."""
+"""Files of the report of an analysis, and its HTML page."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from pathlib import Path
 from shapespace.batch.progress import waiting
 from shapespace.commands.report import write_report
 from shapespace.errors import ShapespaceError
-from shapespace.statistics.answer import Answer
+from shapespace.report.analyses.analysis_report import AnalysisReport
 
 
-def keep_answer(answer: Answer, output: Path, *, quiet: bool) -> tuple[Path | None, list[str]]:
-    """Write an answer to a folder, with its report where the extra `report` is there.
+def save_report(report: AnalysisReport, output: Path, *, quiet: bool) -> tuple[Path | None, list[str]]:
+    """Write a report to a folder, with its HTML page if the extra `report` is installed.
 
     Args:
-        answer: to keep.
+        report: of the analysis.
         output: the folder.
         quiet: no progress.
 
     Returns:
-        The path of the report, None where it cannot be drawn; and what the user should know.
+        The path of the page, None where it cannot be drawn; and notes for the user.
 
     Raises:
         FileError: the folder cannot be written.
@@ -27,8 +27,8 @@ def keep_answer(answer: Answer, output: Path, *, quiet: bool) -> tuple[Path | No
     from shapespace.report.html import require_report_extra
 
     with waiting("writing the results", quiet=quiet):
-        answer.save(output)
-    notes = list(answer.notes)
+        report.save(output)
+    notes = list(report.notes)
     try:
         require_report_extra()
     except ShapespaceError as error:

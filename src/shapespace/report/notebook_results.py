@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from shapespace.errors import ShapespaceError
+from shapespace.report.analyses.results import analysis_report
 from shapespace.report.blocks import Block, Cell, Column, Notes, Table, Text
 from shapespace.report.notebook import Drawn, notebook_html
 from shapespace.report.page import Page
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from shapespace.correspondence.result import Correspondence
     from shapespace.geometry.volume_surface import VolumeSurface
     from shapespace.model.additive import AdditiveModel
-    from shapespace.statistics.answer import Answer
+    from shapespace.statistics.analysis_result import AnalysisResult
     from shapespace.statistics.predictor import Predictions, Predictor
     from shapespace.store.results import Results
 
@@ -32,30 +33,22 @@ _MOST_NOTES = 6
 _MOST_COLUMNS = 8
 
 
-class Answered(Protocol):
-    """The result of an analysis."""
-
-    def answer(self) -> Answer:
-        """Return the answer that is saved and reported."""
-        ...
-
-
-def html_of_analysis(result: Answered) -> str:
+def html_of_analysis(result: AnalysisResult) -> str:
     """Return the notebook view of an analysis: its summary and its first tables."""
     try:
-        answer = result.answer()
+        report = analysis_report(result)
     except ShapespaceError as error:
         return notebook_html(result, type(result).__name__, [f"Nothing can be reported: {error}"], [])
     # Tables need neither files nor pictures; the folder is never read.
     parts = StudyParts(Page(1), Folder(Path()), ANALYSIS)
-    parts_as_kept = [read_part(to_json(part), ANALYSIS.file, ANALYSIS.again) for part in answer.parts]
+    parts_as_kept = [read_part(to_json(part), ANALYSIS.file, ANALYSIS.again) for part in report.parts]
     tables = [part for part in parts_as_kept if isinstance(part, TablePart)]
     blocks: list[Block] = []
     for part in tables[:MOST_TABLES]:
         for block in parts.blocks(part, part.title or TITLES["table"]):
             blocks += _shortened(block) if isinstance(block, Table) else [block]
-    blocks.append(Notes([*answer.notes[:_MOST_NOTES], "result.answer().save(folder) keeps tables, maps and report."]))
-    return notebook_html(result, answer.title, answer.summary, [], blocks=blocks)
+    blocks.append(Notes([*report.notes[:_MOST_NOTES], "result.save(folder) writes tables, maps and report."]))
+    return notebook_html(result, report.title, report.summary, [], blocks=blocks)
 
 
 def html_of_cohort(cohort: Cohort) -> str:
@@ -145,7 +138,7 @@ def html_of_predictor(predictor: Predictor) -> str:
         ("Subjects", str(predictor.subjects)),
         ("Method", predictor.method),
         ("Targets", f"{predictor.lowest:.4g} to {predictor.highest:.4g}"),
-        ("Intervals", f"{percent(predictor.level)}"),
+        ("Intervals", f"{percent(predictor.confidence)}"),
         ("Surface", f"{len(predictor.mean):,} vertices, gauge {predictor.gauge}"),
         ("Farthest subject", mm(predictor.farthest_mm)),
     ]

@@ -23,12 +23,11 @@ from shapespace.errors import InputError
 from shapespace.geometry.procrustes import align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_normals
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, SampleSize, TestScheme
-from shapespace.statistics.answer import Answer
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
-from shapespace.statistics.observed import weights_of
+from shapespace.statistics.observation_weights import weights_of
 from shapespace.statistics.sides import Sides, find_sides, given_sides
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
@@ -43,7 +42,7 @@ _MOSTLY = 0.5
 
 
 @dataclass(frozen=True)
-class Effect:
+class AnovaRow:
     """A row of the Procrustes ANOVA; sums of squares over all vertices of all shapes and their images.
 
     Args:
@@ -65,7 +64,7 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Scores:
+class AsymmetryScores:
     """How far each of n subjects is from its own mirror image, RMS over the vertices.
 
     Args:
@@ -84,8 +83,8 @@ class Scores:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Asymmetry:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AsymmetryResult(AnalysisResult):
     """What the sides of n subjects differ by.
 
     Args:
@@ -119,9 +118,9 @@ class Asymmetry:
     normals: FloatArray | None
     symmetric: FloatArray
     difference: FloatArray
-    anova: tuple[Effect, ...]
-    scores: Scores
-    vertex_scores: Scores
+    anova: tuple[AnovaRow, ...]
+    scores: AsymmetryScores
+    vertex_scores: AsymmetryScores
     z: FloatArray
     z_low: FloatArray
     z_high: FloatArray
@@ -186,20 +185,13 @@ class Asymmetry:
             ),
         )  # fmt: skip
 
-    def effect(self, source: str) -> Effect:
+    def effect(self, source: str) -> AnovaRow:
         """Return the row of the ANOVA of that name."""
         return next(effect for effect in self.anova if effect.source == source)
 
-    def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
-        return lazy_import("answer_of_asymmetry")(self)
-
     def __repr__(self) -> str:
         rows = listed_briefly([f"{row.source}: p {row.p:.3g}" for row in self.anova if row.p is not None])
-        return f"<Asymmetry of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
+        return f"<AsymmetryResult of {len(self.subjects)} subjects, {len(self.cohort)} shapes; {rows or 'no test'}>"
 
 
 def measure_asymmetry(
@@ -211,8 +203,8 @@ def measure_asymmetry(
     reference: tuple[str, str] | None = None,
     permutations: int = 999,
     seed: int = 0,
-    on_step: Callable[[int, int], None] | None = None,
-) -> Asymmetry:
+    progress: Callable[[int, int], None] | None = None,
+) -> AsymmetryResult:
     """Return what the sides of the objects of a cohort differ by.
 
     Args:
@@ -224,7 +216,7 @@ def measure_asymmetry(
         reference: column and value of the subjects that scores are compared with; None for all.
         permutations: number of permutations for p; 0 for none.
         seed: seed of the permutations.
-        on_step: called with (permutations done, in all).
+        progress: called with (permutations done, in all).
 
     Raises:
         InputError: an object without mirror symmetry, pairs that cannot be, fewer than three subjects, no such column,
@@ -235,7 +227,7 @@ def measure_asymmetry(
         raise InputError("The number of permutations and the seed must be 0 or more.")
     sides = find_sides(cohort) if pairs is None else given_sides(cohort, pairs, where)
     names, codes = _subjects(cohort, subject)
-    group = _group(cohort, names, codes, reference)
+    in_reference = _in_reference(cohort, names, codes, reference)
     symmetric, difference, mean = _split(cohort, sides)
     pairs_observed = _pairs_observed(cohort, sides)
     counts = np.bincount(codes)
@@ -246,14 +238,14 @@ def measure_asymmetry(
         difference -= heights[:, None] * normals
     rng = np.random.default_rng(seed)
 
-    who = _Means(codes, counts)
+    who = _SubjectMeans(codes, counts)
     along = _along(difference, normals) if normals is not None else difference
     own, own_difference = who.of(along), who.of(difference)
     told = own[..., None] * normals if normals is not None else own
     scores = _scores(along, who, _shared(cohort, sides, mean, told, who))
     vertex_scores = _scores(difference, who, _shared(cohort, sides, mean, own_difference, who))
-    z = _standardised(scores, group)
-    steps = _Steps(permutations, on_step)
+    z, z_low, z_high = _standardised(scores, in_reference)
+    steps = _Steps(permutations, progress)
     parts = symmetric, difference
     if normals is not None and not sides.paired:
         # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
@@ -267,29 +259,47 @@ def measure_asymmetry(
         known = _known_beyond(own, heights)
         weight = known if weight is None else weight * known
     p = _family_wise(own, rng, steps, weight)
-    return Asymmetry(
-        cohort, sides, names, counts, mean, normals, who.of(symmetric), own_difference, anova, scores,
-        vertex_scores, *z, group, read_only(directional), p, permutations, seed, observed,
-    )  # fmt: skip
+    return AsymmetryResult(
+        cohort=cohort,
+        sides=sides,
+        subjects=names,
+        counts=counts,
+        mean=mean,
+        normals=normals,
+        symmetric=who.of(symmetric),
+        difference=own_difference,
+        anova=anova,
+        scores=scores,
+        vertex_scores=vertex_scores,
+        z=z,
+        z_low=z_low,
+        z_high=z_high,
+        in_reference=in_reference,
+        directional=read_only(directional),
+        directional_p=p,
+        permutations=permutations,
+        seed=seed,
+        observed=observed,
+    )
 
 
 class _Steps:
     """Counts permutations for whoever shows progress."""
 
-    def __init__(self, permutations: int, on_step: Callable[[int, int], None] | None) -> None:
-        self.each, self.done, self.on_step = permutations, 0, on_step
+    def __init__(self, permutations: int, progress: Callable[[int, int], None] | None) -> None:
+        self.each, self.done, self.progress = permutations, 0, progress
 
     def blocks(self) -> list[int]:
         return [min(_BLOCK, self.each - start) for start in range(0, self.each, _BLOCK)]
 
     def add(self, count: int) -> None:
         self.done += count
-        if self.on_step is not None:
-            self.on_step(self.done, 4 * self.each)
+        if self.progress is not None:
+            self.progress(self.done, 4 * self.each)
 
 
 @dataclass(frozen=True, eq=False)
-class _Means:
+class _SubjectMeans:
     """Subjects by number: (N,) whose each shape is, and (n,) how many each has."""
 
     codes: npt.NDArray[np.intp]
@@ -321,7 +331,7 @@ def _subjects(cohort: Cohort, column: str | None) -> tuple[tuple[str, ...], npt.
     return names, codes
 
 
-def _group(
+def _in_reference(
     cohort: Cohort, names: tuple[str, ...], codes: npt.NDArray[np.intp], reference: tuple[str, str] | None
 ) -> npt.NDArray[np.bool_]:
     if reference is None:
@@ -383,11 +393,11 @@ def _along(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
 def _anova(
     symmetric: FloatArray,
     difference: FloatArray,
-    who: _Means,
+    who: _SubjectMeans,
     dimensions: tuple[float, float],
     rng: np.random.Generator,
     steps: _Steps,
-) -> tuple[Effect, ...]:
+) -> tuple[AnovaRow, ...]:
     n, rows = len(who.counts), len(who.codes)
     flat_s = symmetric.reshape(rows, -1) - symmetric.reshape(rows, -1).mean(axis=0)
     flat_d = difference.reshape(rows, -1)
@@ -414,18 +424,18 @@ def _anova(
     ms_individual, ms_side = individual / ((n - 1) * d_sym), side / d_asym
     ms_both = both / ((n - 1) * d_asym)
     found = [
-        Effect("individual", individual, (n - 1) * d_sym, ms_individual, _over(ms_individual, ms_both), p_individual),
-        Effect("side", side, d_asym, ms_side, _over(ms_side, ms_both), p_side),
+        AnovaRow("individual", individual, (n - 1) * d_sym, ms_individual, _over(ms_individual, ms_both), p_individual),
+        AnovaRow("side", side, d_asym, ms_side, _over(ms_side, ms_both), p_side),
     ]
     if not repeated:
-        return (*found, Effect("individual x side", both, (n - 1) * d_asym, ms_both))
+        return (*found, AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both))
     df = rows - n
     ms_error = error_d / (df * d_asym)
     return (
         *found,
-        Effect("individual x side", both, (n - 1) * d_asym, ms_both, _over(ms_both, ms_error), p_both),
-        Effect(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
-        Effect(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
+        AnovaRow("individual x side", both, (n - 1) * d_asym, ms_both, _over(ms_both, ms_error), p_both),
+        AnovaRow(ERROR_ASYMMETRIC, error_d, df * d_asym, ms_error),
+        AnovaRow(ERROR_SYMMETRIC, error_s, df * d_sym, error_s / (df * d_sym)),
     )
 
 
@@ -485,7 +495,7 @@ def _family_wise(
     return read_only(beyond / (1 + steps.each)) if steps.each else read_only(np.full(m, np.nan))
 
 
-def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, who: _Means) -> FloatArray | None:
+def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, who: _SubjectMeans) -> FloatArray | None:
     """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by what their fits know of themselves.
 
     All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
@@ -504,7 +514,7 @@ def _shared(cohort: Cohort, sides: Sides, mean: FloatArray, told: FloatArray, wh
     return ((along[who.codes] * fitted.b_stddev) ** 2).sum(axis=1) @ who.shares
 
 
-def _scores(fields: FloatArray, who: _Means, shared: FloatArray | None) -> Scores:
+def _scores(fields: FloatArray, who: _SubjectMeans, shared: FloatArray | None) -> AsymmetryScores:
     """Return the RMS over the vertices of the subjects' means of `fields` (N, M) or (N, M, 3), less their error.
 
     The squared length of a mean is that of the truth, and the trace of the error's covariance, and scatters with
@@ -541,10 +551,10 @@ def _scores(fields: FloatArray, who: _Means, shared: FloatArray | None) -> Score
     known = 1.0 if df or shared is not None else np.nan
     error = float(np.sqrt(trace / vertices)) if df else float("nan")
     low, high = (read_only(known * mm(end)) for end in (middle - half, middle + half))
-    return Scores(mm(net), low, high, read_only(raw), error)
+    return AsymmetryScores(mm(net), low, high, read_only(raw), error)
 
 
-def _standardised(scores: Scores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _standardised(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return z, low and high (n,) of scores beside those of the group, of which nobody is compared with itself."""
     inside = scores.mm[group]
     n, total, square = len(inside), inside.sum(), (inside**2).sum()
@@ -560,7 +570,7 @@ def _standardised(scores: Scores, group: npt.NDArray[np.bool_]) -> tuple[FloatAr
     return z(scores.mm), z(scores.low), z(scores.high)
 
 
-def first_pattern(found: Asymmetry) -> tuple[FloatArray, float, FloatArray]:
+def first_pattern(found: AsymmetryResult) -> tuple[FloatArray, float, FloatArray]:
     """Return the first principal pattern of fluctuating asymmetry.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What changed? Pairs and series of scans of a subject: signed maps in mm, volumes, landmarks, and what is noise."""
+"""Change between visits of the same subjects: signed maps in mm, volumes and landmarks, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -15,269 +15,334 @@ from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import boundary_edges, vertex_areas
-from shapespace.lazy import lazy_import
 from shapespace.model.shape_model import region_vertices
-from shapespace.statistics.answer import Answer
 from shapespace.statistics.change_align import stable_vertices
-from shapespace.statistics.change_answer import answer_of
-from shapespace.statistics.change_found import ChangeSettings, Estimate, Found, SubjectChange, VisitChange, effect_of
-from shapespace.statistics.change_group import difference_test, mean_test
 from shapespace.statistics.change_maps import (
-    Aligned,
-    Known,
-    aligned,
+    AlignedVisits,
+    ChangeUncertainty,
+    align_visits,
     contrast,
     faces_in,
-    known_by_fits,
-    known_by_stable,
     noise_factor,
     swept_mm3,
+    uncertainty_from_fits,
+    uncertainty_from_stable_part,
     volume_mm3,
 )
-from shapespace.statistics.change_repeat import Repeatability, Rescans
+from shapespace.statistics.change_repeatability import Repeatability, RepeatabilityEstimator
+from shapespace.statistics.change_result import (
+    ChangeConfig,
+    ChangeEstimate,
+    ChangeResult,
+    GroupDifferenceTests,
+    MeanChangeTests,
+    SubjectChange,
+    VisitChange,
+    change_or_rate,
+)
 from shapespace.statistics.change_visits import Visits, time_column, visits_of
 from shapespace.statistics.dispersion import DispersionTest, dispersion_test
-from shapespace.statistics.observed import weights_of
+from shapespace.statistics.map_tests import difference_test, mean_test
+from shapespace.statistics.observation_weights import weights_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, require
 
 WHOLE = "whole"
-"""What the whole surface is called beside its regions."""
+"""Name of the whole surface among the regions."""
 _ROUNDING = 1e-4
 """Share of the size by which surfaces in files are rounded, at most."""
 _COUNTED = 0.5
 """Of the weight that it could have, from which a vertex counts as stable."""
 
 
-class Change(Found):
-    """What changed in the subjects of a cohort: `Found`, which lists it, and its report."""
-
-    def answer(self) -> Answer:
-        """Return what is kept of it: a report, tables, arrays and meshes."""
-        return answer_of(self)
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
-
-
 def change(
-    cohort: Cohort, settings: ChangeSettings | None = None, *, on_step: Callable[[int, int], None] | None = None
-) -> Change:
-    """Return what changed between the visits of each subject, in millimetres, and in the group.
+    cohort: Cohort, config: ChangeConfig | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> ChangeResult:
+    """Measure the changes between the visits of each subject, in millimetres, and test them over subjects.
 
-    Scans of a subject are brought to its first rigidly, by what is stable. Standard deviations are those of rescans
-    where there are some (two scans of a subject at a time, or rows that the column `rescan` marks), else what the fits
-    say of themselves, else the spread over the stable part.
+    The scans of a subject are aligned rigidly to its first by the stable part. Standard deviations are those of rescans
+    where there are some (two scans of a subject at a time, or rows that the column `rescan` marks), else those stated
+    by the fits, else the spread over the stable part.
 
     Args:
-        cohort: in the gauge `form`, with triangles; its table tells subject and time of each shape.
-        settings: what is asked; None for the defaults.
-        on_step: called with (done, total) subjects.
+        cohort: in the gauge `form`, with triangles; its table contains subject and time of each shape.
+        config: None for the defaults.
+        progress: called with (done, total) subjects.
 
     Raises:
         FileError: the file of the stable region cannot be read.
         InputError: another gauge, no triangles, subjects or times missing, times without an order, two scans of a visit
-            that are not marked as rescans, no such stable region, groups other than two, or nobody with two visits.
+            that are not marked as rescans, no such stable region, groups other than two, or no subject with two visits.
     """
     require(cohort, Cohort, "change", "read one with shapespace.read_cohort")
-    settings = settings or ChangeSettings()
+    config = config or ChangeConfig()
+    _refuse_unsuitable(cohort, config)
+    columns = [config.subject, time_column(cohort.table, config.time)]
+    cohort = cohort.complete([*columns, config.group] if config.group else columns)
+    visits = visits_of(cohort.table, config.subject, config.time, config.order)
+    single = tuple(name for name, own in visits.by_subject.items() if len(own) < 2)
+    if len(single) == len(visits.by_subject):
+        raise InputError(
+            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({named(single)}); give the same "
+            f"subject in {config.subject} and another time in {visits.column}."
+        )
+    groups = _groups(cohort, config, visits, single)
+    stable = stable_vertices(cohort, config.stable)
+    regions = _regions(cohort, config)
+    problem = _Problem(
+        cohort=cohort,
+        landmarks=cohort.landmarks or SurfaceLandmarks(),
+        regions=np.stack([_indicator(vertices, cohort.n_vertices) for vertices in regions.values()]),
+        uncertainty="rescans" if visits.rescans else "fits" if cohort.fitted is not None else "stable",
+        time_unit=visits.time_unit,
+        is_closed=not len(boundary_edges(faces_in(cohort))),
+    )
+    estimator = RepeatabilityEstimator(cohort.reference, faces_in(cohort), problem.landmarks, problem.regions)
+    drafts: list[_SubjectDraft] = []
+    before, displacement = np.zeros_like(cohort.reference), np.zeros_like(cohort.reference)
+    for done, (name, own) in enumerate(visits.by_subject.items(), 1):
+        subject = align_visits(cohort, own, stable)
+        estimator.add(subject)
+        if len(own) > 1:
+            drafts.append(_draft(problem, name, subject))
+            before += subject.means[0]
+            displacement += subject.means[-1] - subject.means[0]
+        if progress is not None:
+            progress(done, len(visits.by_subject))
+    repeatability = estimator.repeatability()
+    subjects = tuple(draft.subject(groups.get(draft.name, ""), repeatability) for draft in drafts)
+    before /= len(subjects)
+    result = ChangeResult(
+        cohort=cohort,
+        config=config,
+        subjects=subjects,
+        single_visit_subjects=single,
+        uncertainty=problem.uncertainty,
+        repeatability=repeatability,
+        mean_change=None,
+        group_difference=None,
+        before=before,
+        after=before + displacement / len(subjects),
+        landmarks=problem.landmarks,
+        regions=tuple(regions),
+        time_unit=visits.time_unit,
+        is_closed=problem.is_closed,
+        is_model_only=_is_model_only(cohort),
+        blank=None,
+    )
+    return _add_tests(result, groups)
+
+
+def _refuse_unsuitable(cohort: Cohort, config: ChangeConfig) -> None:
+    """Check that changes of a cohort can be measured in millimetres along normals.
+
+    Raises:
+        InputError: another gauge, no unit, no triangles, or options that are out of range.
+    """
     if cohort.gauge != "form":
         raise InputError("Changes are in millimetres, but this cohort has sizes divided out; read it with gauge form.")
     if cohort.unit != "mm":
         raise InputError("Changes are in millimetres, but these coordinates have no unit; give surfaces in mm.")
     if cohort.faces is None:
         raise InputError("Changes are along normals, and points have none; give surfaces with triangles.")
-    if settings.permutations < 1 or settings.seed < 0:
+    if config.permutations < 1 or config.seed < 0:
         raise InputError("Tests need at least one permutation and a seed of 0 or more.")
-    columns = [settings.subject, time_column(cohort.table, settings.time)]
-    cohort = cohort.complete([*columns, settings.group] if settings.group else columns)
-    visits = visits_of(cohort.table, settings.subject, settings.time, settings.order)
-    single = tuple(name for name, own in visits.of.items() if len(own) < 2)
-    if len(single) == len(visits.of):
-        raise InputError(
-            f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({named(single)}); give the same "
-            f"subject in {settings.subject} and another time in {visits.column}."
-        )
-    groups = _groups(cohort, settings, visits, single)
-    stable = stable_vertices(cohort, settings.stable)
-    landmarks = cohort.landmarks or SurfaceLandmarks()
-    regions = _regions(cohort, settings)
-    parts = np.zeros((len(regions), cohort.n_vertices))
-    for row, vertices in zip(parts, regions.values(), strict=True):
-        row[vertices] = 1.0
-    rescans = Rescans(cohort.reference, faces_in(cohort), landmarks, parts)
-    drafts: list[_Draft] = []
-    source: Literal["rescans", "fits", "stable"] = (
-        "rescans" if visits.rescans else "fits" if cohort.fitted is not None else "stable"
-    )
-    before, moved = np.zeros_like(cohort.reference), np.zeros_like(cohort.reference)
-    closed = not len(boundary_edges(faces_in(cohort)))
-    for done, (name, own) in enumerate(visits.of.items(), 1):
-        found = aligned(cohort, own, stable)
-        rescans.add(found)
-        if len(own) > 1:
-            drafts.append(_draft(cohort, name, found, landmarks, parts, source, visits.unit, closed=closed))
-            before += found.means[0]
-            moved += found.means[-1] - found.means[0]
-        if on_step is not None:
-            on_step(done, len(visits.of))
-    repeatability = rescans.told()
-    subjects = tuple(draft.subject(groups.get(draft.name, ""), repeatability) for draft in drafts)
-    before /= len(subjects)
-    answer = Change(
-        cohort, settings, subjects, single, source, repeatability, None, None, None, None, None, (), before,
-        before + moved / len(subjects), landmarks, tuple(regions), visits.unit, closed, _model_only(cohort),
-    )  # fmt: skip
-    return _tested(answer, groups)
 
 
-def _model_only(cohort: Cohort) -> bool:
+def _indicator(vertices: IntArray, n_vertices: int) -> FloatArray:
+    """Return (V,) 1 for some vertices and 0 for the others."""
+    indicator = np.zeros(n_vertices)
+    indicator[vertices] = 1.0
+    return indicator
+
+
+def _is_model_only(cohort: Cohort) -> bool:
+    """Return whether the surfaces are the model's own, up to the rounding of files."""
     if cohort.fitted is None:
         return False
-    own, there = cohort.fitted.model.reconstruct(cohort.fitted.b[0]), cohort.vertices(0)
-    off = np.linalg.norm(fit_similarity(own, there).apply(own) - there, axis=1).max()
-    return bool(off < _ROUNDING * np.linalg.norm(np.ptp(there, axis=0)))
+    reconstruction, surface = cohort.fitted.model.reconstruct(cohort.fitted.b[0]), cohort.vertices(0)
+    T = fit_similarity(reconstruction, surface)
+    largest = np.linalg.norm(T.apply(reconstruction) - surface, axis=1).max()
+    return bool(largest < _ROUNDING * np.linalg.norm(np.ptp(surface, axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Draft:
-    """A subject before its standard deviations are known, which rescans of all tell."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Problem:
+    """What the estimates of all subjects have in common.
+
+    Args:
+        cohort: the scans.
+        landmarks: on the surfaces.
+        regions: (P, V) 1 for the vertices of each region, the whole first.
+        uncertainty: source of the standard deviations, as in `ChangeResult`.
+        time_unit: of rates; empty for none.
+        is_closed: whether the surface is closed.
+    """
+
+    cohort: Cohort
+    landmarks: SurfaceLandmarks
+    regions: FloatArray
+    uncertainty: Literal["rescans", "fits", "stable"]
+    time_unit: str
+    is_closed: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SubjectDraft:
+    """A subject before its standard deviations are estimated from the rescans of all subjects."""
 
     name: str
     visits: tuple[VisitChange, ...]
-    sums: tuple[Estimate, ...]
-    factors: tuple[float, ...]
+    estimates: tuple[ChangeEstimate, ...]
+    noise_factors: tuple[float, ...]
     stable: BoolArray
     area_mm2: FloatArray
-    before_mm3: float
+    volume_before_mm3: float
     observed: BoolArray | None
 
     def subject(self, group: str, repeatability: Repeatability | None) -> SubjectChange:
-        sums = list(self.sums)
+        estimates = list(self.estimates)
         if repeatability is not None:
             quantile = float(student.ppf(0.975, repeatability.freedom))
-            sums = [
+            estimates = [
                 replace(
-                    one,
+                    estimate,
                     stddev_mm=factor * repeatability.within_mm,
                     landmarks_stddev_mm=factor * repeatability.landmarks_within_mm,
                     volumes_stddev_mm3=factor * repeatability.volumes_within_mm3,
                     quantile=quantile,
                 )
-                for one, factor in zip(sums, self.factors, strict=True)
+                for estimate, factor in zip(estimates, self.noise_factors, strict=True)
             ]
-        rate = sums[1] if len(sums) > 1 else None
         return SubjectChange(
-            self.name, group, self.visits, sums[0], rate, self.stable, self.area_mm2, self.before_mm3, self.observed,
-        )  # fmt: skip
-
-
-def _draft(
-    cohort: Cohort,
-    name: str,
-    found: Aligned,
-    landmarks: SurfaceLandmarks,
-    parts: FloatArray,
-    source: Literal["rescans", "fits", "stable"],
-    unit: str,
-    *,
-    closed: bool,
-) -> _Draft:
-    faces = faces_in(cohort)
-    first = found.means[0]
-    area = vertex_areas(Mesh(first, faces))
-    along = found.along_mm
-    swept = np.stack([swept_mm3(first, mean, faces) for mean in found.means]) @ parts.T
-    told = tuple(
-        VisitChange(
-            visit.label,
-            visit.at,
-            len(visit.rows),
-            float(np.sqrt(np.average(along[k] ** 2, weights=area))),
-            float(swept[k, 0]),
+            name=self.name,
+            group=group,
+            visits=self.visits,
+            change=estimates[0],
+            rate=estimates[1] if len(estimates) > 1 else None,
+            stable=self.stable,
+            area_mm2=self.area_mm2,
+            volume_before_mm3=self.volume_before_mm3,
+            observed=self.observed,
         )
-        for k, visit in enumerate(found.visits)
+
+
+def _draft(problem: _Problem, name: str, subject: AlignedVisits) -> _SubjectDraft:
+    """Return the changes of a subject, with standard deviations unless these are estimated from rescans."""
+    faces, first = faces_in(problem.cohort), subject.means[0]
+    area = vertex_areas(Mesh(first, faces))
+    along = subject.along_mm
+    swept = np.stack([swept_mm3(first, mean, faces) for mean in subject.means]) @ problem.regions.T
+    visits = tuple(
+        VisitChange(
+            label=visit.label,
+            time=visit.time,
+            scans=len(visit.rows),
+            rms_mm=float(np.sqrt(np.average(along[k] ** 2, weights=area))),
+            volume_mm3=float(swept[k, 0]),
+        )
+        for k, visit in enumerate(subject.visits)
     )
-    sums: list[Estimate] = []
+    estimates: list[ChangeEstimate] = []
     factors: list[float] = []
-    by_stable = known_by_stable(found, landmarks, parts) if source == "stable" else None
-    for rate in (False, True) if unit else (False,):
-        weights = contrast(found.visits, rate=rate)
-        factors.append(noise_factor(found.visits, weights))
-        if by_stable is not None:
-            # Its spread is that of a difference of the last visit and the first.
-            share = factors[-1] / factors[0]
-            known = Known(share * by_stable.along_mm, share * by_stable.landmarks_mm, by_stable.volumes_mm3)
-        elif source == "fits":
-            known = known_by_fits(cohort, found, weights, landmarks, parts)
-        else:
-            known = Known(np.zeros(len(area)), np.zeros(len(landmarks)), np.zeros(len(parts)))
-        moved = landmarks.interpolate(np.tensordot(weights, found.means, axes=1))
-        sums.append(
-            Estimate(
-                weights @ along,
-                known.along_mm,
-                moved,
-                known.landmarks_mm,
-                weights @ swept,
-                known.volumes_mm3,
+    for rate in (False, True) if problem.time_unit else (False,):
+        weights = contrast(subject.visits, rate=rate)
+        factors.append(noise_factor(subject.visits, weights))
+        stddev = _uncertainty(problem, subject, weights, factors[-1] / factors[0])
+        estimates.append(
+            ChangeEstimate(
+                along_mm=weights @ along,
+                stddev_mm=stddev.along_mm,
+                landmarks_mm=problem.landmarks.interpolate(np.tensordot(weights, subject.means, axes=1)),
+                landmarks_stddev_mm=stddev.landmarks_mm,
+                volumes_mm3=weights @ swept,
+                volumes_stddev_mm3=stddev.volumes_mm3,
             )
         )
-    stable = found.weights > _COUNTED * area
-    before_mm3 = volume_mm3(first, faces) if closed else float("nan")
-    return _Draft(name, told, tuple(sums), tuple(factors), stable, area, before_mm3, found.observed)
+    return _SubjectDraft(
+        name=name,
+        visits=visits,
+        estimates=tuple(estimates),
+        noise_factors=tuple(factors),
+        stable=subject.weights > _COUNTED * area,
+        area_mm2=area,
+        volume_before_mm3=volume_mm3(first, faces) if problem.is_closed else float("nan"),
+        observed=subject.observed,
+    )
 
 
-def _regions(cohort: Cohort, settings: ChangeSettings) -> dict[str, IntArray]:
-    """Return name -> vertices of what volumes are told of: the whole, and regions.
+def _uncertainty(
+    problem: _Problem, subject: AlignedVisits, weights: FloatArray, noise_ratio: float
+) -> ChangeUncertainty:
+    """Return the standard deviations of a sum over visits by `weights` (T,); 0 where rescans replace them.
+
+    `noise_ratio` is the noise of the sum divided by that of the difference of the last visit and the first.
+    """
+    if problem.uncertainty == "stable":
+        spread = uncertainty_from_stable_part(subject, problem.landmarks, problem.regions)
+        return ChangeUncertainty(noise_ratio * spread.along_mm, noise_ratio * spread.landmarks_mm, spread.volumes_mm3)
+    if problem.uncertainty == "fits":
+        return uncertainty_from_fits(problem.cohort, subject, weights, problem.landmarks, problem.regions)
+    sizes = problem.cohort.n_vertices, len(problem.landmarks), len(problem.regions)
+    return ChangeUncertainty(*map(np.zeros, sizes))
+
+
+def _regions(cohort: Cohort, config: ChangeConfig) -> dict[str, IntArray]:
+    """Return name -> vertices of the whole surface and of the regions whose volumes are measured.
 
     Raises:
         InputError: a region with vertices that the surfaces do not have.
     """
-    asked = settings.regions
-    if asked is None:
-        asked = {} if cohort.fitted is None else {k: v.tolist() for k, v in cohort.fitted.model.regions.items()}
+    regions = config.regions
+    if regions is None:
+        regions = {} if cohort.fitted is None else {k: v.tolist() for k, v in cohort.fitted.model.regions.items()}
     whole = {WHOLE: np.arange(cohort.n_vertices, dtype=np.int32)}
-    return whole | {name: region_vertices(own, cohort.n_vertices, name) for name, own in asked.items()}
+    return whole | {name: region_vertices(own, cohort.n_vertices, name) for name, own in regions.items()}
 
 
-def _groups(cohort: Cohort, settings: ChangeSettings, visits: Visits, single: Sequence[str]) -> dict[str, str]:
-    """Return subject -> its group; empty where none was asked for.
+def _groups(cohort: Cohort, config: ChangeConfig, visits: Visits, single: Sequence[str]) -> dict[str, str]:
+    """Return subject -> its group; empty without groups.
 
     Raises:
         InputError: a subject in two groups, or other than two groups of two subjects with two visits.
     """
-    if settings.group is None:
+    if config.group is None:
         return {}
-    cells, where = cohort.table.texts(settings.group), cohort.table.where
-    found: dict[str, str] = {}
-    for name, own in visits.of.items():
-        held = sorted({cells[row] for visit in own for row in visit.rows})
-        if len(held) > 1:
+    cells, where = cohort.table.texts(config.group), cohort.table.where
+    group_of_subject: dict[str, str] = {}
+    for name, own in visits.by_subject.items():
+        groups = sorted({cells[row] for visit in own for row in visit.rows})
+        if len(groups) > 1:
             raise InputError(
-                f"{where}: {name} is in two groups by {settings.group!r} ({', '.join(held[:2])}); correct one of them."
+                f"{where}: {name} is in two groups by {config.group!r} ({', '.join(groups[:2])}); correct one of them."
             )
         if name not in single:
-            found[name] = held[0]
-    counts = Counter(found.values())
+            group_of_subject[name] = groups[0]
+    counts = Counter(group_of_subject.values())
     if len(counts) != 2 or min(counts.values()) < 2:
-        told = ", ".join(f"{group}: {count}" for group, count in sorted(counts.items())[:5])
+        counted = ", ".join(f"{group}: {count}" for group, count in sorted(counts.items())[:5])
         raise InputError(
-            f"{where}: {settings.group!r} must part the subjects with two visits into two groups of two or more, not "
-            f"{told}; choose another column."
+            f"{where}: {config.group!r} must part the subjects with two visits into two groups of two or more, not "
+            f"{counted}; choose another column."
         )
-    return found
+    return group_of_subject
 
 
-def _dispersion(
-    answer: Change, maps: FloatArray, second: BoolArray, area: FloatArray, names: tuple[str, ...]
-) -> DispersionTest | None:
+def _dispersion(result: ChangeResult, maps: FloatArray, second: BoolArray, area: FloatArray) -> DispersionTest | None:
     """Return the test of equal dispersion of the changes (N, V) of two groups, vertices weighted by their area."""
-    settings, codes = answer.settings, second.astype(np.intp)
+    config, codes = result.config, second.astype(np.intp)
+    groups = tuple(sorted({subject.group for subject in result.subjects}))
     rooted = maps * np.sqrt(area / area.mean())
     residual = rooted - np.stack([rooted[codes == k].mean(axis=0) for k in (0, 1)])[codes]
     leverage = 1.0 / np.bincount(codes)[codes]
     return dispersion_test(
-        settings.group or "", residual, leverage, codes, names, maps.shape[1], settings.permutations, settings.seed
+        variable=config.group or "",
+        residual=residual,
+        leverage=leverage,
+        codes=codes,
+        groups=groups,
+        n_vertices=maps.shape[1],
+        permutations=config.permutations,
+        seed=config.seed,
     )
 
 
@@ -290,37 +355,38 @@ def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
     return weights_of(np.min(shares, axis=0)) == 0
 
 
-def _tested(answer: Change, groups: Mapping[str, str]) -> Change:
-    """Return the same with its tests over subjects."""
-    settings, subjects = answer.settings, answer.subjects
-    if settings.rate and not answer.unit:
+def _add_tests(result: ChangeResult, groups: Mapping[str, str]) -> ChangeResult:
+    """Return a result with its tests over subjects."""
+    config, subjects = result.config, result.subjects
+    if config.rate and not result.time_unit:
         raise InputError("Rates need times that are numbers or dates; leave out --rate, or name such a --time.")
     if len(subjects) < 2:
-        return answer
-    asked = [effect_of(subject, rate=settings.rate) for subject in subjects]
-    maps = np.stack([one.along_mm for one in asked])
-    blank, landmarks = _blank(subjects), answer.landmarks
+        return result
+    estimates = [change_or_rate(subject, rate=config.rate) for subject in subjects]
+    maps = np.stack([estimate.along_mm for estimate in estimates])
+    blank, landmarks = _blank(subjects), result.landmarks
     at_landmarks = landmarks.interpolate(maps.T)
     at_landmarks[blank[landmarks.corners].any(axis=1)] = 0.0
     # Vertices without variation are never significant, and are excluded from the maxima.
     maps[:, blank] = 0.0
-    volumes = np.stack([one.volumes_mm3 for one in asked])
+    volumes = np.stack([estimate.volumes_mm3 for estimate in estimates])
     area = np.mean([subject.area_mm2 for subject in subjects], axis=0)
-    run = (settings.permutations, settings.seed)
-    unequal = settings.unequal_variances
-    whole, few = np.ones(len(answer.parts)), np.ones(len(landmarks))
-    names: tuple[str, ...] = tuple(sorted(set(groups.values())))
-    second = np.array([groups.get(subject.name) == names[1] for subject in subjects]) if names else None
-    return replace(
-        answer,
-        blank=blank if blank.any() else None,
-        group=mean_test(maps, area, *run),
-        group_volumes=mean_test(volumes, whole, *run),
-        group_landmarks=mean_test(at_landmarks.T, few, *run) if landmarks else None,
-        between=None if second is None else difference_test(maps, second, area, *run, unequal_variances=unequal),
-        between_volumes=None
-        if second is None
-        else difference_test(volumes, second, whole, *run, unequal_variances=unequal),
-        groups=names,
-        dispersion=None if second is None else _dispersion(answer, maps, second, area, names),
+    run = (config.permutations, config.seed)
+    equal_weights = np.ones(len(result.regions))
+    mean_change = MeanChangeTests(
+        surface=mean_test(maps, area, *run),
+        volumes=mean_test(volumes, equal_weights, *run),
+        landmarks=mean_test(at_landmarks.T, np.ones(len(landmarks)), *run) if landmarks else None,
     )
+    difference = None
+    if groups:
+        first_name, second_name = sorted(set(groups.values()))
+        second = np.array([groups[subject.name] == second_name for subject in subjects])
+        unequal = config.unequal_variances
+        difference = GroupDifferenceTests(
+            groups=(first_name, second_name),
+            surface=difference_test(maps, second, area, *run, unequal_variances=unequal),
+            volumes=difference_test(volumes, second, equal_weights, *run, unequal_variances=unequal),
+            dispersion=_dispersion(result, maps, second, area),
+        )
+    return replace(result, blank=blank if blank.any() else None, mean_change=mean_change, group_difference=difference)

@@ -19,7 +19,7 @@ _RIGID = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned:
+class AlignedVisits:
     """The scans of one subject, aligned on what is stable.
 
     Args:
@@ -44,7 +44,7 @@ class Aligned:
         return np.einsum("tvd,vd->tv", self.means - self.means[0], self.normals)
 
 
-def aligned(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) -> Aligned:
+def align_visits(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) -> AlignedVisits:
     """Return the scans of one subject, all brought to the first by what is stable.
 
     Raises:
@@ -68,7 +68,7 @@ def aligned(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) ->
         scans.append(np.stack(own))
     means = np.stack([own.mean(axis=0) for own in scans])
     observed = cohort.observed_in([row for visit in visits for row in visit.rows])
-    return Aligned(tuple(visits), tuple(scans), means, vertex_normals(Mesh(means[0], faces)), weights, observed)
+    return AlignedVisits(tuple(visits), tuple(scans), means, vertex_normals(Mesh(means[0], faces)), weights, observed)
 
 
 def faces_in(cohort: Cohort) -> IntArray:
@@ -102,7 +102,7 @@ def volume_mm3(vertices: FloatArray, faces: IntArray) -> float:
 def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
     """Return (T,) with which visits sum to last minus first, or to the slope of a line by time."""
     if rate:
-        at = np.array([visit.at for visit in visits])
+        at = np.array([visit.time for visit in visits])
         away = at - at.mean()
         return away / float(away @ away)
     out = np.zeros(len(visits))
@@ -116,7 +116,7 @@ def noise_factor(visits: Sequence[Visit], weights: FloatArray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class ChangeUncertainty:
     """Standard deviations of a sum over visits of one subject.
 
     Args:
@@ -130,18 +130,20 @@ class Known:
     volumes_mm3: FloatArray
 
 
-def known_by_stable(subject: Aligned, landmarks: SurfaceLandmarks, parts: FloatArray) -> Known:
+def uncertainty_from_stable_part(
+    subject: AlignedVisits, landmarks: SurfaceLandmarks, parts: FloatArray
+) -> ChangeUncertainty:
     """Return what the spread over the stable part says, which did not change; the same at all vertices."""
     moved = subject.means[-1] - subject.means[0]
     along = np.einsum("vd,vd->v", moved, subject.normals)
     spread_mm = _spread(along, subject.weights)
     marks = np.full(len(landmarks), _spread(np.linalg.norm(moved, axis=1), subject.weights))
-    return Known(np.full(len(along), spread_mm), marks, np.full(len(parts), np.nan))
+    return ChangeUncertainty(np.full(len(along), spread_mm), marks, np.full(len(parts), np.nan))
 
 
-def known_by_fits(
-    cohort: Cohort, subject: Aligned, weights: FloatArray, landmarks: SurfaceLandmarks, parts: FloatArray
-) -> Known:
+def uncertainty_from_fits(
+    cohort: Cohort, subject: AlignedVisits, weights: FloatArray, landmarks: SurfaceLandmarks, parts: FloatArray
+) -> ChangeUncertainty:
     """Return what the fits' own standard deviations say, through modes and alignment.
 
     Coefficients vary by `b_stddev`, modes move the vertices, and the alignment takes out what of that is a rigid motion
@@ -177,7 +179,7 @@ def known_by_fits(
     volumes = (parts @ np.einsum("vdk,vd->vk", moves, outward)) ** 2 @ variance
     summed = weights @ subject.along_mm
     wider = max(1.0, _spread(summed / np.sqrt(np.maximum(along, 1e-18)), subject.weights))
-    return Known(wider * np.sqrt(along), wider * np.sqrt(marks), wider * np.sqrt(volumes))
+    return ChangeUncertainty(wider * np.sqrt(along), wider * np.sqrt(marks), wider * np.sqrt(volumes))
 
 
 def _spread(values: FloatArray, weights: FloatArray) -> float:

@@ -22,12 +22,12 @@ class Visit:
     """One time of one subject.
 
     Args:
-        at: the time in units of `Visits.unit`, or the place in the order of words.
+        time: in units of `Visits.time_unit`, or the place in the order of words.
         label: as the table tells it.
         rows: of its scans; more than one are rescans.
     """
 
-    at: float
+    time: float
     label: str
     rows: tuple[int, ...]
 
@@ -37,13 +37,13 @@ class Visits:
     """The visits of all subjects in a table.
 
     Args:
-        of: subject -> visits, in order.
-        unit: of time, such as "year", for rates; empty where times are words.
+        by_subject: subject -> visits, in order.
+        time_unit: such as "year", for rates; empty where times are words.
         column: that tells the times.
     """
 
-    of: Mapping[str, tuple[Visit, ...]]
-    unit: str
+    by_subject: Mapping[str, tuple[Visit, ...]]
+    time_unit: str
     column: str
 
     __repr__ = short_repr
@@ -51,7 +51,7 @@ class Visits:
     @property
     def rescans(self) -> int:
         """Scans beside the first of their visit."""
-        return sum(len(visit.rows) - 1 for visits in self.of.values() for visit in visits)
+        return sum(len(visit.rows) - 1 for visits in self.by_subject.values() for visit in visits)
 
 
 def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str] | None) -> Visits:
@@ -72,23 +72,23 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
     subjects, labels = table.texts(subject), table.texts(column)
     marks = table.columns.get(RESCAN)
     rows: dict[str, dict[float, list[int]]] = {}
-    for row, (who, at) in enumerate(zip(subjects, places, strict=True)):
-        rows.setdefault(who, {}).setdefault(at, []).append(row)
+    for row, (name, place) in enumerate(zip(subjects, places, strict=True)):
+        rows.setdefault(name, {}).setdefault(place, []).append(row)
     if marks is not None:
-        for who, times in rows.items():
+        for name, times in rows.items():
             for scans in times.values():
                 plain = [row for row in scans if marks[row].lower() in _NOT_MARKED]
                 if len(plain) > 1:
                     raise InputError(
-                        f"{table.where}: {who} has {len(plain)} scans at {labels[plain[0]]} "
+                        f"{table.where}: {name} has {len(plain)} scans at {labels[plain[0]]} "
                         f"({named([table.rows[row] for row in plain])}) that the column {RESCAN} does not mark as "
                         "rescans; mark all but one, or correct their times."
                     )
-    found = {
-        who: tuple(Visit(at, labels[scans[0]], tuple(scans)) for at, scans in sorted(times.items()))
-        for who, times in rows.items()
+    visits = {
+        name: tuple(Visit(place, labels[scans[0]], tuple(scans)) for place, scans in sorted(times.items()))
+        for name, times in rows.items()
     }
-    return Visits(found, unit, column)
+    return Visits(visits, unit, column)
 
 
 def time_column(table: Table, time: str | None) -> str:

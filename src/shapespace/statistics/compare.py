@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,10 +17,9 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
-from shapespace.statistics.answer import Answer
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.compare_formula import (
     Design,
     Term,
@@ -33,12 +31,11 @@ from shapespace.statistics.compare_formula import (
 from shapespace.statistics.compare_maps import EffectMap, effect_maps
 from shapespace.statistics.compare_strata import Stratum, less
 from shapespace.statistics.compare_unequal import Units, is_between_units, units_of
-from shapespace.statistics.compare_within import Strata, Within, strata_of
+from shapespace.statistics.compare_within import ModelStrata, RepeatedMeasures, WithinSubjects, strata_of
 from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, effect_size
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
-from shapespace.statistics.methods_answer import dispersion_sentence, is_dispersion_warning
-from shapespace.statistics.observed import information, weights_of
+from shapespace.statistics.observation_weights import information, weights_of
 from shapespace.types import FloatArray, read_only, require
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -47,12 +44,12 @@ TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
 
 _RANK = 1e-9
 _TIE = 1e-9
-_MOST_LEVELS = 6
-_FEWEST = 20
+MOST_LEVELS = 6
+"""Largest number of classes of a variable whose pairs are compared."""
 
 
 @dataclass(frozen=True)
-class CompareOptions:
+class CompareConfig:
     """How groups are compared.
 
     Args:
@@ -65,7 +62,7 @@ class CompareOptions:
         maps: whether to test each vertex.
         bump_width_mm: of fits: also search, at each vertex, for a bump of this width (standard deviation, mm) along the
             normals, beyond the variation between shapes.
-        level: level of significance.
+        alpha: level of significance.
         drop_missing: exclude shapes with missing values in the table (default: an error).
         random: random effects: those within subjects that differ between subjects, such as `1 + time | subject`; all
             others are assumed to be equal in all subjects (default with blocks: all).
@@ -81,7 +78,7 @@ class CompareOptions:
     seed: int = 0
     maps: bool = True
     bump_width_mm: float | None = None
-    level: float = 0.05
+    alpha: float = 0.05
     drop_missing: bool = False
     random: str | None = None
     unequal_variances: bool = False
@@ -94,7 +91,7 @@ class CompareOptions:
             )
         if not 20 <= self.permutations <= 1_000_000:
             raise InputError(f"The number of permutations must lie from 20 to 1000000, not at {self.permutations}.")
-        if self.seed < 0 or not 0 < self.level < 1:
+        if self.seed < 0 or not 0 < self.alpha < 1:
             raise InputError("The seed must be 0 or more, and the level of significance between 0 and 1.")
         if self.effect_size not in EFFECT_SIZES:
             raise InputError(f"There is no effect size {self.effect_size!r}; choose one of {', '.join(EFFECT_SIZES)}.")
@@ -102,7 +99,7 @@ class CompareOptions:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TermTest:
     """A row of the Procrustes analysis of variance.
 
@@ -113,7 +110,7 @@ class TermTest:
         squares: sum of squares, mm².
         r2: its share of the total of the stratum.
         f: mean square divided by that of the residuals; with unequal variances, squared effect divided by its variance.
-        z: F in standard deviations above the mean of its arrangements, after `CompareOptions.effect_size`.
+        z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
     """
@@ -131,19 +128,29 @@ class TermTest:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True)
-class Remainder:
-    """Residuals and total of a stratum: degrees of freedom, and sums of squares in mm²."""
+@dataclass(frozen=True, kw_only=True)
+class StratumSummary:
+    """Residuals and total of a stratum.
+
+    Args:
+        stratum: its name.
+        df: degrees of freedom of the residuals.
+        squares: their sum of squares, mm².
+        df_total: degrees of freedom of the total.
+        squares_total: total sum of squares, mm².
+        log_arrangements: logarithm of the number of different arrangements, for the term with the fewest.
+    """
 
     stratum: str
     df: int
     squares: float
     df_total: int
     squares_total: float
+    log_arrangements: float
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class ShapeEffect:
     """What differs between two values of a variable, all other variables being the same.
 
     Args:
@@ -157,7 +164,7 @@ class Effect:
         distance_mm: Procrustes distance, the root of the squared changes summed over vertices.
         rms_mm: root of their mean.
         f: squared distance by its variance.
-        z: F in standard deviations above the mean of its arrangements, after `CompareOptions.effect_size`.
+        z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
         p: share of arrangements with an F as large.
         p_family: the same by the largest F of all pairs of classes of this variable.
         map: vertex by vertex; None where it was not asked for.
@@ -189,7 +196,7 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Angle:
+class EffectAngle:
     """The angle between two changes of shape; `p` tests whether they are parallel, None where that is not asked."""
 
     first: str
@@ -198,37 +205,35 @@ class Angle:
     p: float | None
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CompareResult(AnalysisResult):
     """A linear model of shapes on covariates, with its tests.
 
     Args:
         cohort: whose shapes they are, as far as they were used.
         design: the columns.
-        options: how they were compared.
+        config: options of the comparison.
         tests: of the terms.
         remainders: of the strata.
         effects: of the variables, and of pairs of them that interact.
         angles: between effects.
-        warnings: what makes the numbers less than they look, a sentence each.
-        subjects: number of subjects; that of shapes where all are independent.
-        notes: sentences on the tests of repeated shapes of subjects.
+        n_subjects: number of subjects; that of shapes where all are independent.
         dispersions: tests of equal dispersion of the classes of each variable between subjects.
         methods: sample sizes, tests and assumptions.
+        repeated_measures: how several shapes of a subject enter the tests; None where all shapes are independent.
     """
 
     cohort: Cohort
     design: Design
-    options: CompareOptions
+    config: CompareConfig
     tests: tuple[TermTest, ...]
-    remainders: tuple[Remainder, ...]
-    effects: tuple[Effect, ...]
-    angles: tuple[Angle, ...]
-    warnings: tuple[str, ...]
-    subjects: int
+    strata: tuple[StratumSummary, ...]
+    effects: tuple[ShapeEffect, ...]
+    angles: tuple[EffectAngle, ...]
+    n_subjects: int
+    dispersions: tuple[DispersionTest, ...]
     methods: Methods
-    notes: tuple[str, ...] = ()
-    dispersions: tuple[DispersionTest, ...] = ()
+    repeated_measures: RepeatedMeasures | None
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -241,30 +246,23 @@ class Comparison:
         Raises:
             InputError: there is none of that name.
         """
-        found = [one for one in self.tests if one.term == term]
-        if not found:
-            raise InputError(f"There is no term {term!r}; there is {', '.join(one.term for one in self.tests)}.")
-        return found[0]
-
-    def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
-        return lazy_import("answer_of_comparison")(self)
+        matches = [test for test in self.tests if test.term == term]
+        if not matches:
+            raise InputError(f"There is no term {term!r}; there is {', '.join(test.term for test in self.tests)}.")
+        return matches[0]
 
     def __repr__(self) -> str:
         terms = listed_briefly([f"{test.term}: R² {100 * test.r2:.1f} %, p {test.p:.3g}" for test in self.tests])
-        return f"<Comparison of {len(self.cohort)} shapes of {self.subjects} subjects; {terms}>"
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
+        return f"<CompareResult of {len(self.cohort)} shapes of {self.n_subjects} subjects; {terms}>"
 
 
 def compare(
     cohort: Cohort,
     formula: str,
-    options: CompareOptions | None = None,
+    config: CompareConfig | None = None,
     *,
-    on_step: Callable[[int, int], None] | None = None,
-) -> Comparison:
+    progress: Callable[[int, int], None] | None = None,
+) -> CompareResult:
     """Return the linear model of a cohort's shapes on what the formula names, tested by permutation of residuals.
 
     `size` and `log_size`, the centroid size in mm and its logarithm, may stand in the formula beside the columns of the
@@ -273,8 +271,8 @@ def compare(
     Args:
         cohort: the shapes and their table.
         formula: such as `~ sex + age`.
-        options: None for the defaults.
-        on_step: called with (done, total).
+        config: None for the defaults.
+        progress: called with (done, total).
 
     Raises:
         InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
@@ -285,81 +283,72 @@ def compare(
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
     require(formula, str, "compare", "write a formula such as '~ sex + age'")
-    options = options or CompareOptions()
-    require(options, CompareOptions, "compare", "give options as CompareOptions(...)")
+    config = config or CompareConfig()
+    require(config, CompareConfig, "compare", "give the options as CompareConfig(...)")
     own = tuple(cohort.table.columns)
     cohort = _with_sizes(cohort)
-    random, options = _random(options, cohort)
+    random, config = _random(config, cohort)
     named = columns_of(formula, cohort.table)
     unknown = int(np.isnan(cohort.sizes_mm).sum())
-    if unknown and not options.drop_missing and {"size", "log_size"} & set(named) - set(own):
+    if unknown and not config.drop_missing and {"size", "log_size"} & set(named) - set(own):
         raise InputError(
             f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
             "out with --drop-missing."
         )
-    cohort = cohort.complete([*named, *([options.blocks] if options.blocks else ())], drop_missing=options.drop_missing)
+    cohort = cohort.complete([*named, *([config.blocks] if config.blocks else ())], drop_missing=config.drop_missing)
     design = design_of(formula, cohort.table)
-    subjects = None if options.blocks is None else cohort.table.texts(options.blocks)
+    subjects = None if config.blocks is None else cohort.table.texts(config.blocks)
     repeated = subjects is not None and len(set(subjects)) < len(subjects)
     made = strata_of(
-        cohort.coefficients, design, subjects if repeated else None, options.blocks or "", options.anova_type, random
+        cohort.coefficients, design, subjects if repeated else None, config.blocks or "", config.anova_type, random
     )
     strata = made.every
     families = [_weighted(cohort, design, family) for family in _families(design, made)]
-    total = len(design.terms) + len(families) * (1 + options.maps)
-    step = _Steps(total, on_step)
+    total = len(design.terms) + len(families) * (1 + config.maps)
+    step = _Steps(total, progress)
     owners = subjects if repeated else None
     tests = tuple(
         test
         for stratum in strata
         for test in term_tests(
-            stratum, options, step, units_of(stratum, design, owners) if options.unequal_variances else None
+            stratum, config, step, units_of(stratum, design, owners) if config.unequal_variances else None
         )
     )
     effects = tuple(
-        replace(effect, exploratory=_is_exploratory(effect, design, tests, options))
+        replace(effect, exploratory=_is_exploratory(effect, design, tests, config))
         for family in families
-        for effect in _effects(cohort, family, design, owners, options, step)
+        for effect in _effects(cohort, family, design, owners, config, step)
     )
     dispersions = tuple(
         test
         for stratum in strata
         if is_between_units(stratum)
-        for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, options.permutations, options.seed)
+        for test in units_of(stratum, design, owners).dispersions(cohort.n_vertices, config.permutations, config.seed)
     )
-    methods = _methods(cohort, design, strata, subjects, dispersions, options)
-    warnings = (
-        *(
-            dispersion_sentence(one, options.unequal_variances, cohort.unit)
-            for one in methods.dispersions
-            if is_dispersion_warning(one, unequal_variances=options.unequal_variances)
-        ),
-        *_warnings(cohort, strata, options, subjects), *made.warnings, *_uncentred(design, options), *_left_out(design),
-    )  # fmt: skip
-    return Comparison(
+    methods = _methods(cohort, design, strata, subjects, dispersions, config)
+    return CompareResult(
         cohort=cohort,
         design=design,
-        options=options,
+        config=config,
         tests=tests,
-        remainders=tuple(_remainder(stratum) for stratum in strata),
+        strata=tuple(_summarise_stratum(stratum, config) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, made, options), *_between(effects)),
-        warnings=warnings,
-        subjects=len(set(subjects)) if subjects is not None else len(cohort),
-        methods=methods,
-        notes=made.notes,
+        angles=(*_parallel(design, made, config), *_between(effects)),
+        n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
         dispersions=dispersions,
+        methods=methods,
+        repeated_measures=made.repeated_measures,
     )
 
 
-def _random(options: CompareOptions, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareOptions]:
+def _random(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareConfig]:
     """Return the random effects, None for all, and the options with the column of subjects as their blocks."""
-    if options.random is None:
-        return None, options
-    effects, column = random_effects_of(options.random, cohort.table)
-    if options.blocks not in (None, column):
-        raise InputError(f"Blocks of {options.blocks!r} and random terms of {column!r} differ; give one of the two.")
-    return effects, replace(options, blocks=column)
+    if config.random is None:
+        return None, config
+    effects, column = random_effects_of(config.random, cohort.table)
+    if config.blocks not in (None, column):
+        raise InputError(f"Blocks of {config.blocks!r} and random terms of {column!r} differ; give one of the two.")
+    return effects, replace(config, blocks=column)
 
 
 class _Steps:
@@ -383,56 +372,56 @@ def _methods(
     strata: Sequence[Stratum],
     subjects: Sequence[str] | None,
     dispersions: Sequence[DispersionTest],
-    options: CompareOptions,
+    config: CompareConfig,
 ) -> Methods:
     """Return sample sizes, tests and assumptions of a comparison."""
     owners = cohort.names if subjects is None else subjects
-    unit = options.blocks or "shape"
+    unit = config.blocks or "shape"
     schemes: list[TestScheme] = []
     for stratum in strata:
         for term in stratum.terms:
-            reduced = stratum.reduced(term, options.anova_type)
-            flips = options.unequal_variances or stratum.flips(reduced)
+            reduced = stratum.reduced(term, config.anova_type)
+            flips = config.unequal_variances or stratum.flips(reduced)
             schemes.append(
                 TestScheme(
                     tested=(term.label,),
-                    statistic="F, unequal variances" if options.unequal_variances else "F",
+                    statistic="F, unequal variances" if config.unequal_variances else "F",
                     stratum=stratum.name,
                     resampling="sign flips" if flips else "permutation",
                     unit=unit if is_between_units(stratum) else f"difference within a {unit}",
                     reduced_model=tuple(other.label for other in reduced),
-                    arrangements=options.permutations,
-                    unequal_variances=options.unequal_variances,
+                    arrangements=config.permutations,
+                    unequal_variances=config.unequal_variances,
                 )
             )
     classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
     return methods_of(
         cohort,
         len(set(owners)),
-        level=options.level,
+        level=config.alpha,
         sizes=sample_sizes(owners, classes),
         tests=tuple(schemes),
-        dispersions=tuple(dispersion_record(one, options.level) for one in dispersions),
-        unequal_variances=options.unequal_variances if classes else None,
-        effect_size=options.effect_size,
+        dispersions=tuple(dispersion_record(one, config.alpha) for one in dispersions),
+        unequal_variances=config.unequal_variances if classes else None,
+        effect_size=config.effect_size,
         r2_strata=tuple(stratum.name for stratum in strata),
         corrected_over=(
-            *(("the vertices of a map (family-wise error, or false discovery rate)",) if options.maps else ()),
+            *(("the vertices of a map (family-wise error, or false discovery rate)",) if config.maps else ()),
             "the pairs of classes of a variable (p of all pairs)",
         ),
     )
 
 
-def _is_exploratory(effect: Effect, design: Design, tests: Sequence[TermTest], options: CompareOptions) -> bool:
+def _is_exploratory(effect: ShapeEffect, design: Design, tests: Sequence[TermTest], config: CompareConfig) -> bool:
     """Return whether no term that contains the variables of an effect is significant."""
     names = {one.column for one in design.variables if one.name in effect.name.split(":")}
     own = {term.label for term in design.terms if names <= term.variables}
-    return not any(test.term in own and test.p <= options.level for test in tests)
+    return not any(test.term in own and test.p <= config.alpha for test in tests)
 
 
 def term_tests(
     stratum: Stratum,
-    options: CompareOptions,
+    config: CompareConfig,
     step: Callable[[], None] = lambda: None,
     units: Units | None = None,
 ) -> Iterator[TermTest]:
@@ -440,7 +429,7 @@ def term_tests(
 
     Args:
         stratum: the stratum.
-        options: of the comparison.
+        config: of the comparison.
         step: called after each term.
         units: of the stratum, to test with unequal variances; None assumes equal ones.
 
@@ -449,12 +438,12 @@ def term_tests(
     """
     total = float((stratum.shapes**2).sum())
     for term in stratum.terms:
-        reduced = stratum.reduced(term, options.anova_type)
+        reduced = stratum.reduced(term, config.anova_type)
         residual = stratum.residual(reduced)
         own = _span(less(stratum.matrix[:, stratum.at([term])], stratum.matrix[:, stratum.at(reduced)]))
         rest = _span(stratum.matrix - own @ (own.T @ stratum.matrix), stratum.matrix.shape[1] - own.shape[1])
-        count = options.permutations if units is None else 1
-        products = stratum.products(np.hstack([own, rest]), residual, count, options.seed, flips=stratum.flips(reduced))
+        count = config.permutations if units is None else 1
+        products = stratum.products(np.hstack([own, rest]), residual, count, config.seed, flips=stratum.flips(reduced))
         squares = (products**2).sum(axis=2)
         df = own.shape[1]
         explained = squares[:, :df].sum(axis=1)  # S2
@@ -462,25 +451,36 @@ def term_tests(
         if units is not None:
             # Columns of the reduced model are not tested; each unit has its own variance.
             f = units.estimate(
-                units.own(term, reduced), [term], reduced, options.permutations, options.seed, term.label
+                units.own(term, reduced), [term], reduced, config.permutations, config.seed, term.label
             ).statistic()
         yield TermTest(
-            term.label, stratum.name, df, float(explained[0]), float(explained[0] / total), float(f[0]),
-            effect_size(f, options.effect_size), _share(f), read_only(f),
-        )  # fmt: skip
+            term=term.label,
+            stratum=stratum.name,
+            df=df,
+            squares=float(explained[0]),
+            r2=float(explained[0] / total),
+            f=float(f[0]),
+            z=effect_size(f, config.effect_size),
+            p=_share(f),
+            arrangements=read_only(f),
+        )
         step()
 
 
-def _remainder(stratum: Stratum) -> Remainder:
-    left = stratum.residual(stratum.terms)
-    return Remainder(
-        stratum.name, stratum.df_error, float((left**2).sum()), len(stratum.matrix) - stratum.removed,
-        float((stratum.shapes**2).sum()),
-    )  # fmt: skip
+def _summarise_stratum(stratum: Stratum, config: CompareConfig) -> StratumSummary:
+    residual = stratum.residual(stratum.terms)
+    return StratumSummary(
+        stratum=stratum.name,
+        df=stratum.df_error,
+        squares=float((residual**2).sum()),
+        df_total=len(stratum.matrix) - stratum.removed,
+        squares_total=float((stratum.shapes**2).sum()),
+        log_arrangements=stratum.fewest_log_arrangements(flips=config.unequal_variances),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Ends:
+class _Contrast:
     """A contrast of a stratum, the terms of its reduced model, and the weight (V,) of each vertex."""
 
     low: str
@@ -492,14 +492,14 @@ class _Ends:
 
 
 @dataclass(frozen=True, eq=False)
-class _Family:
+class _ContrastFamily:
     """Contrasts of one variable, or of two that interact."""
 
     name: str
-    ends: tuple[_Ends, ...]
+    ends: tuple[_Contrast, ...]
 
 
-def _families(design: Design, strata: Strata) -> Iterator[_Family]:
+def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
     within = strata.within
     for one in design.variables:
         alone = [term for term in design.terms if term.variables == frozenset({one.column})]
@@ -507,31 +507,33 @@ def _families(design: Design, strata: Strata) -> Iterator[_Family]:
         both = frozenset({one.column})
         if within is not None and within.holds(both):
             ends = [_within_ends(within, one, low, high) for low, high in _pairs(one)]
-            yield _Family(one.name, tuple(ends))
+            yield _ContrastFamily(one.name, tuple(ends))
             continue
         for stratum in strata.every:
             if any(term in stratum.terms for term in wanted):
                 reduced = tuple(stratum.without(both))
                 ends = [
-                    _Ends(one.told(low), one.told(high), stratum, reduced, design.contrast(one.column, low, high))
+                    _Contrast(one.told(low), one.told(high), stratum, reduced, design.contrast(one.column, low, high))
                     for low, high in _pairs(one)
                 ]
-                yield _Family(one.name, tuple(ends))
+                yield _ContrastFamily(one.name, tuple(ends))
     for one, other in _interacting(design):
         both = frozenset({one.column, other.column})
         (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
         what, name = _told(one, low, high), f"{one.name}:{other.name}"
         words = f"{what} at {other.told(first)}", f"the same at {other.told(second)}"
         if within is not None and within.holds(both):
-            yield _Family(name, (_within_interaction(within, one, other, words),))
+            yield _ContrastFamily(name, (_within_interaction(within, one, other, words),))
             continue
         change = [design.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
         for stratum in strata.every:
             if any(both <= term.variables for term in stratum.terms):
-                yield _Family(name, (_Ends(*words, stratum, tuple(stratum.without(both)), change[1] - change[0]),))
+                yield _ContrastFamily(
+                    name, (_Contrast(*words, stratum, tuple(stratum.without(both)), change[1] - change[0]),)
+                )
 
 
-def _weighted(cohort: Cohort, design: Design, family: _Family) -> _Family:
+def _weighted(cohort: Cohort, design: Design, family: _ContrastFamily) -> _ContrastFamily:
     """Return a family with the share of the information on each contrast that the observations of a vertex carry.
 
     The scans of a subject count one by one, also where a test combines them.
@@ -552,16 +554,16 @@ def _weighted(cohort: Cohort, design: Design, family: _Family) -> _Family:
     return replace(family, ends=tuple(replace(e, weight=w) for e, w in zip(family.ends, weights, strict=True)))
 
 
-def _within_ends(within: Within, one: Variable, low: str | float, high: str | float) -> _Ends:
+def _within_ends(within: WithinSubjects, one: Variable, low: str | float, high: str | float) -> _Contrast:
     """Return the change of a variable within subjects, at the average of the variables between subjects."""
     own = frozenset({one.column})
     stratum, between = within.contrast_stratum(
         within.effects.contrast(one.column, low, high), own, _told(one, low, high)
     )
-    return _Ends(one.told(low), one.told(high), stratum, tuple(stratum.without(own)), between.average({}))
+    return _Contrast(one.told(low), one.told(high), stratum, tuple(stratum.without(own)), between.average({}))
 
 
-def _within_interaction(within: Within, one: Variable, other: Variable, words: tuple[str, str]) -> _Ends:
+def _within_interaction(within: WithinSubjects, one: Variable, other: Variable, words: tuple[str, str]) -> _Contrast:
     """Return the contrast of two variables of which one or both differ within subjects."""
     both = frozenset({one.column, other.column})
     (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
@@ -569,18 +571,18 @@ def _within_interaction(within: Within, one: Variable, other: Variable, words: t
     if both <= within.variables:
         change = [within.effects.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
         stratum, between = within.contrast_stratum(change[1] - change[0], both, name)
-        return _Ends(*words, stratum, tuple(stratum.without(both)), between.average({}))
+        return _Contrast(*words, stratum, tuple(stratum.without(both)), between.average({}))
     inner, outer = (one, other) if one.column in within.variables else (other, one)
     (low, high), (first, second) = _pairs(inner)[0], _pairs(outer)[0]
     contrast = within.effects.contrast(inner.column, low, high)
     stratum, between = within.contrast_stratum(contrast, frozenset({inner.column}), name)
-    return _Ends(*words, stratum, tuple(stratum.without(both)), between.contrast(outer.column, first, second))
+    return _Contrast(*words, stratum, tuple(stratum.without(both)), between.contrast(outer.column, first, second))
 
 
 def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, float]]:
     """Return the pairs of values between which a change is shown."""
     if variable.levels:
-        return list(itertools.combinations(variable.levels[:_MOST_LEVELS], 2))
+        return list(itertools.combinations(variable.levels[:MOST_LEVELS], 2))
     return [(variable.low, variable.high)]
 
 
@@ -598,23 +600,23 @@ def _interacting(design: Design) -> Iterator[tuple[Variable, Variable]]:
 
 def _effects(
     cohort: Cohort,
-    family: _Family,
+    family: _ContrastFamily,
     design: Design,
     subjects: Sequence[str] | None,
-    options: CompareOptions,
+    config: CompareConfig,
     step: Callable[[], None],
-) -> Iterator[Effect]:
+) -> Iterator[ShapeEffect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, design, subjects, options) for own in parts]
+    made = [_tested_together(cohort, own, design, subjects, config) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
-    if options.maps:
+    if config.maps:
         step()
     for own, (statistics, changes, maps) in zip(parts, made, strict=True):
         for ends, f, change, shown in zip(own, statistics, changes, maps, strict=True):
             distance = float(np.linalg.norm(change))
-            yield Effect(
+            yield ShapeEffect(
                 name=family.name,
                 low=ends.low,
                 high=ends.high,
@@ -625,7 +627,7 @@ def _effects(
                 distance_mm=distance,
                 rms_mm=distance / math.sqrt(cohort.n_vertices),
                 f=float(f[0]),
-                z=effect_size(f, options.effect_size),
+                z=effect_size(f, config.effect_size),
                 p=_share(f),
                 p_family=float((largest >= f[0] * (1 - _TIE)).mean()),
                 map=shown,
@@ -634,35 +636,42 @@ def _effects(
 
 def _tested_together(
     cohort: Cohort,
-    family: Sequence[_Ends],
+    family: Sequence[_Contrast],
     design: Design,
     subjects: Sequence[str] | None,
-    options: CompareOptions,
+    config: CompareConfig,
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum."""
     stratum, reduced = family[0].stratum, family[0].reduced
-    if options.unequal_variances:
-        return _tested_unequal(cohort, family, units_of(stratum, design, subjects), options)
+    if config.unequal_variances:
+        return _tested_unequal(cohort, family, units_of(stratum, design, subjects), config)
     residual, flips = stratum.residual(reduced), stratum.flips(reduced)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
     along = (directions / lengths[:, None]) @ stratum.basis
-    products = stratum.products(stratum.basis, residual, options.permutations, options.seed, flips=flips)
+    products = stratum.products(stratum.basis, residual, config.permutations, config.seed, flips=flips)
     error = ((residual**2).sum() - (products**2).sum(axis=(1, 2))) / stratum.df_error
     f = np.stack([_ratio((np.einsum("m,pmk->pk", a, products) ** 2).sum(axis=1), error) for a in along])
     changes = directions @ stratum.shapes
-    if not options.maps:
+    if not config.maps:
         return f, changes, [None] * len(family)
     weights = [ends.weight for ends in family if ends.weight is not None]
     maps = effect_maps(
-        cohort, stratum, residual, products, along, changes, options.bump_width_mm,
-        np.stack(weights) if weights else None, level=options.level,
-    )  # fmt: skip
+        cohort=cohort,
+        stratum=stratum,
+        residual=residual,
+        products=products,
+        along=along,
+        changes=changes,
+        bump_width_mm=config.bump_width_mm,
+        weights=np.stack(weights) if weights else None,
+        alpha=config.alpha,
+    )
     return f, changes, maps
 
 
 def _tested_unequal(
-    cohort: Cohort, family: Sequence[_Ends], units: Units, options: CompareOptions
+    cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
     """Return F (E, P), changes (E, K) in mm and maps of E contrasts of one stratum, with unequal variances."""
     stratum = units.stratum
@@ -679,22 +688,29 @@ def _tested_unequal(
         direction = stratum.direction(ends.contrast)
         own = (direction / max(float(np.linalg.norm(direction)), 1e-300))[:, None]
         label = f"{ends.low} to {ends.high}"
-        estimate = units.estimate(own, tested, ends.reduced, options.permutations, options.seed, label)
+        estimate = units.estimate(own, tested, ends.reduced, config.permutations, config.seed, label)
         statistics.append(estimate.statistic())
         changes.append(direction @ stratum.shapes)
         maps += (
             effect_maps(
-                cohort, stratum, estimate.flips.residual, estimate.flips.fitted, estimate.along, changes[-1][None],
-                options.bump_width_mm, None if ends.weight is None else ends.weight[None], estimates=[estimate],
-                level=options.level,
+                cohort=cohort,
+                stratum=stratum,
+                residual=estimate.flips.residual,
+                products=estimate.flips.fitted,
+                along=estimate.along,
+                changes=changes[-1][None],
+                bump_width_mm=config.bump_width_mm,
+                weights=None if ends.weight is None else ends.weight[None],
+                estimates=[estimate],
+                alpha=config.alpha,
             )
-            if options.maps
+            if config.maps
             else [None]
-        )  # fmt: skip
+        )
     return np.stack(statistics), np.stack(changes), maps
 
 
-def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterator[Angle]:
+def _parallel(design: Design, strata: ModelStrata, config: CompareConfig) -> Iterator[EffectAngle]:
     """Yield angles between what a variable changes in one class of another and in the next, where they interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
@@ -705,18 +721,18 @@ def _parallel(design: Design, strata: Strata, options: CompareOptions) -> Iterat
         main = [term for term in design.terms if term.variables == frozenset({one.column})]
         if not together or not main or len(one.levels) > 2 or not other.levels:
             continue
-        levels = other.levels[:_MOST_LEVELS]
+        levels = other.levels[:MOST_LEVELS]
         words = [f"{_told(one, *_pairs(one)[0])}, {other.told(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
-        for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, options), strict=False):
+        for (first, second), drawn in zip(pairs, _changes_in_pairs(design, strata, one, other, config), strict=False):
             angles = _angles(*drawn)
             # Their arrangements assume equal variances.
-            p = None if options.unequal_variances else float((angles >= angles[0] - _TIE).mean())
-            yield Angle(words[first], words[second], float(angles[0]), p)
+            p = None if config.unequal_variances else float((angles >= angles[0] - _TIE).mean())
+            yield EffectAngle(words[first], words[second], float(angles[0]), p)
 
 
 def _changes_in_pairs(
-    design: Design, strata: Strata, one: Variable, other: Variable, options: CompareOptions
+    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield the changes (P, K) by a variable in the two classes of each pair of another, in each arrangement.
 
@@ -724,13 +740,13 @@ def _changes_in_pairs(
     """
     both = frozenset({one.column, other.column})
     low, high = _pairs(one)[0]
-    levels = other.levels[:_MOST_LEVELS]
+    levels = other.levels[:MOST_LEVELS]
     within = strata.within
     if within is None or not within.holds(both):
         stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
         if stratum is not None and any(term.variables == frozenset({one.column}) for term in stratum.terms):
             contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in levels]
-            yield from itertools.combinations(_changes_of(stratum, both, contrasts, options), 2)
+            yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
         return
     if one.column not in within.variables:
         return
@@ -738,7 +754,7 @@ def _changes_in_pairs(
         contrast = within.effects.contrast(one.column, low, high)
         stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
         contrasts = [between.average({other.column: level}) for level in levels]
-        yield from itertools.combinations(_changes_of(stratum, both, contrasts, options), 2)
+        yield from itertools.combinations(_changes_of(stratum, both, contrasts, config), 2)
         return
     # Both within subjects: each arrangement exchanges the two changes in some subjects.
     own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
@@ -747,82 +763,33 @@ def _changes_in_pairs(
         middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
         mean = middle.direction(parts.average({})) @ middle.shapes
         differ = half.direction(between.average({}))
-        flipped = half.products(differ[:, None], half.shapes, options.permutations, options.seed, flips=True)[:, 0]
+        flipped = half.products(differ[:, None], half.shapes, config.permutations, config.seed, flips=True)[:, 0]
         yield mean + flipped, mean - flipped
 
 
 def _changes_of(
-    stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], options: CompareOptions
+    stratum: Stratum, variables: frozenset[str], contrasts: Sequence[FloatArray], config: CompareConfig
 ) -> list[FloatArray]:
     """Return contrasts (P, K) in each arrangement of the model without the terms of some variables."""
     reduced = stratum.without(variables)
     residual = stratum.residual(reduced)
-    products = stratum.products(
-        stratum.basis, residual, options.permutations, options.seed, flips=stratum.flips(reduced)
-    )
+    products = stratum.products(stratum.basis, residual, config.permutations, config.seed, flips=stratum.flips(reduced))
     products += stratum.basis.T @ (stratum.shapes - residual)
     return [np.einsum("m,pmk->pk", stratum.basis.T @ stratum.direction(one), products) for one in contrasts]
 
 
-def _between(effects: Sequence[Effect]) -> Iterator[Angle]:
+def _between(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
     """Yield angles between the effects of different variables."""
     for one, other in itertools.combinations(effects, 2):
         if one.name != other.name and ":" not in one.name + other.name:
             angle = float(_angles(one.change[None], other.change[None])[0])
-            yield Angle(one.label, other.label, angle, None)
+            yield EffectAngle(one.label, other.label, angle, None)
 
 
 def _angles(one: FloatArray, other: FloatArray) -> FloatArray:
     """Return the (P,) angles in degrees of vectors (P, K) (S10)."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.maximum(lengths, 1e-300), -1, 1)))
-
-
-def _warnings(
-    cohort: Cohort, strata: Sequence[Stratum], options: CompareOptions, subjects: Sequence[str] | None
-) -> Iterator[str]:
-    own = cohort.table.columns.get("subject", ())
-    if subjects is None and all(own) and len(set(own)) < len(own):
-        yield (
-            f"The {len(own)} shapes are of {len(set(own))} subjects and are taken for independent, which makes "
-            "differences look surer than they are; say --blocks subject."
-        )
-    if subjects is not None:
-        counts = Counter(subjects)
-        if max(counts.values()) == 1:
-            yield f"No {options.blocks} has two shapes, so --blocks changes nothing."
-        elif len(set(counts.values())) > 1 and len(strata) and strata[0].name.startswith("between"):
-            yield (
-                f"There are {min(counts.values())} to {max(counts.values())} shapes of a {options.blocks}; each counts "
-                "once, by its mean, and p is approximate where means of few scans are noisier."
-            )
-    for stratum in strata:
-        fewest = stratum.fewest_log_arrangements(flips=options.unequal_variances)
-        if fewest < math.log(_FEWEST):
-            yield (
-                f"There are only {round(math.exp(fewest))} arrangements"
-                f"{' ' + stratum.name if stratum.name else ''} that differ, so no p can be small."
-            )
-
-
-def _left_out(design: Design) -> Iterator[str]:
-    for one in design.variables:
-        if len(one.levels) > _MOST_LEVELS:
-            yield f"{one.name} has {len(one.levels)} classes; pairs of the first {_MOST_LEVELS} are compared."
-
-
-def _uncentred(design: Design, options: CompareOptions) -> Iterator[str]:
-    for one in design.variables:
-        # Where a function has moved it, as center(age) does, 0 is where it says.
-        apart = any(
-            one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
-            for term in design.terms
-        )
-        if options.anova_type == "III" and apart and not one.levels and one.low * one.high > 0:
-            yield (
-                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
-                f"center({one.name}) in the formula, or take type II."
-            )
 
 
 def _share(statistic: FloatArray) -> float:

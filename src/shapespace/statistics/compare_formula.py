@@ -50,7 +50,7 @@ _ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
 _CONTEXT = {"sqrt": np.sqrt}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Variable:
     """A column that a formula names, as numbers or as classes.
 
@@ -94,7 +94,7 @@ class Term:
     columns: tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Design:
     """The columns of a linear model beside the intercept.
 
@@ -315,7 +315,14 @@ def design_of(formula: str, table: Table) -> Design:
         if not np.isfinite(matrix[:, [at + 1 for at in term.columns]]).all():
             raise InputError(f"{table.where}: {term.label} is not finite in all rows, as a logarithm of 0 would be.")
     return Design(
-        formula, read_only(matrix[:, 1:]), terms, tuple(inside.values()), own_values, variable_of, codes, spec
+        formula=formula,
+        matrix=read_only(matrix[:, 1:]),
+        terms=terms,
+        variables=tuple(inside.values()),
+        values=own_values,
+        factors=variable_of,
+        _codes=codes,
+        _spec=spec,
     )
 
 
@@ -561,7 +568,9 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
         if two or low == high:
             low, high = float(numbers.min()), float(numbers.max())
         groups = (_group(low), _group(high)) if two else ()
-        return Variable(name, column, (), groups, low, high, float(numbers.mean())), [float(v) for v in numbers]
+        return Variable(
+            name=name, column=column, levels=(), groups=groups, low=low, high=high, middle=float(numbers.mean())
+        ), [float(v) for v in numbers]
     told = table.kind(name) == "number"
     cells = [f"{float(cell):g}" if told else cell for cell in table.texts(name)]
     levels = tuple(sorted(set(cells), key=float) if told else sorted(set(cells)))
@@ -569,7 +578,7 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
         raise InputError(
             f"{table.where}: {name!r} is {levels[0][:40]!r} for all {len(table)} shapes; a comparison needs two groups."
         )
-    return Variable(f"C({name})" if told else name, column, levels, levels), cells
+    return Variable(name=f"C({name})" if told else name, column=column, levels=levels, groups=levels), cells
 
 
 def _group(value: float) -> str:

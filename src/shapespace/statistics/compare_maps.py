@@ -121,7 +121,7 @@ def effect_maps(
     weights: FloatArray | None = None,
     *,
     estimates: Sequence[Estimate] | None = None,
-    level: float = 0.05,
+    alpha: float = 0.05,
 ) -> Sequence[EffectMap]:
     """Return the maps of E effects that are tested beside the same other terms; memory does not grow with P times V.
 
@@ -176,7 +176,7 @@ def effect_maps(
     made: list[EffectMap] = []
     for at in range(E):
         tests = {
-            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at], level)
+            name: _tested(observed[name][at], as_large[name][at] / P, largest[name][at], pooled[name][at], alpha)
             for name in lenses
         }
         own = {name: read_only(values[at, :, 0]) for name, values in seen.items()}
@@ -263,11 +263,11 @@ def _bin(f: FloatArray) -> Any:
     return np.clip((np.log10(np.maximum(f, 1e-300)) + 6.0) * (_BINS / 12.0), 0, _BINS - 1).astype(np.intp)
 
 
-def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, level: float) -> Tested:
+def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, alpha: float) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
     as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - _TIE))  # S8
     of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
     q = false_discovery_control(of_all[_bin(f)])
-    critical = float(np.sort(largest)[-(int(level * len(largest) * (1 + _TIE)) + 1)])
+    critical = float(np.sort(largest)[-(int(alpha * len(largest) * (1 + _TIE)) + 1)])
     return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q), critical)

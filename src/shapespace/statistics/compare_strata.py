@@ -33,7 +33,7 @@ _BATCH = 50
 """Arrangements that are drawn from one seed."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Stratum:
     """Rows that are exchangeable, with the terms that are tested on them.
 
@@ -203,7 +203,16 @@ def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
     columns = np.arange(design.matrix.shape[1], dtype=np.intp)
     refuse_aliased(everything, columns, design.terms, design)
     rows = np.zeros(n, dtype=np.intp)
-    return Stratum("", shapes - shapes.mean(axis=0), everything, columns, design.terms, rows, 1, 0)
+    return Stratum(
+        name="",
+        shapes=shapes - shapes.mean(axis=0),
+        matrix=everything,
+        columns=columns,
+        terms=design.terms,
+        groups=rows,
+        removed=1,
+        number=0,
+    )
 
 
 def between_stratum(
@@ -265,8 +274,16 @@ def between_stratum(
     refuse_aliased(model, ids, (*nuisance, *terms), design, where)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
-        where, means - means.mean(axis=0), model, ids, tuple(terms), rows, 1, 1, nuisance=tuple(nuisance)
-    )  # fmt: skip
+        name=where,
+        shapes=means - means.mean(axis=0),
+        matrix=model,
+        columns=ids,
+        terms=tuple(terms),
+        groups=rows,
+        removed=1,
+        number=1,
+        nuisance=tuple(nuisance),
+    )
 
 
 def common_stratum(
@@ -296,7 +313,16 @@ def common_stratum(
         refuse_few(n - subjects, design, where, n, f"shapes in {subjects} blocks", len(columns))
         inner = values - means_of(values, at)[at]
         refuse_aliased(inner, columns, terms, design, where)
-        return Stratum(where, shapes - means_of(shapes, at)[at], inner, columns, tuple(terms), at, subjects, 2)
+        return Stratum(
+            name=where,
+            shapes=shapes - means_of(shapes, at)[at],
+            matrix=inner,
+            columns=columns,
+            terms=tuple(terms),
+            groups=at,
+            removed=subjects,
+            number=2,
+        )
     # Residuals of each subject's own model in orthonormal coordinates, where they are uncorrelated (Huh, Jhun 2001).
     rows, inner = list[FloatArray](), list[FloatArray]()
     for subject in range(int(at.max()) + 1):
@@ -309,7 +335,17 @@ def common_stratum(
     refuse_few(len(rest), design, where, len(rest), f"differences of shapes of one {blocks}", len(columns))
     refuse_aliased(model, columns, terms, design, where, np.abs(values).max(axis=0))
     groups = np.zeros(len(rest), dtype=np.intp)
-    return Stratum(where, rest, model, columns, tuple(terms), groups, 0, 2, scheme="flip")
+    return Stratum(
+        name=where,
+        shapes=rest,
+        matrix=model,
+        columns=columns,
+        terms=tuple(terms),
+        groups=groups,
+        removed=0,
+        number=2,
+        scheme="flip",
+    )
 
 
 def columns_of_terms(terms: Sequence[Term]) -> Rows:

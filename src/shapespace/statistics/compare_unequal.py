@@ -17,7 +17,7 @@ _RANK = 1e-9
 """Singular values below this share of the largest are rounding."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Units:
     """A stratum with one row for each unit that is exchanged: a shape, the mean of a subject, or its contrasts.
 
@@ -84,7 +84,13 @@ class Units:
             InputError: a unit that the model fits exactly.
         """
         flips = unequal_variances(
-            self.shapes, self.full, self.columns(reduced), self.classes(self.grouping(terms)), permutations, seed, name
+            shapes=self.shapes,
+            full=self.full,
+            reduced=self.columns(reduced),
+            groups=self.classes(self.grouping(terms)),
+            permutations=permutations,
+            seed=seed,
+            where=name,
         )
         return flips.estimate(own)
 
@@ -94,9 +100,16 @@ class Units:
         for one in self.grouping(self.stratum.terms):
             codes = np.array([one.groups.index(value) for value in self._values(one)], dtype=np.intp)
             test = dispersion_test(
-                one.name, residual, self.leverage, codes, one.groups, n_vertices * self.stratum.width, permutations,
-                seed, self.stratum.name,
-            )  # fmt: skip
+                variable=one.name,
+                residual=residual,
+                leverage=self.leverage,
+                codes=codes,
+                groups=one.groups,
+                n_vertices=n_vertices * self.stratum.width,
+                permutations=permutations,
+                seed=seed,
+                stratum=self.stratum.name,
+            )
             if test is not None:
                 yield test
 
@@ -142,7 +155,7 @@ def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -
         varying = frozenset(
             column for column, values in design.values.items() if len(set(zip(codes, values, strict=True))) > len(first)
         )
-    return Units(stratum, shapes, matrix, full, rows, design, varying)
+    return Units(stratum=stratum, shapes=shapes, matrix=matrix, full=full, rows=rows, design=design, varying=varying)
 
 
 def is_between_units(stratum: Stratum) -> bool:

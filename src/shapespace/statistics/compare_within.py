@@ -10,7 +10,7 @@ measures with the error of subject by condition, and in the two-stage analysis o
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _SHARES = np.append(np.linspace(0.0, 0.95, 20), 0.99)
 
 
 @dataclass(frozen=True, eq=False)
-class Responses:
+class SubjectResponses:
     """An effect within subjects, estimated for each subject that shows it.
 
     Args:
@@ -49,8 +49,8 @@ class Responses:
     variances: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Within:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WithinSubjects:
     """The cells of subjects, and the effects that differ within subjects.
 
     Args:
@@ -101,10 +101,15 @@ class Within:
             own = columns_of_terms([self.effects.terms[effect] for effect in self.random])
             strata.append(
                 common_stratum(
-                    self.shapes, self.design.matrix[self.rows], self.effects.matrix[self.rows][:, own], self.at,
-                    self.design, [term for term in self.design.terms if term in fixed], self.blocks,
+                    shapes=self.shapes,
+                    matrix=self.design.matrix[self.rows],
+                    own_columns=self.effects.matrix[self.rows][:, own],
+                    at=self.at,
+                    design=self.design,
+                    terms=[term for term in self.design.terms if term in fixed],
+                    blocks=self.blocks,
                 )
-            )  # fmt: skip
+            )
         return tuple(strata)
 
     def conditions(self) -> Iterator[tuple[Term, FloatArray]]:
@@ -140,35 +145,17 @@ class Within:
         """Names inside of the variables that differ within subjects."""
         return frozenset(name for term in self.effects.terms for name in term.variables)
 
-    def notes(self) -> list[str]:
-        """Return sentences on the tests of effects within subjects."""
-        out: list[str] = []
-        if self.random:
-            labels = ", ".join(self.label(effect) for effect in self.random)
-            out.append(
-                f"Each {self.blocks} may respond differently to {labels}: each of these effects is tested on one "
-                f"estimate per {self.blocks}; the signs of the estimates are flipped, or the estimates are permuted "
-                f"between {self.blocks}s."
-            )
-        return out
+    def common_effects(self) -> tuple[str, ...]:
+        """Return the effects that are assumed to be the same in all subjects."""
+        return tuple(self.label(effect) for effect in self.terms if effect not in self.random)
 
-    def warnings(self, strata: Sequence[Stratum]) -> list[str]:
-        """Return sentences on limitations of the tests within subjects."""
-        out: list[str] = []
-        fixed = [self.label(effect) for effect in self.terms if effect not in self.random]
-        if fixed:
-            out.append(
-                f"All {self.blocks}s are assumed to respond alike to {', '.join(fixed)}; if they do not, p within "
-                f"{self.blocks}s is too small. Without --random the responses may differ between {self.blocks}s."
-            )
-        for stratum in strata:
-            if stratum.scheme == "subjects" and len(stratum.groups) < self.count:
-                label = stratum.name.removeprefix(f"within {self.blocks}: ")
-                out.append(
-                    f"{self.count - len(stratum.groups)} of {self.count} {self.blocks}s lack conditions from which "
-                    f"{label} can be estimated, and are left out of its test."
-                )
-        return out
+    def subjects_without_effect(self, strata: Sequence[Stratum]) -> dict[str, int]:
+        """Return effect -> number of subjects from whose conditions it cannot be estimated."""
+        return {
+            stratum.name.removeprefix(f"within {self.blocks}: "): self.count - len(stratum.groups)
+            for stratum in strata
+            if stratum.scheme == "subjects" and len(stratum.groups) < self.count
+        }
 
     def contrast_stratum(self, contrast: FloatArray, variables: frozenset[str], name: str) -> tuple[Stratum, Design]:
         """Return the stratum of one contrast of the conditions within subjects, and its columns between subjects.
@@ -186,7 +173,7 @@ class Within:
         responses = self._responses(contrast[:, None], list(every), in_mm=True)
         return self._stratum(responses, chosen, f"within {self.blocks}: {name}")
 
-    def _stratum(self, responses: Responses, effects: Sequence[int], where: str) -> tuple[Stratum, Design]:
+    def _stratum(self, responses: SubjectResponses, effects: Sequence[int], where: str) -> tuple[Stratum, Design]:
         """Return the stratum of responses to some effects, and its columns between subjects."""
         s, d = len(responses.subjects), int(responses.values.shape[1])
         label = where.removeprefix(f"within {self.blocks}: ")
@@ -212,10 +199,20 @@ class Within:
         constant = np.zeros((s, d))
         constant[:, 0] = roots
         stratum = Stratum(
-            where, (roots[:, None, None] * responses.values).reshape(s * d, -1), whole,
-            np.repeat(columns, d), terms, np.zeros(s, dtype=np.intp), 0, 2, scheme="subjects", width=d,
-            units=responses.subjects, n_units=self.count, constant=constant.ravel(),
-        )  # fmt: skip
+            name=where,
+            shapes=(roots[:, None, None] * responses.values).reshape(s * d, -1),
+            matrix=whole,
+            columns=np.repeat(columns, d),
+            terms=terms,
+            groups=np.zeros(s, dtype=np.intp),
+            removed=0,
+            number=2,
+            scheme="subjects",
+            width=d,
+            units=responses.subjects,
+            n_units=self.count,
+            constant=constant.ravel(),
+        )
         return stratum, between
 
     def _between(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
@@ -228,7 +225,7 @@ class Within:
         terms = [replace(term, columns=made.terms[parts.index(term.factors - self.factors)].columns) for term in chosen]
         return tuple({term.columns: term for term in terms}.values()), made
 
-    def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> Responses:
+    def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> SubjectResponses:
         """Return contrasts `target` (D, d) of the columns of the effects, each subject's in its model of some effects.
 
         They are scaled so that their squares are those of the cells of an average subject, or in mm (`in_mm`).
@@ -248,15 +245,15 @@ class Within:
             estimates.append(weights @ self.shapes[cells])
             covariances.append(covariance)
         if not chosen:
-            return Responses(np.zeros(0, dtype=np.intp), np.zeros((0, target.shape[1], 0)), np.zeros(0))
+            return SubjectResponses(np.zeros(0, dtype=np.intp), np.zeros((0, target.shape[1], 0)), np.zeros(0))
         information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
         metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
         own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
         shown = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
-        return Responses(np.array(chosen, dtype=np.intp), shown, own / np.median(own))
+        return SubjectResponses(np.array(chosen, dtype=np.intp), shown, own / np.median(own))
 
 
-def _weights(responses: Responses, matrix: FloatArray) -> FloatArray:
+def _weights(responses: SubjectResponses, matrix: FloatArray) -> FloatArray:
     """Return the (s,) weights of subjects in a model (s, q) of their responses; 1 for all if they are equally precise.
 
     The variance of a response is that between subjects plus that of its estimate. The share of the latter is the value
@@ -304,27 +301,45 @@ def _reduced_effects(effects: Sequence[Term], effect: int, squares: str) -> list
     return [one for one in others if squares != "II" or not effects[effect].factors < effects[one].factors]
 
 
+@dataclass(frozen=True, kw_only=True)
+class RepeatedMeasures:
+    """How several shapes of a subject enter the tests.
+
+    Args:
+        n_cells: cells of one subject and condition, to which the shapes are averaged.
+        random_effects: effects within subjects that may differ between subjects.
+        common_effects: effects within subjects that are assumed to be the same in all subjects.
+        subjects_without_effect: effect -> number of subjects that lack the conditions from which it is estimated; they
+            are excluded from its test.
+        adjusted_conditions: terms within subjects whose subject means are covariates of the model between subjects.
+    """
+
+    n_cells: int
+    random_effects: tuple[str, ...] = ()
+    common_effects: tuple[str, ...] = ()
+    subjects_without_effect: Mapping[str, int] = field(default_factory=dict[str, int])
+    adjusted_conditions: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
-class Strata:
+class ModelStrata:
     """The strata of a model.
 
     Args:
         every: with the terms that are tested in each.
         within: the effects within subjects; None where there are none.
-        notes: sentences on the tests.
-        warnings: sentences on limitations of the tests.
+        repeated_measures: how several shapes of a subject enter the tests; None where all rows are exchangeable.
     """
 
     every: tuple[Stratum, ...]
-    within: Within | None = None
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    within: WithinSubjects | None = None
+    repeated_measures: RepeatedMeasures | None = None
 
 
 def strata_of(
     shapes: FloatArray, design: Design, subjects: Sequence[str] | None, blocks: str, squares: str = "II",
     random: Sequence[frozenset[str]] | None = None,
-) -> Strata:  # fmt: skip
+) -> ModelStrata:  # fmt: skip
     """Return the strata of a linear model of shapes.
 
     Args:
@@ -340,7 +355,7 @@ def strata_of(
             subjects show, or random effects that are none of the model.
     """
     if subjects is None:
-        return Strata((independent_stratum(shapes, design),))
+        return ModelStrata((independent_stratum(shapes, design),))
     n = len(shapes)
     refuse_aliased(
         design.matrix - design.matrix.mean(axis=0), np.arange(design.matrix.shape[1], dtype=np.intp), design.terms,
@@ -358,7 +373,9 @@ def strata_of(
     strata: list[Stratum] = []
     within = None
     if inner:
-        within = _within(design, inner, varying, blocks, random, means, rows, at)
+        within = _within(
+            design=design, inner=inner, varying=varying, blocks=blocks, random=random, shapes=means, rows=rows, at=at
+        )
         strata += within.strata(squares)
     elif random:
         raise _no_effect(random[0], design)
@@ -368,28 +385,20 @@ def strata_of(
         strata.insert(
             0, between_stratum(means_of(means, at), design.matrix[rows[first]], conditions, design, outer, blocks)
         )
-    notes, warnings = list[str](), list[str]()
-    if len(rows) < n:
-        notes.append(
-            f"{n} shapes are averaged to {len(rows)} cells of one {blocks} and condition; repeated shapes of a cell do "
-            "not count as further observations."
-        )
-    if within is not None:
-        notes += within.notes()
-        warnings += within.warnings(strata)
-    if outer and strata[0].nuisance:
-        labels = ", ".join(term.label for term in strata[0].nuisance)
-        notes.append(
-            f"The shapes of each {blocks} are not of the same conditions: the means of {labels} per {blocks} are "
-            f"covariates of the model between {blocks}s, so that its F contains the uncertainty of this adjustment."
-        )
-    return Strata(tuple(strata), within, tuple(notes), tuple(warnings))
+    repeated_measures = RepeatedMeasures(
+        n_cells=len(rows),
+        random_effects=() if within is None else tuple(within.label(effect) for effect in within.random),
+        common_effects=() if within is None else within.common_effects(),
+        subjects_without_effect={} if within is None else within.subjects_without_effect(strata),
+        adjusted_conditions=tuple(term.label for term in strata[0].nuisance) if outer else (),
+    )
+    return ModelStrata(tuple(strata), within, repeated_measures)
 
 
 def _within(
     design: Design, inner: Sequence[Term], varying: set[str], blocks: str, random: Sequence[frozenset[str]] | None,
     shapes: FloatArray, rows: Rows, at: Rows,
-) -> Within:  # fmt: skip
+) -> WithinSubjects:  # fmt: skip
     factors = {name for name, variable in design.factors.items() if variable in varying}
     effects = list(dict.fromkeys(term.factors & factors for term in inner))
     # Subjects of different classes may differ in their mean, which belongs between them.
@@ -410,7 +419,16 @@ def _within(
         number: tuple(term for term in inner if term.factors & factors == effect)
         for number, effect in enumerate(effects, 1)
     }
-    return Within(design, blocks, design.part([frozenset(), *effects]), terms, tuple(chosen), shapes, rows, at)
+    return WithinSubjects(
+        design=design,
+        blocks=blocks,
+        effects=design.part([frozenset(), *effects]),
+        terms=terms,
+        random=tuple(chosen),
+        shapes=shapes,
+        rows=rows,
+        at=at,
+    )
 
 
 def _no_effect(effect: frozenset[str], design: Design) -> InputError:

@@ -39,7 +39,7 @@ _BATCH = 50
 _FLOOR = 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DispersionTest:
     """A test of equal dispersion of the classes of a variable.
 
@@ -117,10 +117,15 @@ def dispersion_test(
         [_f_of_means(distances[rows], own) for rows in _permutations(len(distances), permutations, seed)]
     )
     return DispersionTest(
-        variable, stratum, tuple(groups[k] for k in used), tuple(int(counts[k]) for k in used),
-        tuple(float(v) for v in np.sqrt(variances / n_vertices)), float(f[0]),
-        float((f >= f[0] * (1 - _TIE)).mean()), permutations,
-    )  # fmt: skip
+        variable=variable,
+        stratum=stratum,
+        groups=tuple(groups[k] for k in used),
+        counts=tuple(int(counts[k]) for k in used),
+        stddev_mm=tuple(float(v) for v in np.sqrt(variances / n_vertices)),
+        f=float(f[0]),
+        p=float((f >= f[0] * (1 - _TIE)).mean()),
+        permutations=permutations,
+    )
 
 
 def _permutations(n: int, permutations: int, seed: int) -> Iterator[Codes]:

@@ -25,7 +25,7 @@ _NOTHING = 1e-10
 
 
 @dataclass(frozen=True)
-class Choice:
+class Regularisation:
     """How much of the shapes a regression goes by.
 
     Args:
@@ -50,11 +50,11 @@ class Choice:
         return f"least squares on the first {self.amount:.0f} principal components"
 
 
-CHOICES = tuple(Choice("raw", p) for p in PENALTIES) + tuple(Choice("whitened", m) for m in MODES)
+CHOICES = tuple(Regularisation("raw", p) for p in PENALTIES) + tuple(Regularisation("whitened", m) for m in MODES)
 
 
 @dataclass(frozen=True, eq=False)
-class Decomposed:
+class TrainingDecomposition:
     """The singular value decomposition of a weighted training set.
 
     Args:
@@ -70,14 +70,14 @@ class Decomposed:
     weight: FloatArray
 
     @staticmethod
-    def of(X: FloatArray, weight: FloatArray) -> Decomposed:
+    def of(X: FloatArray, weight: FloatArray) -> TrainingDecomposition:
         """Return the decomposition of coefficients (n, K) whose rows have weights (n,)."""
         middle = weighted_mean(X, weight)
         left, singular, right = np.linalg.svd(np.sqrt(weight)[:, None] * (X - middle), full_matrices=False)
         kept = singular > _NOTHING * max(float(singular[0]), 1e-300)
-        return Decomposed(middle, left[:, kept], singular[kept], right[kept], weight)
+        return TrainingDecomposition(middle, left[:, kept], singular[kept], right[kept], weight)
 
-    def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Choice]) -> FloatArray:
+    def predict(self, X: FloatArray, targets: FloatArray, choices: Sequence[Regularisation]) -> FloatArray:
         """Return the predictions (C, m, P) of each choice for coefficients (m, K), from targets (n, P) of the training
         set."""
         mean = weighted_mean(targets, self.weight)
@@ -85,14 +85,14 @@ class Decomposed:
         of_targets = self.left.T @ (np.sqrt(self.weight)[:, None] * (targets - mean))
         return np.stack([mean + (along * choice.factors(self.singular)) @ of_targets for choice in choices])  # S41
 
-    def weights(self, target: FloatArray, choice: Choice) -> tuple[FloatArray, float]:
+    def weights(self, target: FloatArray, choice: Regularisation) -> tuple[FloatArray, float]:
         """Return weights (K,) and intercept of a prediction from coefficients, for a target (n,)."""
         mean = float(weighted_mean(target, self.weight))
         of_target = self.left.T @ (np.sqrt(self.weight) * (target - mean))
         beta = (choice.factors(self.singular) / self.singular * of_target) @ self.right
         return beta, mean - float(self.middle @ beta)
 
-    def effective(self, choice: Choice) -> float:
+    def effective(self, choice: Regularisation) -> float:
         """Return the effective degrees of freedom of a choice, without the mean."""
         return float(choice.factors(self.singular).sum())
 
@@ -118,19 +118,19 @@ def folds_of(codes: IndexArray, count: int, rng: np.random.Generator) -> IndexAr
 
 
 def errors_of(
-    X: FloatArray, targets: FloatArray, weight: FloatArray, folds: IndexArray, choices: Sequence[Choice]
+    X: FloatArray, targets: FloatArray, weight: FloatArray, folds: IndexArray, choices: Sequence[Regularisation]
 ) -> FloatArray:
     """Return the weighted sum of squared errors (C, P) of each choice for targets (N, P), in folds (N,)."""
     total = np.zeros((len(choices), targets.shape[1]))
     for fold in np.unique(folds):
         test = folds == fold
-        found = Decomposed.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
+        found = TrainingDecomposition.of(X[~test], weight[~test]).predict(X[test], targets[~test], choices)
         total += np.einsum("m,cmp->cp", weight[test], (found - targets[test]) ** 2)
     return total
 
 
 @dataclass(frozen=True, eq=False)
-class Nested:
+class NestedPredictions:
     """What nested cross-validation predicts of rows left out.
 
     Args:
@@ -150,9 +150,9 @@ def nested(
     weight: FloatArray,
     outer: IndexArray,
     inner: Sequence[IndexArray],
-    choices: Sequence[Choice] = CHOICES,
+    choices: Sequence[Regularisation] = CHOICES,
     on_fold: Callable[[int, int], None] | None = None,
-) -> Nested:
+) -> NestedPredictions:
     """Return predictions of all rows, each by a training set that has nothing of its subject, nor the choice either.
 
     Args:
@@ -171,10 +171,10 @@ def nested(
         train = ~test
         errors = errors_of(X[train], targets[train], weight[train], own, choices)
         best = errors.argmin(axis=0)
-        found = Decomposed.of(X[train], weight[train]).predict(X[test], targets[train], choices)
+        found = TrainingDecomposition.of(X[train], weight[train]).predict(X[test], targets[train], choices)
         predicted[test] = np.take_along_axis(found, best[None, None, :], axis=0)[0]
         baseline[test] = weighted_mean(targets[train], weight[train])
         chosen.append(best)
         if on_fold is not None:
             on_fold(fold + 1, len(inner))
-    return Nested(predicted, baseline, np.stack(chosen))
+    return NestedPredictions(predicted, baseline, np.stack(chosen))

@@ -62,15 +62,15 @@ def sample_sizes(
     return tuple(sizes)
 
 
-def dispersion_record(test: DispersionTest, level: float) -> Dispersion:
+def dispersion_record(test: DispersionTest, alpha: float) -> Dispersion:
     """Return the record of a test of equal dispersion in analysis.json.
 
     Args:
         test: the test.
-        level: of significance.
+        alpha: level of significance.
     """
     return Dispersion(
         variable=test.variable, stratum=test.stratum, groups=test.groups, counts=test.counts, stddev=test.stddev_mm,
-        f=test.f, p=test.p, arrangements=test.permutations, equal=test.p > level,
+        f=test.f, p=test.p, arrangements=test.permutations, equal=test.p > alpha,
         smaller_is_more_variable=test.smaller_is_more_variable,
     )  # fmt: skip

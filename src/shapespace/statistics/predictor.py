@@ -33,7 +33,9 @@ FORMAT, VERSION = "shapespace predictor", 1
 _ROUNDING = 1e-9
 _AGAIN = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
-_FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "level", "method")
+_FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "confidence", "method")
+_KEYS = {"confidence": "level"}
+"""Field -> its key in files of version 1, where they differ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class Predictions:
         return lazy_import("html_of_predictions")(self)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Predictor:
     """A number as a linear function of where the vertices lie.
 
@@ -76,7 +78,7 @@ class Predictor:
         lowest, highest: of the targets learned from.
         farthest_mm: RMS distance from the mean of the shape learned from that lies furthest.
         subjects: how many were learned from.
-        level: of the intervals.
+        confidence: level of the intervals.
         method: in words.
     """
 
@@ -93,7 +95,7 @@ class Predictor:
     highest: float
     farthest_mm: float
     subjects: int
-    level: float
+    confidence: float
     method: str
 
     def __repr__(self) -> str:
@@ -115,7 +117,7 @@ class Predictor:
         self._check(cohort)
         off = np.stack([self._placed(cohort.vertices(at)) for at in range(len(cohort))]) - self.mean
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
-        low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.level)
+        low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)
         away = np.sqrt((off**2).sum(axis=2).mean(axis=1))
         outside = tuple(self._outside(float(v), float(mm)) for v, mm in zip(all_ways[:, 0], away, strict=True))
         return Predictions(cohort.names, read_only(all_ways[:, 0]), low, high, outside)
@@ -164,10 +166,10 @@ class Predictor:
         Raises:
             FileError: the folder cannot be written.
         """
-        path, facts = Path(path), {name: getattr(self, name) for name in _FACTS}
-        told = json.dumps({"format": FORMAT, "format_version": VERSION, **facts}, allow_nan=False)
+        facts = {_KEYS.get(name, name): getattr(self, name) for name in _FACTS}
+        text = json.dumps({"format": FORMAT, "format_version": VERSION, **facts}, allow_nan=False)
         arrays: dict[str, npt.NDArray[Any]] = {name: getattr(self, name) for name in _FLOATS}
-        write_arrays(path, {**arrays, "fold": self.fold.astype(np.int64), "facts": np.array(told)})
+        write_arrays(Path(path), {**arrays, "fold": self.fold.astype(np.int64), "facts": np.array(text)})
 
     @staticmethod
     def load(path: Path | str) -> Predictor:
@@ -200,7 +202,7 @@ class Predictor:
             return "its folds do not exist"
         if not all(np.isfinite(getattr(self, name)).all() for name in _FLOATS):
             return "it holds numbers that are not finite"
-        if (self.residuals < 0).any() or (self.share <= 0).any() or not 0 < self.level < 1:
+        if (self.residuals < 0).any() or (self.share <= 0).any() or not 0 < self.confidence < 1:
             return "it holds numbers that cannot be"
         return ""
 
@@ -213,7 +215,7 @@ def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
     if facts.get("format") != FORMAT or facts.get("format_version") != VERSION:
         raise ValueError("another format")
     texts = {name: facts[name] for name in ("target", "gauge", "model_hash", "method")}
-    numbers = {name: float(facts[name]) for name in ("lowest", "highest", "farthest_mm", "level")}
+    numbers = {name: float(facts[_KEYS.get(name, name)]) for name in ("lowest", "highest", "farthest_mm", "confidence")}
     if not all(isinstance(text, str) for text in texts.values()) or texts["gauge"] not in ("form", "shape"):
         raise ValueError("facts of another kind")
     if not all(map(math.isfinite, numbers.values())):
@@ -233,7 +235,7 @@ def model_hash_of(cohort: Cohort) -> str:
 
 
 def cv_plus(
-    ways: FloatArray, residuals: FloatArray, fold: IndexArray, share: FloatArray, level: float
+    ways: FloatArray, residuals: FloatArray, fold: IndexArray, share: FloatArray, confidence: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return low and high (n,) of CV+ intervals.
 
@@ -242,10 +244,10 @@ def cv_plus(
         residuals: (N,) absolute, of rows predicted without their fold.
         fold: (N,) theirs, from 0.
         share: (N,) how much each counts; they sum to the number of subjects.
-        level: of the interval; with too few subjects for it the ends are the outermost.
+        confidence: level of the interval; with too few subjects for it the ends are the outermost.
     """
     subjects = float(share.sum())
-    past = min(level * (1.0 + 1.0 / subjects), 1.0) * subjects
+    past = min(confidence * (1.0 + 1.0 / subjects), 1.0) * subjects
     by_row = ways[:, fold]
     high = _weighted_quantile(by_row + residuals, share, past)
     low = -_weighted_quantile(residuals - by_row, share, past)

@@ -14,15 +14,14 @@ from shapespace.cohort.proportions import widen_share
 from shapespace.cohort.table import named
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, told_briefly
 from shapespace.schemas import Methods, TestScheme
-from shapespace.statistics.answer import Answer
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.linear_regressors import (
     CHOICES,
-    Choice,
-    Decomposed,
     IndexArray,
+    Regularisation,
+    TrainingDecomposition,
     errors_of,
     folds_of,
     nested,
@@ -40,7 +39,7 @@ _EDGES = (5.0, 95.0)
 
 
 @dataclass(frozen=True)
-class Measure:
+class AccuracyMeasure:
     """A figure of predictions on subjects left out, with its interval by drawing subjects anew; NaN where undefined."""
 
     value: float
@@ -48,8 +47,8 @@ class Measure:
     high: float
 
 
-@dataclass(frozen=True, eq=False)
-class Regression:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RegressionResult(AnalysisResult):
     """A regression of a number on shape, with its cross-validated accuracy.
 
     Args:
@@ -70,7 +69,7 @@ class Regression:
         predictor: learned from all rows.
         pattern: (K,) how the coefficients change, mm, with one unit of the target.
         low_at, high_at: the 5th and 95th percentile of the target.
-        level: of all intervals.
+        confidence: level of all intervals.
         folds: of the outer cross-validation.
         permutations: how many.
         draws: of subjects, for intervals of figures.
@@ -86,17 +85,17 @@ class Regression:
     low: FloatArray
     high: FloatArray
     baseline: FloatArray
-    measures: Mapping[str, Measure]
+    measures: Mapping[str, AccuracyMeasure]
     baseline_rmse: float
     baseline_mae: float
     p: float | None
-    choice: Choice
+    choice: Regularisation
     effective: float
     predictor: Predictor
     pattern: FloatArray
     low_at: float
     high_at: float
-    level: float
+    confidence: float
     folds: int
     permutations: int
     draws: int
@@ -148,24 +147,13 @@ class Regression:
         mean = self.cohort.vertices(weighted_mean(self.cohort.coefficients, self.predictor.share))
         return np.einsum("vd,vd->v", moved, vertex_normals(Mesh(mean, self.cohort.faces)))
 
-    def answer(self, new: tuple[Cohort, Predictions] | None = None) -> Answer:
-        """Return it as it is kept and reported.
-
-        Args:
-            new: shapes of other subjects, and what the predictor says of them; None for none.
-        """
-        return lazy_import("answer_of_regression")(self, new)
-
     def __repr__(self) -> str:
         figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
         tested = [] if self.p is None else [f"p {self.p:.3g}"]
         return (
-            f"<Regression of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} subjects; "
-            f"{listed_briefly([*tested, *figures])}>"
+            f"<RegressionResult of {told_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} "
+            f"subjects; {listed_briefly([*tested, *figures])}>"
         )
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
 
 
 def regress(
@@ -176,10 +164,10 @@ def regress(
     folds: int = 10,
     permutations: int = 199,
     draws: int = 2000,
-    level: float = 0.9,
+    confidence: float = 0.9,
     seed: int = 0,
-    on_step: Callable[[int, int], None] | None = None,
-) -> Regression:
+    progress: Callable[[int, int], None] | None = None,
+) -> RegressionResult:
     """Learn a number from shape, and measure on subjects left out how well.
 
     Args:
@@ -190,16 +178,16 @@ def regress(
         folds: number of folds of the outer cross-validation; the inner one has five.
         permutations: number of permutations for p; 0 for none.
         draws: of subjects, for intervals of figures.
-        level: coverage of intervals.
+        confidence: coverage of intervals.
         seed: seed of folds and draws.
-        on_step: called with (steps done, in all).
+        progress: called with (steps done, in all).
 
     Raises:
         InputError: no such column, values that are missing, no numbers or all the same, fewer than ten subjects, fewer
             subjects than folds, or options that cannot be.
     """
     require(cohort, Cohort, "regress", "read one with shapespace.read_cohort")
-    _check_options(folds, permutations, draws, level, seed)
+    _check_options(folds, permutations, draws, confidence, seed)
     y = cohort.table.numbers(target)
     _check_target(cohort, target, y)
     subjects = subjects_of(cohort, subject)
@@ -216,19 +204,51 @@ def regress(
     rng = np.random.default_rng(seed)
     outer = folds_of(codes, folds, rng)
     inner = [folds_of(codes[outer != fold], min(5, len(names) // 2), rng) for fold in range(folds)]
-    steps = _Steps(1 + -(-permutations // _BLOCK), folds, on_step)
+    steps = _Steps(1 + -(-permutations // _BLOCK), folds, progress)
     done = nested(X, y[:, None], share, outer, inner, on_fold=steps.fold)
     predicted, baseline = done.predicted[:, 0], done.baseline[:, 0]
-    low, high = _intervals(X, y, share, outer, inner, done.chosen[:, 0], level)
-    measures = _measures(y, predicted, baseline, low, high, share, codes, draws, level, rng)
-    p = _p_of(X, y, codes, share, outer, inner, measures["r2"].value, permutations, rng, steps)
+    low, high = _intervals(
+        X=X, y=y, share=share, outer=outer, inner=inner, chosen=done.chosen[:, 0], confidence=confidence
+    )
+    measures = _measures(
+        y=y,
+        predicted=predicted,
+        baseline=baseline,
+        low=low,
+        high=high,
+        share=share,
+        codes=codes,
+        draws=draws,
+        confidence=confidence,
+        rng=rng,
+    )
+    p = _p_of(
+        X=X,
+        y=y,
+        codes=codes,
+        share=share,
+        outer=outer,
+        inner=inner,
+        observed=measures["r2"].value,
+        permutations=permutations,
+        rng=rng,
+        steps=steps,
+    )
 
     errors = errors_of(X, y[:, None], share, outer, CHOICES)[:, 0]
-    predictor, choice, effective = _predictor(cohort, target, y, share, outer, CHOICES[int(errors.argmin())], level)
+    predictor, choice, effective = _predictor(
+        cohort=cohort,
+        target=target,
+        y=y,
+        share=share,
+        outer=outer,
+        choice=CHOICES[int(errors.argmin())],
+        confidence=confidence,
+    )
     centred = y - weighted_mean(y, share)
     pattern = (share * centred) @ X / float((share * centred**2).sum())  # S44
     low_at, high_at = _percentiles(y, codes, share, _EDGES)
-    return Regression(
+    return RegressionResult(
         cohort=cohort,
         target=target,
         observed=read_only(y),
@@ -247,7 +267,7 @@ def regress(
         pattern=read_only(pattern),
         low_at=low_at,
         high_at=high_at,
-        level=level,
+        confidence=confidence,
         folds=folds,
         permutations=permutations,
         draws=draws,
@@ -286,22 +306,22 @@ def share_of(subjects: Sequence[str]) -> FloatArray:
 class _Steps:
     """Counts outer folds over all blocks of permutations."""
 
-    def __init__(self, blocks: int, folds: int, on_step: Callable[[int, int], None] | None) -> None:
-        self.total, self.done, self.on_step = blocks * folds, 0, on_step
+    def __init__(self, blocks: int, folds: int, progress: Callable[[int, int], None] | None) -> None:
+        self.total, self.done, self.progress = blocks * folds, 0, progress
 
     def fold(self, _done: int, _folds: int) -> None:
         self.done += 1
-        if self.on_step is not None:
-            self.on_step(self.done, self.total)
+        if self.progress is not None:
+            self.progress(self.done, self.total)
 
 
-def _check_options(folds: int, permutations: int, draws: int, level: float, seed: int) -> None:
+def _check_options(folds: int, permutations: int, draws: int, confidence: float, seed: int) -> None:
     if folds < 3:
         raise InputError(f"Cross-validation needs at least 3 folds, not {folds}.")
     if permutations < 0 or seed < 0 or draws < 1:
         raise InputError("The number of permutations and the seed must be 0 or more, and that of draws 1 or more.")
-    if not 0.5 <= level < 1:
-        raise InputError(f"The level of intervals must lie between 0.5 and 1, not at {level}.")
+    if not 0.5 <= confidence < 1:
+        raise InputError(f"The level of intervals must lie between 0.5 and 1, not at {confidence}.")
 
 
 def _check_target(cohort: Cohort, target: str, y: FloatArray) -> None:
@@ -322,7 +342,7 @@ def _intervals(
     outer: IndexArray,
     inner: list[IndexArray],
     chosen: IndexArray,
-    level: float,
+    confidence: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return low and high (N,) of CV+ intervals of rows left out, by the inner folds of their training sets."""
     low, high = np.empty_like(y), np.empty_like(y)
@@ -330,12 +350,12 @@ def _intervals(
         test, train = outer == fold, outer != fold
         choice = CHOICES[int(chosen[fold])]
         residuals, ways, _, _ = _left_out(X[train], y[train], share[train], own, choice, X[test])
-        low[test], high[test] = cv_plus(ways, residuals, own, share[train], level)
+        low[test], high[test] = cv_plus(ways, residuals, own, share[train], confidence)
     return low, high
 
 
 def _left_out(
-    X: FloatArray, y: FloatArray, share: FloatArray, folds: IndexArray, choice: Choice, new: FloatArray
+    X: FloatArray, y: FloatArray, share: FloatArray, folds: IndexArray, choice: Regularisation, new: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return residuals (N,) without each row's fold, predictions (n, F) of `new`, weights (F, K), intercepts (F,)."""
     residuals = np.empty_like(y)
@@ -343,7 +363,7 @@ def _left_out(
     intercepts: list[float] = []
     for fold in range(int(folds.max()) + 1):
         test = folds == fold
-        beta, intercept = Decomposed.of(X[~test], share[~test]).weights(y[~test], choice)
+        beta, intercept = TrainingDecomposition.of(X[~test], share[~test]).weights(y[~test], choice)
         residuals[test] = np.abs(y[test] - X[test] @ beta - intercept)
         weights.append(beta)
         intercepts.append(intercept)
@@ -352,12 +372,18 @@ def _left_out(
 
 
 def _predictor(
-    cohort: Cohort, target: str, y: FloatArray, share: FloatArray, outer: IndexArray, choice: Choice, level: float
-) -> tuple[Predictor, Choice, float]:
+    cohort: Cohort,
+    target: str,
+    y: FloatArray,
+    share: FloatArray,
+    outer: IndexArray,
+    choice: Regularisation,
+    confidence: float,
+) -> tuple[Predictor, Regularisation, float]:
     X = cohort.coefficients
-    whole = Decomposed.of(X, share)
+    whole = TrainingDecomposition.of(X, share)
     if choice.space == "whitened":
-        choice = Choice("whitened", min(choice.amount, len(whole.singular)))
+        choice = Regularisation("whitened", min(choice.amount, len(whole.singular)))
     beta, intercept = whole.weights(y, choice)
     residuals, _, weights, intercepts = _left_out(X, y, share, outer, choice, X[:1])
     middle = whole.middle
@@ -377,7 +403,7 @@ def _predictor(
         highest=float(y.max()),
         farthest_mm=farthest,
         subjects=round(float(share.sum())),
-        level=level,
+        confidence=confidence,
         method=choice.words(),
     )
     return predictor, choice, whole.effective(choice)
@@ -392,9 +418,9 @@ def _measures(
     share: FloatArray,
     codes: IndexArray,
     draws: int,
-    level: float,
+    confidence: float,
     rng: np.random.Generator,
-) -> dict[str, Measure]:
+) -> dict[str, AccuracyMeasure]:
     """Return all figures with their intervals, of which every draw is a weighing of subjects."""
     n = int(codes.max()) + 1
     times = np.vstack([np.ones(n), rng.multinomial(n, np.full(n, 1.0 / n), draws)])
@@ -412,17 +438,17 @@ def _measures(
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (m_py - m_p * m_y) / (m_pp - m_p**2)
         found = (1.0 - square / by_mean, np.sqrt(square), absolute, slope, m_y - slope * m_p, covered, width)
-    tail = 50.0 * (1.0 - level)
+    tail = 50.0 * (1.0 - confidence)
 
-    def measure(values: FloatArray) -> Measure:
+    def measure(values: FloatArray) -> AccuracyMeasure:
         drawn = values[1:][np.isfinite(values[1:])]
         ends = np.percentile(drawn, [tail, 100.0 - tail]) if len(drawn) else (np.nan, np.nan)
-        return Measure(float(values[0]), float(ends[0]), float(ends[1]))
+        return AccuracyMeasure(float(values[0]), float(ends[0]), float(ends[1]))
 
     measured = {name: measure(values) for name, values in zip(MEASURES, found, strict=True)}
     inside = measured["coverage"]
-    ends = widen_share(np.array(inside.low), np.array(inside.high), n, level)
-    return {**measured, "coverage": Measure(inside.value, *map(float, ends))}
+    ends = widen_share(np.array(inside.low), np.array(inside.high), n, confidence)
+    return {**measured, "coverage": AccuracyMeasure(inside.value, *map(float, ends))}
 
 
 def _p_of(

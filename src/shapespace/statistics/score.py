@@ -20,10 +20,9 @@ from shapespace.errors import CorrespondenceError, InputError
 from shapespace.fit.posterior import new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly
 from shapespace.schemas import Methods, SampleSize, TestScheme
-from shapespace.statistics.answer import Answer
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.methods import methods_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
@@ -39,7 +38,7 @@ _OUTSIDE = 0.01
 
 
 @dataclass(frozen=True)
-class ScoreOptions:
+class ScoreConfig:
     """How subjects are measured by a reference.
 
     Args:
@@ -60,7 +59,7 @@ class ScoreOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Near:
+class NearestReference:
     """One of the reference beside a subject: its name, its distance in standard deviations, and the RMS in mm."""
 
     name: str
@@ -68,8 +67,8 @@ class Near:
     rms_mm: float
 
 
-@dataclass(frozen=True, eq=False)
-class Scores:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoreResult(AnalysisResult):
     """Where M subjects lie in a reference of N scans of P people.
 
     Args:
@@ -97,7 +96,7 @@ class Scores:
         reference_distance: (N,) Mahalanobis distance of each of the reference by the others.
         reference_rest_mm: (N,) as `rest_mm`.
         subjects: the cohort of them.
-        options: of the scoring.
+        config: options of the scoring.
         notes: who was left out and why, and what should be known.
     """
 
@@ -118,12 +117,12 @@ class Scores:
     size_z: FloatArray
     z: FloatArray
     z_limit: float
-    nearest: tuple[tuple[Near, ...], ...]
+    nearest: tuple[tuple[NearestReference, ...], ...]
     outside: tuple[tuple[str, ...], ...]
     reference_distance: FloatArray
     reference_rest_mm: FloatArray
     subjects: Cohort
-    options: ScoreOptions
+    config: ScoreConfig
     notes: tuple[str, ...]
 
     @property
@@ -161,30 +160,23 @@ class Scores:
             ),
         )  # fmt: skip
 
-    def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
-        return lazy_import("answer_of_scores")(self)
-
     def __repr__(self) -> str:
         percentiles = listed_briefly(
             [f"{name}: percentile {at:.0f}" for name, at in zip(self.names, self.percentile, strict=True)]
         )
         return (
-            f"<Scores of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
+            f"<ScoreResult of {len(self.names)} shapes against {len(self.reference_names)} of {self.people} subjects, "
             f"{self.modes} modes; {percentiles}>"
         )
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
 
 
 def score(
     reference: Cohort,
     subjects: Cohort,
-    options: ScoreOptions | None = None,
+    config: ScoreConfig | None = None,
     *,
-    on_step: Callable[[int, int], None] | None = None,
-) -> Scores:
+    progress: Callable[[int, int], None] | None = None,
+) -> ScoreResult:
     """Return where `subjects` lie in the population that `reference` is a sample of.
 
     Distances are measured in q principal components of the reference, by its covariance there and the fit's own
@@ -194,8 +186,8 @@ def score(
     Args:
         reference: N shapes.
         subjects: M shapes, read with `onto=reference`.
-        options: how; None for the defaults.
-        on_step: called with (done, total).
+        config: options; None for the defaults.
+        progress: called with (done, total).
 
     Raises:
         InputError: fewer than five people, more modes than there can be, cohorts of different models or gauges, a
@@ -204,24 +196,24 @@ def score(
     """
     require(reference, Cohort, "score", "read one with shapespace.read_cohort")
     require(subjects, Cohort, "score", "read one with shapespace.read_cohort")
-    options = options or ScoreOptions()
-    if options.subject is not None:
-        reference = reference.complete([options.subject], drop_missing=options.drop_missing)
-        subjects = subjects.complete([options.subject], drop_missing=options.drop_missing)
+    config = config or ScoreConfig()
+    if config.subject is not None:
+        reference = reference.complete([config.subject], drop_missing=config.drop_missing)
+        subjects = subjects.complete([config.subject], drop_missing=config.drop_missing)
     _refuse_unlike(reference, subjects)
-    people = _people(reference, options.subject)
+    people = _people(reference, config.subject)
     own, outside_basis = _in_basis_of(reference, subjects)
-    _refuse_known(reference, subjects, own, outside_basis, options.subject)
-    ruler = _Ruler(reference, people, _modes(reference, people, options.modes))
+    _refuse_known(reference, subjects, own, outside_basis, config.subject)
+    ruler = _Ruler(reference, people, _modes(reference, people, config.modes))
     theirs, ours = _Seen.of(reference), _Seen.of(subjects)
     notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]
     if theirs is None or ours is None or not np.array_equal(theirs.prior, ours.prior):
         if reference.fitted is not None:
             notes.append("How uncertain each fit is was not taken into account; that needs coefficients of fits.")
         theirs = ours = None
-    m, draws = len(subjects), _draws(theirs, options)
+    m, draws = len(subjects), _draws(theirs, config)
     found = np.empty((5, m))
-    nearest: list[tuple[Near, ...]] = []
+    nearest: list[tuple[NearestReference, ...]] = []
     plain = None if theirs is not None else ruler.left_out(reference.coefficients[None], None)
     for k in range(m):
         noise = None
@@ -238,9 +230,9 @@ def score(
             np.sqrt(own_d2), ruler.share(d2 >= own_d2), ruler.p_value(own_d2),
             own_rest, ruler.share(rest >= own_rest),
         )  # fmt: skip
-        nearest.append(_nearest(ruler, reference, own[k], outside_basis[k], noise, options.nearest))
-        if on_step is not None:
-            on_step(k + 1, m)
+        nearest.append(_nearest(ruler, reference, own[k], outside_basis[k], noise, config.nearest))
+        if progress is not None:
+            progress(k + 1, m)
     beyond = np.array([_beyond(subjects), np.full(m, np.nan)])
     theirs_beyond = _beyond(reference)
     if np.isfinite(theirs_beyond).all():
@@ -250,7 +242,7 @@ def score(
     z, limit = _maps(reference, subjects, people, ours)
     sizes = reference.sizes_mm
     size_z = (subjects.sizes_mm - sizes.mean()) / max(float(sizes.std(ddof=1)), 1e-12)
-    scores = Scores(
+    scores = ScoreResult(
         names=subjects.names, reference_names=reference.names, people=ruler.people, modes=ruler.modes,
         variance_share=ruler.variance_share,
         mean=Mesh(reference.vertices(ruler.whole.mean), reference.faces, name="mean"),
@@ -258,7 +250,7 @@ def score(
         rest_mm=read_only(found[3]), rest_farther=read_only(found[4]), beyond_mm=read_only(beyond[0]),
         beyond_farther=read_only(beyond[1]), size_mm=subjects.sizes_mm, size_z=read_only(size_z), z=z, z_limit=limit,
         nearest=tuple(nearest), outside=(), reference_distance=read_only(np.sqrt(own_d2[0])),
-        reference_rest_mm=read_only(own_rest[0]), subjects=subjects, options=options,
+        reference_rest_mm=read_only(own_rest[0]), subjects=subjects, config=config,
         notes=(*notes, *_on_size(ruler.people)),
     )  # fmt: skip
     return replace(scores, outside=tuple(tuple(_outside(scores, k)) for k in range(m)))
@@ -470,10 +462,10 @@ class _Seen:
         return coefficients + moved @ self.into
 
 
-def _draws(seen: _Seen | None, options: ScoreOptions) -> FloatArray:
+def _draws(seen: _Seen | None, config: ScoreConfig) -> FloatArray:
     """Return standard normal numbers (R, N, K)."""
     shape = (0, 0) if seen is None else seen.told.shape
-    return np.random.default_rng(options.seed).standard_normal((options.draws, *shape))
+    return np.random.default_rng(config.seed).standard_normal((config.draws, *shape))
 
 
 def _beyond(cohort: Cohort) -> FloatArray:
@@ -484,12 +476,12 @@ def _beyond(cohort: Cohort) -> FloatArray:
 
 def _nearest(
     ruler: _Ruler, reference: Cohort, own: FloatArray, outside: float, noise: FloatArray | None, count: int
-) -> tuple[Near, ...]:
+) -> tuple[NearestReference, ...]:
     between = own - reference.coefficients
     far = np.sqrt(ruler.whole.squared(between @ ruler.whole.components.T, noise))
     rms = np.sqrt(((between**2).sum(axis=1) + outside) / ruler.n_vertices)
     order: list[int] = np.argsort(far, kind="stable")[:count].tolist()
-    return tuple(Near(reference.names[k], float(far[k]), float(rms[k])) for k in order)
+    return tuple(NearestReference(reference.names[k], float(far[k]), float(rms[k])) for k in order)
 
 
 def _maps(reference: Cohort, subjects: Cohort, people: IntArray, seen: _Seen | None) -> tuple[FloatArray, float]:
@@ -546,7 +538,7 @@ def _on_size(people: int) -> list[str]:
     ]
 
 
-def _outside(scores: Scores, k: int) -> list[str]:
+def _outside(scores: ScoreResult, k: int) -> list[str]:
     """Return sentences on how a subject lies outside what reference or model know."""
     out: list[str] = []
     # A small reference can say no more than that a subject lies beyond all of it.

@@ -31,7 +31,7 @@ _FEWEST = 4
 _NUMBER = re.compile(r"[0-9]{1,12}")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Sides:
     """Which place of an object is the mirror image of which.
 
@@ -129,13 +129,29 @@ def find_sides(cohort: Cohort) -> Sides:
     other = mirror_pairs(mesh, found)
     if other is not None:
         corners, weights = _alone(other)
-        return Sides(everything, cohort.faces, corners, weights, True, found.off_share, tuple(notes))
+        return Sides(
+            vertices=everything,
+            faces=cohort.faces,
+            corners=corners,
+            weights=weights,
+            paired=True,
+            off_share=found.off_share,
+            notes=tuple(notes),
+        )
     notes.append(
         "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; what "
         "the mean's sides differ by along the surface cannot be seen so, and the Procrustes ANOVA takes differences "
         "along the normals alone."
     )
-    return Sides(everything, cohort.faces, found.corners, found.weights, False, found.off_share, tuple(notes))
+    return Sides(
+        vertices=everything,
+        faces=cohort.faces,
+        corners=found.corners,
+        weights=found.weights,
+        paired=False,
+        off_share=found.off_share,
+        notes=tuple(notes),
+    )
 
 
 def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "The pairs") -> Sides:
@@ -172,7 +188,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     faces = None if cohort.faces is None else own[cohort.faces]
     faces = None if faces is None else faces[(faces >= 0).all(axis=1)]
     faces = None if faces is None or not len(faces) else faces
-    sides = Sides(vertices, faces, corners, weights, True, 0.0)
+    sides = Sides(vertices=vertices, faces=faces, corners=corners, weights=weights, paired=True, off_share=0.0)
     x = cohort.reference[vertices]
     image = sides.image(x)
     try:
@@ -187,7 +203,9 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
         )
     left = cohort.n_vertices - len(vertices)
     notes = (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
-    return Sides(vertices, faces, corners, weights, True, share, notes)
+    return Sides(
+        vertices=vertices, faces=faces, corners=corners, weights=weights, paired=True, off_share=share, notes=notes
+    )
 
 
 def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:

@@ -12,6 +12,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.errors import InputError
+    from shapespace.report.analyses.asymmetry import asymmetry_report
     from shapespace.statistics.asymmetry import measure_asymmetry
     from shapespace.statistics.sides import read_pairs
 
@@ -24,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
     with steps(None, "permuting", "shape", quiet=arguments.quiet) as step:
-        found = measure_asymmetry(
+        result = measure_asymmetry(
             cohort,
             subject=subject,
             pairs=pairs,
@@ -32,6 +33,6 @@ def run(arguments: argparse.Namespace) -> int:
             reference=(column, value) if column else None,
             permutations=arguments.permutations,
             seed=arguments.seed,
-            on_step=step,
+            progress=step,
         )
-    return finish(found.answer(), arguments)
+    return finish(asymmetry_report(result), arguments)

@@ -17,13 +17,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure the changes, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.io.regions import read_region
+    from shapespace.report.analyses.change import change_report
     from shapespace.statistics.change import change
-    from shapespace.statistics.change_found import ChangeSettings
+    from shapespace.statistics.change_result import ChangeConfig
 
     cohort = cohort_of(arguments, "form")
     if arguments.landmarks is not None:
         cohort = replace(cohort, landmarks=_landmarks(arguments.landmarks, cohort.n_vertices))
-    settings = ChangeSettings(
+    config = ChangeConfig(
         subject=arguments.subject,
         time=arguments.time,
         order=arguments.order,
@@ -41,8 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         cohort = cohort.complete([*columns, time_column(cohort.table, arguments.time)], drop_missing=True)
     with steps(None, "comparing", "subject", quiet=arguments.quiet) as step:
-        answer = change(cohort, settings, on_step=step).answer()
-    return finish(answer, arguments)
+        result = change(cohort, config, progress=step)
+    return finish(change_report(result), arguments)
 
 
 def _landmarks(path: Path, n_vertices: int) -> SurfaceLandmarks:

@@ -11,7 +11,7 @@ from shapespace.cli.printing import say, show, show_json
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.geometry.procrustes import Gauge
-    from shapespace.statistics.answer import Answer
+    from shapespace.report.analyses.analysis_report import AnalysisReport
 
 
 def cohort_of(
@@ -36,19 +36,19 @@ def cohort_of(
     return replace(cohort, unit="") if getattr(arguments, "no_unit", False) else cohort
 
 
-def finish(answer: Answer, arguments: argparse.Namespace) -> int:
-    """Write the answer and its report, and print the summary."""
-    from shapespace.commands.answers import keep_answer
+def finish(report: AnalysisReport, arguments: argparse.Namespace) -> int:
+    """Write a report to the output folder, and print its summary."""
+    from shapespace.commands.answers import save_report
     from shapespace.schemas import to_json
 
-    report, notes = keep_answer(answer, arguments.output, quiet=arguments.quiet)
+    page, notes = save_report(report, arguments.output, quiet=arguments.quiet)
     for note in notes:
         say(note)
     if arguments.json:
-        analysis = to_json(answer.analysis())
-        show_json({"folder": str(arguments.output), "report": None if report is None else str(report), **analysis})
+        analysis = to_json(report.analysis())
+        show_json({"folder": str(arguments.output), "report": None if page is None else str(page), **analysis})
         return 0
-    for sentence in answer.summary:
+    for sentence in report.summary:
         show(sentence)
-    show(f"The report is {report}" if report is not None else f"All numbers are in {arguments.output}")
+    show(f"The report is {page}" if page is not None else f"All numbers are in {arguments.output}")
     return 0

@@ -10,9 +10,10 @@ from shapespace.cli.answers.common import cohort_of, finish
 def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
     from shapespace.batch.progress import steps
-    from shapespace.statistics.compare import CompareOptions, compare
+    from shapespace.report.analyses.compare import compare_report
+    from shapespace.statistics.compare import CompareConfig, compare
 
-    options = CompareOptions(
+    config = CompareConfig(
         anova_type=arguments.anova_type,
         blocks=arguments.blocks,
         random=arguments.random,
@@ -20,12 +21,12 @@ def run(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         maps=not arguments.no_maps,
         bump_width_mm=arguments.bumps,
-        level=arguments.level,
+        alpha=arguments.level,
         drop_missing=arguments.drop_missing,
         unequal_variances=arguments.unequal_variances,
         effect_size=arguments.effect_size,
     )
     cohort = cohort_of(arguments)
     with steps(None, "permuting", "step", quiet=arguments.quiet) as step:
-        found = compare(cohort, arguments.formula, options, on_step=step)
-    return finish(found.answer(), arguments)
+        result = compare(cohort, arguments.formula, config, progress=step)
+    return finish(compare_report(result), arguments)

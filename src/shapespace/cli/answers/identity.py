@@ -10,39 +10,41 @@ from shapespace.cli.answers.common import cohort_of, finish
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
-    from shapespace.statistics.identity.rounds import IdentityOptions
+    from shapespace.statistics.identity.trial import IdentityConfig
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify whether two scans are of one subject."""
     from shapespace.batch.progress import steps
+    from shapespace.report.analyses.verify import verify_report
     from shapespace.statistics.identity.verify import verify
 
-    cohort, options = _asked(arguments)
+    cohort, config = _cohort_and_config(arguments)
     with steps(None, "comparing", "draw", quiet=arguments.quiet) as step:
-        found = verify(cohort, options, on_step=step)
-    return finish(found.answer(), arguments)
+        result = verify(cohort, config, progress=step)
+    return finish(verify_report(result), arguments)
 
 
 def run_identify(arguments: argparse.Namespace) -> int:
     """Identify the subject of a scan among the enrolled ones."""
     from shapespace.batch.progress import steps
+    from shapespace.report.analyses.identify import identify_report
     from shapespace.statistics.identity.identify import identify
 
-    cohort, options = _asked(arguments)
+    cohort, config = _cohort_and_config(arguments)
     with steps(None, "searching", "score", quiet=arguments.quiet) as step:
-        found = identify(cohort, options, on_step=step)
-    return finish(found.answer(), arguments)
+        result = identify(cohort, config, progress=step)
+    return finish(identify_report(result), arguments)
 
 
-def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:
-    from shapespace.statistics.identity.rounds import IdentityOptions
+def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityConfig]:
+    from shapespace.statistics.identity.trial import IdentityConfig
 
     cohort = cohort_of(arguments, "shape")
     if arguments.surfaces != "coefficients":
         cohort = replace(cohort, fitted=None)
     chosen: dict[str, Any] = {} if arguments.scores is None else {"scores": arguments.scores}
-    options = IdentityOptions(
+    config = IdentityConfig(
         subject=arguments.subject,
         gallery=arguments.gallery,
         probe=arguments.probe,
@@ -58,4 +60,4 @@ def _asked(arguments: argparse.Namespace) -> tuple[Cohort, IdentityOptions]:
         drop_missing=arguments.drop_missing,
         **chosen,
     )
-    return cohort, options
+    return cohort, config

@@ -13,30 +13,30 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.read import CohortOptions, read_cohort
     from shapespace.io.files import make_folder
+    from shapespace.report.analyses.regression import prediction_report, regression_report
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import regress
-    from shapespace.statistics.regression_answer import predicted_answer
 
     if arguments.predictor is not None:
         learned = Predictor.load(arguments.predictor)
         if learned.model_hash and arguments.surfaces == "auto":
             arguments.surfaces = "coefficients"
         cohort = cohort_of(arguments, learned.gauge, least=1)
-        return finish(predicted_answer(learned, cohort, learned.predict(cohort)), arguments)
+        return finish(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     subject = arguments.subject or (SUBJECT if SUBJECT in cohort.table.columns else None)
     wanted = [arguments.target, *([subject] if subject else [])]
     cohort = cohort.complete(wanted, drop_missing=arguments.drop_missing)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
-        found = regress(
+        result = regress(
             cohort,
             arguments.target,
             subject=subject,
             folds=arguments.folds,
             permutations=arguments.permutations,
-            level=arguments.level,
+            confidence=arguments.level,
             seed=arguments.seed,
-            on_step=step,
+            progress=step,
         )
     new = None
     if arguments.predict is not None:
@@ -47,9 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
             fresh = read_cohort(arguments.predict, options, onto=cohort, on_shape=step)
         there = subject is not None and subject in fresh.table.columns
         refuse_known(
-            found.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where
+            result.subjects, fresh.table.texts(subject) if there and subject else fresh.names, fresh.table.where
         )
-        new = (fresh, found.predictor.predict(fresh))
+        new = (fresh, result.predictor.predict(fresh))
     make_folder(arguments.output)
-    found.predictor.save(arguments.output / "predictor.npz")
-    return finish(found.answer(new), arguments)
+    result.predictor.save(arguments.output / "predictor.npz")
+    return finish(regression_report(result, new), arguments)

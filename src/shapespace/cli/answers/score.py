@@ -10,9 +10,10 @@ from shapespace.cli.answers.common import cohort_of, finish
 def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import steps
-    from shapespace.statistics.score import ScoreOptions, score
+    from shapespace.report.analyses.score import score_report
+    from shapespace.statistics.score import ScoreConfig, score
 
-    options = ScoreOptions(
+    config = ScoreConfig(
         modes=arguments.modes,
         subject=arguments.subject,
         nearest=arguments.nearest,
@@ -23,5 +24,5 @@ def run(arguments: argparse.Namespace) -> int:
     reference = cohort_of(argparse.Namespace(**{**vars(arguments), **known}))
     subjects = cohort_of(arguments, onto=reference)
     with steps(len(subjects), "scoring", "subject", quiet=arguments.quiet) as step:
-        scores = score(reference, subjects, options, on_step=step)
-    return finish(scores.answer(), arguments)
+        result = score(reference, subjects, config, progress=step)
+    return finish(score_report(result), arguments)

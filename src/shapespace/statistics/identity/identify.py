@@ -10,12 +10,11 @@ import numpy as np
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
 from shapespace.errors import InputError
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
-from shapespace.statistics.answer import Answer
-from shapespace.statistics.identity.rates import Figure, figure, people_drawn
-from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.statistics.analysis_result import AnalysisResult
+from shapespace.statistics.identity.rates import RateEstimate, people_drawn, rate_estimate
 from shapespace.statistics.identity.scores import score_name
+from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FPIR = (1e-1, 1e-2)
@@ -78,8 +77,8 @@ class Searches:
         return 1.0 - np.average(hit[self.enrolled], axis=0, weights=w[self.enrolled])
 
 
-@dataclass(frozen=True, eq=False)
-class Identified:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IdentificationRates:
     """How well one score finds people.
 
     Args:
@@ -93,16 +92,16 @@ class Identified:
 
     name: str
     searches: Searches
-    rank_1: Figure
+    rank_1: RateEstimate
     cmc: FloatArray
     band: FloatArray
-    fnir: Mapping[float, Figure]
+    fnir: Mapping[float, RateEstimate]
 
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IdentificationResult(AnalysisResult):
     """What identification in a cohort found.
 
     Args:
@@ -111,30 +110,23 @@ class Identification:
         probes: how many searches there were.
         trained_on: how many people were learned from; the least of all rounds.
         trial: who was who.
-        options: that it was asked with.
+        config: options of the analysis.
     """
 
-    scores: tuple[Identified, ...]
+    scores: tuple[IdentificationRates, ...]
     enrolled: int
     probes: int
     trained_on: int
     trial: Trial
-    options: IdentityOptions
+    config: IdentityConfig
 
-    def __getitem__(self, name: str) -> Identified:
+    def __getitem__(self, name: str) -> IdentificationRates:
         name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
-    def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
-        return lazy_import("answer_of_identification")(self)
-
     def __repr__(self) -> str:
         ranks = listed_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
-        return f"<Identification of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
+        return f"<IdentificationResult of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
 
 def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
@@ -162,39 +154,44 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
 
 
 def identify(
-    cohort: Cohort, options: IdentityOptions | None = None, *, on_step: Callable[[int, int], None] | None = None
-) -> Identification:
+    cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> IdentificationResult:
     """Return how well people are found among those enrolled.
 
     Args:
         cohort: scans of which the table says whom they show.
-        options: who is enrolled; None enrols the first scan of each person. With folds, people are searched for among
+        config: who is enrolled; None enrols the first scan of each person. With folds, people are searched for among
             those of their own fold.
-        on_step: called with (done, total).
+        progress: called with (done, total).
 
     Raises:
         InputError: as `trial_of`, or too few people to learn from.
         ShapespaceError: scikit-learn is not installed.
     """
     require(cohort, Cohort, "identify", "read one with shapespace.read_cohort")
-    options = options or IdentityOptions()
-    trial = trial_of(cohort, options, enrol=True)
-    parts: dict[str, list[Searches]] = {name: [] for name in options.scores}
+    config = config or IdentityConfig()
+    trial = trial_of(cohort, config, enrol=True)
+    parts: dict[str, list[Searches]] = {name: [] for name in config.scores}
     sizes: list[int] = []
-    for round_, found in scores_of(trial, options, options.modes):
+    for round_, found in scores_of(trial, config, config.modes):
         gallery, probes = (trial.person[list(rows)] for rows in (round_.gallery, round_.probes))
         sizes.append(len(np.unique(gallery)))
         for name, scores in found.items():
             parts[name].append(search(scores, gallery, probes))
-    people = people_drawn(trial.tested, options.draws, options.seed)
-    found_by: list[Identified] = []
+    people = people_drawn(trial.tested, config.draws, config.seed)
+    rates: list[IdentificationRates] = []
     for number, (name, told) in enumerate(parts.items()):
-        found_by.append(identified(name, joined(told), min(sizes), people))
-        if on_step is not None:
-            on_step(number + 1, len(parts))
-    learned = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
-    probes = sum(len(one.probes) for one in trial.rounds)
-    return Identification(tuple(found_by), min(sizes), probes, learned, trial, options)
+        rates.append(identification_rates(name, joined(told), min(sizes), people))
+        if progress is not None:
+            progress(number + 1, len(parts))
+    return IdentificationResult(
+        scores=tuple(rates),
+        enrolled=min(sizes),
+        probes=sum(len(one.probes) for one in trial.rounds),
+        trained_on=min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds),
+        trial=trial,
+        config=config,
+    )
 
 
 def joined(parts: Sequence[Searches]) -> Searches:
@@ -203,7 +200,7 @@ def joined(parts: Sequence[Searches]) -> Searches:
     return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
 
-def identified(name: str, searches: Searches, most: int, people: FloatArray) -> Identified:
+def identification_rates(name: str, searches: Searches, most: int, people: FloatArray) -> IdentificationRates:
     """Return the figures of one score.
 
     Args:
@@ -225,7 +222,16 @@ def identified(name: str, searches: Searches, most: int, people: FloatArray) -> 
     band = np.percentile(drawn[:, :most], [2.5, 97.5], axis=0) if len(drawn) else np.full((2, most), np.nan)
     band = np.stack(widen_share(band[0], band[1], searches.people))
     missed = {
-        rate: figure(float(fnir[k]), drawn[:, most + k], searches.people) if searched * rate >= 1 else Figure(None)
+        rate: rate_estimate(float(fnir[k]), drawn[:, most + k], searches.people)
+        if searched * rate >= 1
+        else RateEstimate(None)
         for k, rate in enumerate(FPIR)
     }
-    return Identified(name, searches, figure(float(cmc[0]), drawn[:, 0], searches.people), cmc, band, missed)
+    return IdentificationRates(
+        name=name,
+        searches=searches,
+        rank_1=rate_estimate(float(cmc[0]), drawn[:, 0], searches.people),
+        cmc=cmc,
+        band=band,
+        fnir=missed,
+    )

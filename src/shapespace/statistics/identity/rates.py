@@ -120,7 +120,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Figure:
+class RateEstimate:
     """A figure with its 95 % interval over people; None if the data are too few.
 
     The interval of a share is never narrower than the exact one without an error, see `widen_share`.
@@ -147,7 +147,7 @@ def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
     return out
 
 
-def figure(value: float | None, drawn: Sequence[float] | FloatArray, people: int | None = None) -> Figure:
+def rate_estimate(value: float | None, drawn: Sequence[float] | FloatArray, people: int | None = None) -> RateEstimate:
     """Return a figure with its bootstrap interval over people.
 
     Args:
@@ -157,12 +157,12 @@ def figure(value: float | None, drawn: Sequence[float] | FloatArray, people: int
     """
     known = np.asarray([one for one in drawn if np.isfinite(one)])
     if value is None or not (len(known) or (people and value in (0.0, 1.0))):
-        return Figure(value)
+        return RateEstimate(value)
     tail = 50.0 * (1.0 - _LEVEL)
     low, high = np.percentile(known if len(known) else [value], [tail, 100.0 - tail])
     if people is not None:
         low, high = widen_share(low, high, people, _LEVEL)
-    return Figure(value, float(low), float(high))
+    return RateEstimate(value, float(low), float(high))
 
 
 def resampled(

@@ -10,13 +10,12 @@ import numpy as np
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.proportions import widen_share
-from shapespace.lazy import lazy_import
 from shapespace.reprs import listed_briefly, short_repr
-from shapespace.statistics.answer import Answer
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.identity.calibration import calibrated, cllr, cllr_min
-from shapespace.statistics.identity.rates import Figure, Pairs, Roc, Sweep, figure, people_drawn, resampled
-from shapespace.statistics.identity.rounds import IdentityOptions, Trial, scores_of, trial_of
+from shapespace.statistics.identity.rates import Pairs, RateEstimate, Roc, Sweep, people_drawn, rate_estimate, resampled
 from shapespace.statistics.identity.scores import score_name
+from shapespace.statistics.identity.trial import IdentityConfig, Trial, scores_of, trial_of
 from shapespace.types import BoolArray, FloatArray, IntArray, require
 
 FAR = (1e-1, 1e-2, 1e-3)
@@ -28,7 +27,7 @@ _ENDS = (2.5, 97.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SubgroupRates:
     """The figures of some pairs.
 
     Args:
@@ -40,14 +39,14 @@ class Part:
 
     genuine: int
     impostor: int
-    eer: Figure
-    tar: Mapping[float, Figure]
+    eer: RateEstimate
+    tar: Mapping[float, RateEstimate]
 
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Verified:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VerificationRates:
     """How well one score tells pairs of one person from pairs of two.
 
     Args:
@@ -68,19 +67,19 @@ class Verified:
     score: FloatArray
     llr: FloatArray | None
     roc: Roc
-    eer: Figure
-    tar: Mapping[float, Figure]
-    cllr: Figure
+    eer: RateEstimate
+    tar: Mapping[float, RateEstimate]
+    cllr: RateEstimate
     cllr_min: float
     band: FloatArray
-    by: Mapping[str, Part]
+    by: Mapping[str, SubgroupRates]
     curve: Mapping[int, float]
 
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Verification:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VerificationResult(AnalysisResult):
     """What verification of a cohort found.
 
     Args:
@@ -89,77 +88,72 @@ class Verification:
         people: names.
         trained_on: how many people were learned from; the least of all rounds.
         trial: who was who.
-        options: that it was asked with.
+        config: options of the analysis.
     """
 
-    scores: tuple[Verified, ...]
+    scores: tuple[VerificationRates, ...]
     pairs: Pairs
     people: tuple[str, ...]
     trained_on: int
     trial: Trial
-    options: IdentityOptions
+    config: IdentityConfig
 
-    def __getitem__(self, name: str) -> Verified:
+    def __getitem__(self, name: str) -> VerificationRates:
         name = score_name(name)
         return next(one for one in self.scores if one.name == name)
 
-    def answer(self) -> Answer:
-        """Return it as it is kept and reported."""
-        return lazy_import("answer_of_verification")(self)
-
     def __repr__(self) -> str:
         rates = listed_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
-        return f"<Verification of {len(self.people)} subjects; {rates}>"
-
-    def _repr_html_(self) -> str:
-        return lazy_import("html_of_analysis")(self)
+        return f"<VerificationResult of {len(self.people)} subjects; {rates}>"
 
 
 def verify(
-    cohort: Cohort, options: IdentityOptions | None = None, *, on_step: Callable[[int, int], None] | None = None
-) -> Verification:
+    cohort: Cohort, config: IdentityConfig | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> VerificationResult:
     """Return how well scans of one person are told from scans of two.
 
     Args:
         cohort: scans of which the table says whom they show.
-        options: who is compared with whom; None for all against all, by folds of the people.
-        on_step: called with (done, total).
+        config: who is compared with whom; None for all against all, by folds of the people.
+        progress: called with (done, total).
 
     Raises:
         InputError: as `trial_of`, or too few people to learn from.
         ShapespaceError: scikit-learn is not installed.
     """
     require(cohort, Cohort, "verify", "read one with shapespace.read_cohort")
-    options = options or IdentityOptions()
-    trial = trial_of(cohort, options)
-    pairs, scores = _pairs_and_scores(trial, options, options.modes)
-    values = trial.cohort.table.texts(options.by) if options.by else ()
+    config = config or IdentityConfig()
+    trial = trial_of(cohort, config)
+    pairs, scores = _pairs_and_scores(trial, config, config.modes)
+    values = trial.cohort.table.texts(config.by) if config.by else ()
     chosen = {value: _with_value(values, value, pairs, all_pairs=trial.all_pairs) for value in sorted(set(values))}
-    people = people_drawn(trial.tested, options.draws, options.seed)
-    total, done = len(scores) * options.draws, 0
+    people = people_drawn(trial.tested, config.draws, config.seed)
+    total, done = len(scores) * config.draws, 0
 
     def step() -> None:
         nonlocal done
         done += 1
-        if on_step is not None:
-            on_step(done, total)
+        if progress is not None:
+            progress(done, total)
 
     curves: dict[int, Mapping[str, FloatArray]] = {
-        modes: _pairs_and_scores(trial, options, modes)[1] for modes in options.curve
+        modes: _pairs_and_scores(trial, config, modes)[1] for modes in config.curve
     }
     found = tuple(
-        verified(name, score, pairs, trial.group, people, chosen=chosen, on_draw=step,
+        verification_rates(name, score, pairs, trial.group, people, chosen=chosen, on_draw=step,
                  curve={modes: Sweep(curves[modes][name], pairs.same).roc().eer for modes in curves})
         for name, score in scores.items()
     )  # fmt: skip
-    learned = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
-    return Verification(found, pairs, trial.people, learned, trial, options)
+    n_training = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
+    return VerificationResult(
+        scores=found, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
+    )
 
 
-def _pairs_and_scores(trial: Trial, options: IdentityOptions, modes: int | None) -> tuple[Pairs, dict[str, FloatArray]]:
+def _pairs_and_scores(trial: Trial, config: IdentityConfig, modes: int | None) -> tuple[Pairs, dict[str, FloatArray]]:
     parts: list[Pairs] = []
-    scores: dict[str, list[FloatArray]] = {name: [] for name in options.scores}
-    for round_, found in scores_of(trial, options, modes):
+    scores: dict[str, list[FloatArray]] = {name: [] for name in config.scores}
+    for round_, found in scores_of(trial, config, modes):
         pairs, at = trial.pairs(round_)
         parts.append(pairs)
         for name, matrix in found.items():
@@ -168,7 +162,7 @@ def _pairs_and_scores(trial: Trial, options: IdentityOptions, modes: int | None)
     return Pairs(one, other, rows), {name: np.concatenate(told) for name, told in scores.items()}
 
 
-def verified(
+def verification_rates(
     name: str,
     score: FloatArray,
     pairs: Pairs,
@@ -178,7 +172,7 @@ def verified(
     chosen: Mapping[str, BoolArray] | None = None,
     curve: Mapping[int, float] | None = None,
     on_draw: Callable[[], None] | None = None,
-) -> Verified:
+) -> VerificationRates:
     """Return the figures of one score.
 
     Args:
@@ -210,7 +204,7 @@ def verified(
     usable = drawn[np.isfinite(drawn[:, 1]), 2 + len(FAR) :]
     band = np.percentile(usable, _ENDS, axis=0) if len(usable) else np.full((2, len(GRID)), np.nan)
     band = np.stack(widen_share(band[0], band[1], pairs.genuine_people))
-    by: dict[str, Part] = {}
+    by: dict[str, SubgroupRates] = {}
     for value, own in (chosen or {}).items():
         part = pairs.take(own)
         genuine = int(part.same.sum())
@@ -218,25 +212,37 @@ def verified(
             continue
         own_sweep = Sweep(score[own], part.same)
         spread = resampled(part, people[:_BY_DRAWS], lambda w, s=own_sweep: _figures(s.roc(w)), 1 + len(FAR))
-        by[value] = Part(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
+        by[value] = SubgroupRates(genuine, len(part) - genuine, *_told(own_sweep.roc(), part, spread))
     least = cllr_min(score, pairs.same)
-    return Verified(name, score, llr, roc, eer, tar, figure(cost, drawn[:, 0]), least, band, by, dict(curve or {}))
+    return VerificationRates(
+        name=name,
+        score=score,
+        llr=llr,
+        roc=roc,
+        eer=eer,
+        tar=tar,
+        cllr=rate_estimate(cost, drawn[:, 0]),
+        cllr_min=least,
+        band=band,
+        by=by,
+        curve=dict(curve or {}),
+    )
 
 
 def _figures(rates: Roc) -> FloatArray:
     return np.concatenate([[rates.eer], rates.tar_at(np.array(FAR))])
 
 
-def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[Figure, dict[float, Figure]]:
+def _told(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
     """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {
-        far: figure(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people)
+        far: rate_estimate(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people)
         if impostors * far >= 1
-        else Figure(None)
+        else RateEstimate(None)
         for k, far in enumerate(FAR)
     }
-    return figure(roc.eer, drawn[:, 0], pairs.genuine_people), tar
+    return rate_estimate(roc.eer, drawn[:, 0], pairs.genuine_people), tar
 
 
 def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:

@@ -1,4 +1,4 @@
-"""What is asked of changes, and what was found."""
+"""Options and results of the analysis of changes between visits."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from scipy.stats import t as student
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import listed_briefly, short_repr
 from shapespace.schemas import Methods, TestScheme
+from shapespace.statistics.analysis_result import AnalysisResult
 from shapespace.statistics.change_align import stable_vertices
-from shapespace.statistics.change_group import LEVEL, MapTest
-from shapespace.statistics.change_maps import aligned
-from shapespace.statistics.change_repeat import Repeatability
+from shapespace.statistics.change_maps import align_visits
+from shapespace.statistics.change_repeatability import Repeatability
 from shapespace.statistics.change_visits import visits_of
 from shapespace.statistics.dispersion import DispersionTest
+from shapespace.statistics.map_tests import LEVEL, MapTest
 from shapespace.statistics.methods import dispersion_record, methods_of, sample_sizes
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
@@ -27,9 +28,9 @@ NINETY_FIVE = 1.96
 """Standard deviations that noise exceeds one time in twenty."""
 
 
-@dataclass(frozen=True)
-class ChangeSettings:
-    """What is asked.
+@dataclass(frozen=True, kw_only=True)
+class ChangeConfig:
+    """Options of the analysis of changes.
 
     Args:
         subject: column of the subjects.
@@ -58,20 +59,20 @@ class ChangeSettings:
     unequal_variances: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class VisitChange:
     """One visit beside the first of its subject.
 
     Args:
         label: the time as the table tells it.
-        at: the same as a number.
+        time: the same as a number.
         scans: of it.
         rms_mm: RMS over the surface of the displacement along the normals.
         volume_mm3: swept since the first visit.
     """
 
     label: str
-    at: float
+    time: float
     scans: int
     rms_mm: float
     volume_mm3: float
@@ -79,8 +80,8 @@ class VisitChange:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChangeEstimate:
     """A quantity of one subject with its standard deviations, or its slope by time.
 
     Args:
@@ -109,7 +110,7 @@ class Estimate:
         return np.abs(self.along_mm) > self.quantile * self.stddev_mm
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SubjectChange:
     """What changed in one subject.
 
@@ -121,7 +122,7 @@ class SubjectChange:
         rate: slope of a line through all visits by least squares, per unit of time; None where times are words.
         stable: (V,) bool, what carried the alignment of the last scan.
         area_mm2: (V,) of each vertex at the first visit.
-        before_mm3: volume at the first visit; NaN of a surface that is not closed.
+        volume_before_mm3: volume at the first visit; NaN of a surface that is not closed.
         observed: (V,) bool, whether all scans of the subject observe a vertex; None if they observe all. Elsewhere the
             change is between estimates, and does not count in `rms_mm` and `beyond_share`.
     """
@@ -129,11 +130,11 @@ class SubjectChange:
     name: str
     group: str
     visits: tuple[VisitChange, ...]
-    change: Estimate
-    rate: Estimate | None
+    change: ChangeEstimate
+    rate: ChangeEstimate | None
     stable: BoolArray
     area_mm2: FloatArray
-    before_mm3: float
+    volume_before_mm3: float
     observed: BoolArray | None = None
 
     @property
@@ -159,64 +160,92 @@ class SubjectChange:
         return float(np.average(self.change.beyond, weights=self.observed_area_mm2))
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What changed in the subjects of a cohort, as numbers.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeanChangeTests:
+    """Tests of the mean change over subjects.
+
+    Args:
+        surface: at the vertices, along the normals.
+        volumes: of the regions.
+        landmarks: along the normals; None without landmarks.
+    """
+
+    surface: MapTest
+    volumes: MapTest
+    landmarks: MapTest | None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupDifferenceTests:
+    """Tests of the difference between the changes of two groups.
+
+    Args:
+        groups: their names, in order; differences are of the second minus the first.
+        surface: at the vertices, along the normals.
+        volumes: of the regions.
+        dispersion: test of equal dispersion of the changes; None where it cannot be tested.
+    """
+
+    groups: tuple[str, str]
+    surface: MapTest
+    volumes: MapTest
+    dispersion: DispersionTest | None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChangeResult(AnalysisResult):
+    """Changes of the subjects of a cohort between their visits, and tests over subjects.
 
     Args:
         cohort: it is of.
-        settings: that were asked.
+        config: options of the analysis.
         subjects: with two visits or more, in the order of the table.
-        single: subjects with one visit, who are left out.
+        single_visit_subjects: subjects with one visit, who are excluded.
         uncertainty: where standard deviations come from: `rescans`; `fits`, their own; `stable`, the spread over what
             is stable.
         repeatability: from rescans; None without.
-        group: test of the mean over subjects; None of a single one.
-        group_volumes: the same of the volumes of `parts`.
-        group_landmarks: the same of the landmarks, along the normals.
-        between: test of the second group against the first, where they were asked for.
-        between_volumes: the same of the volumes.
-        dispersion: test of equal dispersion of the changes of the two groups; None without groups.
-        groups: names of the two groups, in order.
+        mean_change: tests of the mean over subjects; None for a single subject.
+        group_difference: tests of the difference of two groups; None without `ChangeConfig.group`.
         before: (V, 3) mean of the first visits,
         after: and moved by the mean change.
         landmarks: on the surfaces.
-        parts: names of what volumes are told of: `whole` and the regions.
-        unit: of time, as in `mm per year`; empty where times are words.
-        closed: whether the surface is.
-        model_only: whether the surfaces hold nothing but what the model of the fits can make.
+        regions: names of the parts with volumes: `whole` and the regions.
+        time_unit: as in `mm per year`; empty where times are words.
+        is_closed: whether the surface is closed.
+        is_model_only: whether the surfaces contain only variation of the model of the fits.
         blank: (V,) bool, where maps are blank because too few subjects observe the vertex; None if nowhere.
     """
 
     cohort: Cohort
-    settings: ChangeSettings
+    config: ChangeConfig
     subjects: tuple[SubjectChange, ...]
-    single: tuple[str, ...]
+    single_visit_subjects: tuple[str, ...]
     uncertainty: Literal["rescans", "fits", "stable"]
     repeatability: Repeatability | None
-    group: MapTest | None
-    group_volumes: MapTest | None
-    group_landmarks: MapTest | None
-    between: MapTest | None
-    between_volumes: MapTest | None
-    groups: tuple[str, ...]
+    mean_change: MeanChangeTests | None
+    group_difference: GroupDifferenceTests | None
     before: FloatArray
     after: FloatArray
     landmarks: SurfaceLandmarks
-    parts: tuple[str, ...]
-    unit: str
-    closed: bool
-    model_only: bool
-    dispersion: DispersionTest | None = None
-    blank: BoolArray | None = None
+    regions: tuple[str, ...]
+    time_unit: str
+    is_closed: bool
+    is_model_only: bool
+    blank: BoolArray | None
 
     @cached_property
     def methods(self) -> Methods:
         """Sample sizes, tests and assumptions."""
         tests: list[TestScheme] = []
-        changes = "rate of change" if self.settings.rate else "change"
-        for tested, test in ((f"mean {changes}", self.group), (f"{changes} of two groups", self.between)):
-            if test is not None:
+        changes = "rate of change" if self.config.rate else "change"
+        mean, difference = self.mean_change, self.group_difference
+        for tested, all_tests in ((f"mean {changes}", mean), (f"{changes} of two groups", difference)):
+            if all_tests is not None:
+                test = all_tests.surface
                 flipped = len(test.n) == 1 or test.unequal_variances
                 tests.append(
                     TestScheme(
@@ -228,12 +257,14 @@ class Found:
                 )  # fmt: skip
         names = [one.name for one in self.subjects for visit in one.visits for _ in range(visit.scans)]
         group = {one.name: one.group for one in self.subjects}
-        variables = [(self.settings.group, [group[name] for name in names])] if self.settings.group else []
+        variables = [(self.config.group, [group[name] for name in names])] if self.config.group else []
         return methods_of(
             self.cohort, len(self.subjects), shapes=len(names), dimensions=None, tests=tuple(tests),
             sizes=sample_sizes(names, variables),
-            dispersions=() if self.dispersion is None else (dispersion_record(self.dispersion, LEVEL),),
-            unequal_variances=None if self.between is None else self.settings.unequal_variances,
+            dispersions=()
+            if difference is None or difference.dispersion is None
+            else (dispersion_record(difference.dispersion, LEVEL),),
+            unequal_variances=None if difference is None else self.config.unequal_variances,
             corrected_over=("the vertices of a map", "the parts in the table of volumes", "the landmarks of a table")
             if tests else (),
             assumptions=("Visits of a subject are aligned rigidly to its first by the stable part; p values do not "
@@ -242,32 +273,34 @@ class Found:
 
     @cached_property
     def by_name(self) -> Mapping[str, SubjectChange]:
-        """Subject -> what changed in it."""
+        """Subject -> its change."""
         return {subject.name: subject for subject in self.subjects}
 
     def __repr__(self) -> str:
-        tests = {"mean change": self.group, " and ".join(self.groups) + " differ": self.between}
-        p_values = listed_briefly(
-            [f"{name}: p {test.omnibus_p:.3g}" for name, test in tests.items() if test is not None]
-        )
+        p_values: list[str] = []
+        if self.mean_change is not None:
+            p_values.append(f"mean change: p {self.mean_change.surface.omnibus_p:.3g}")
+        if self.group_difference is not None:
+            groups = " and ".join(self.group_difference.groups)
+            p_values.append(f"{groups} differ: p {self.group_difference.surface.omnibus_p:.3g}")
         return (
             f"<{type(self).__name__} of {len(self.subjects)} subjects, {len(self.cohort)} scans; uncertainty from "
-            f"{self.uncertainty}{f'; {p_values}' if p_values else ''}>"
+            f"{self.uncertainty}{f'; {listed_briefly(p_values)}' if p_values else ''}>"
         )
 
     def surfaces(self, name: str) -> tuple[Mesh, Mesh]:
         """Return a subject's surface at its first visit and, aligned to it, at its last."""
-        visits = visits_of(self.cohort.table, self.settings.subject, self.settings.time, self.settings.order).of[name]
-        found = aligned(self.cohort, visits, stable_vertices(self.cohort, self.settings.stable))
-        faces = self.cohort.faces
-        return Mesh(found.means[0], faces, name=f"{name} before"), Mesh(found.means[-1], faces, name=f"{name} after")
+        visits = visits_of(self.cohort.table, self.config.subject, self.config.time, self.config.order)
+        stable = stable_vertices(self.cohort, self.config.stable)
+        means, faces = align_visits(self.cohort, visits.by_subject[name], stable).means, self.cohort.faces
+        return Mesh(means[0], faces, name=f"{name} before"), Mesh(means[-1], faces, name=f"{name} after")
 
 
-def effect_of(subject: SubjectChange, *, rate: bool) -> Estimate:
+def change_or_rate(subject: SubjectChange, *, rate: bool) -> ChangeEstimate:
     """Return the change of a subject, or its rate."""
-    found = subject.rate if rate else subject.change
-    assert found is not None
-    return found
+    estimate = subject.rate if rate else subject.change
+    assert estimate is not None
+    return estimate
 
 
 def interval_of_mean(values: FloatArray) -> tuple[float, float]:

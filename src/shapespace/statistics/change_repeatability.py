@@ -1,4 +1,4 @@
-"""Repeatability from rescans: how far two scans of the same subject at the same time differ, and what that means."""
+"""Repeatability from rescans: within-subject standard deviation, smallest detectable change and ICC."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import numpy as np
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.geometry.surface import vertex_areas
 from shapespace.reprs import short_repr
-from shapespace.statistics.change_maps import Aligned, swept_mm3
+from shapespace.statistics.change_maps import AlignedVisits, swept_mm3
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 SMALLEST = 1.96 * float(np.sqrt(2.0))
 """Of the within-subject standard deviation: the smallest detectable change of one scan against another."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Repeatability:
-    """What rescans tell of the noise of one scan, after the alignment that the changes have.
+    """Noise of one scan, estimated from rescans after the alignment used for the changes.
 
     Args:
-        scans: that are rescanned or rescans,
-        visits: of so many,
+        scans: number of scans of visits with rescans.
+        visits: number of visits with rescans.
         freedom: degrees of freedom, scans less visits.
         within_mm: (V,) within-subject standard deviation along the normals.
         volumes_within_mm3: (P,) of the volume that each part sweeps, the whole first.
         landmarks_within_mm: (L,) of each landmark: root of the summed variances along the axes.
         icc: (V,) intraclass correlation of each vertex between people, all three axes; NaN without two people.
-        shape_icc: of all vertices together,
-        volume_icc: and of the volume between the surface and the mean.
+        shape_icc: of all vertices together.
+        volume_icc: of the volume between the surface and the mean.
     """
 
     scans: int
@@ -61,8 +61,8 @@ class Repeatability:
 
 
 @dataclass(eq=False)
-class Rescans:
-    """Gathers rescans, a subject at a time.
+class RepeatabilityEstimator:
+    """Estimator of repeatability that takes one subject at a time.
 
     Args:
         reference: (V, 3) in whose frame people are compared.
@@ -77,30 +77,31 @@ class Rescans:
     parts: FloatArray
     scans: int = 0
     visits: int = 0
-    people: list[int] = field(default_factory=list[int])
+    n_scans_of_subject: list[int] = field(default_factory=list[int])
 
     def __post_init__(self) -> None:
         V = len(self.reference)
         self._area = vertex_areas(Mesh(self.reference, self.faces))
-        self._along, self._marks, self._volume = np.zeros(V), np.zeros(len(self.landmarks)), np.zeros(len(self.parts))
+        self._along, self._volume = np.zeros(V), np.zeros(len(self.parts))
+        self._landmarks = np.zeros(len(self.landmarks))
         self._within, self._means, self._squares = np.zeros(V), np.zeros((V, 3)), np.zeros(V)
         self._volumes: list[FloatArray] = []
 
-    def add(self, subject: Aligned) -> None:
-        """Take in the visits of a subject that have rescans."""
+    def add(self, subject: AlignedVisits) -> None:
+        """Add the visits of a subject that have rescans."""
         chosen = [scans for scans in subject.scans if len(scans) > 1]
         for scans in chosen:
             off = scans - scans.mean(axis=0)
             self._along += (np.einsum("nvd,vd->nv", off, subject.normals) ** 2).sum(axis=0)
-            self._marks += (self.landmarks.interpolate(np.moveaxis(off, 1, 0)) ** 2).sum(axis=(1, 2))
+            self._landmarks += (self.landmarks.interpolate(np.moveaxis(off, 1, 0)) ** 2).sum(axis=(1, 2))
             self._volume += _squares(self._swept(subject.means[0], scans) @ self.parts.T)
             self.scans += len(scans)
             self.visits += 1
         if chosen:
-            self._add_person(chosen[0])
+            self._add_subject(chosen[0])
 
-    def _add_person(self, scans: FloatArray) -> None:
-        """One visit of each person stands for it between people."""
+    def _add_subject(self, scans: FloatArray) -> None:
+        """Add one visit of a subject to the variation between subjects."""
         mean = scans.mean(axis=0)
         T = fit_similarity(mean, self.reference, self._area, with_scale=False)
         off = T.apply(mean) - self.reference
@@ -109,29 +110,30 @@ class Rescans:
         self._squares += len(scans) * (off**2).sum(axis=1)
         posed = np.stack([T.apply(scan) for scan in scans])
         self._volumes.append(self._swept(self.reference, posed).sum(axis=1, keepdims=True))
-        self.people.append(len(scans))
+        self.n_scans_of_subject.append(len(scans))
 
     def _swept(self, before: FloatArray, scans: FloatArray) -> FloatArray:
         return np.stack([swept_mm3(before, scan, self.faces) for scan in scans])
 
-    def told(self) -> Repeatability | None:
-        """Return what they tell; None where there are none."""
+    def repeatability(self) -> Repeatability | None:
+        """Return the repeatability; None without rescans."""
         freedom = self.scans - self.visits
         if not freedom:
             return None
-        between = self._squares - (self._means**2).sum(axis=1) / sum(self.people)
+        between = self._squares - (self._means**2).sum(axis=1) / sum(self.n_scans_of_subject)
         volumes = np.concatenate(self._volumes)
         within_volume = np.sum([_squares(own) for own in self._volumes], axis=0)
+        sizes = self.n_scans_of_subject
         return Repeatability(
-            self.scans,
-            self.visits,
-            freedom,
-            np.sqrt(self._along / freedom),  # S21
-            np.sqrt(self._volume / freedom),
-            np.sqrt(self._marks / freedom),
-            _icc(between, self._within, self.people),
-            float(_icc(between.sum(keepdims=True), self._within.sum(keepdims=True), self.people)[0]),
-            float(_icc(_squares(volumes) - within_volume, within_volume, self.people)[0]),
+            scans=self.scans,
+            visits=self.visits,
+            freedom=freedom,
+            within_mm=np.sqrt(self._along / freedom),  # S21
+            volumes_within_mm3=np.sqrt(self._volume / freedom),
+            landmarks_within_mm=np.sqrt(self._landmarks / freedom),
+            icc=_icc(between, self._within, sizes),
+            shape_icc=float(_icc(between.sum(keepdims=True), self._within.sum(keepdims=True), sizes)[0]),
+            volume_icc=float(_icc(_squares(volumes) - within_volume, within_volume, sizes)[0]),
         )
 
 

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.report.analyses.results import analysis_report
+from shapespace.report.analyses.shape_data import shape_notes, shape_settings
 from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.change import change
-from shapespace.statistics.compare import CompareOptions, compare
-from shapespace.statistics.observed import information, shape_notes, shape_settings
+from shapespace.statistics.compare import CompareConfig, compare
+from shapespace.statistics.observation_weights import information
 from shapespace.statistics.regression import regress
 from shapespace.statistics.score import score
 from shapespace.types import BoolArray, FloatArray
@@ -73,13 +75,13 @@ def test_a_difference_that_only_estimates_show_is_not_on_the_map() -> None:
     whole[10:] += 25.0 * near[:, None] * whole[0] / np.linalg.norm(whole[0], axis=1, keepdims=True)
     holed = np.where(mask()[:, :, None], whole, np.nan)
     made = Cohort.of_shapes(holed, {"group": GROUPS}, faces=training_meshes(3, vertices=V)[0].faces)
-    found = compare(made, "~ group", CompareOptions(permutations=200))
+    found = compare(made, "~ group", CompareConfig(permutations=200))
     shown = found.effects[0].map
     assert shown is not None and shown.weight is not None and shown.blank is not None
     np.testing.assert_array_equal(np.flatnonzero(shown.blank), np.arange(6))
     assert (shown.shown.p_family[:6] == 1).all() and (shown.shown_mm[:6] == 0).all()
     assert (shown.shown.p_family[6:] <= 0.05).any()
-    answer = found.answer()
+    answer = analysis_report(found)
     assert any("6 of 80 vertices are grey" in sentence for sentence in answer.summary)
     assert np.isnan(answer.arrays["effect_1.npz"]["normal_mm"][:6]).all()
     assert np.isfinite(answer.arrays["effect_1.npz"]["normal_mm"][6:]).all()
@@ -94,7 +96,7 @@ def test_answers_state_the_share_of_estimates_and_the_shape_with_most() -> None:
     assert "in 9 of 20 shapes, most in shape 4 (12.5 %)" in note
     stated = shape_settings(made)
     assert stated["estimated_share_largest_shape"] == "shape 4" and stated["vertices_not_analysed"] == 0
-    answer = compare(made, "~ group", CompareOptions(permutations=20, maps=False)).answer()
+    answer = analysis_report(compare(made, "~ group", CompareConfig(permutations=20, maps=False)))
     header, rows = answer.tables["observed.csv"]
     assert header == ("shape", "estimated_share") and len(rows) == 9 and rows[0] == ("shape 4", 0.125)
     assert note in answer.notes and answer.settings["estimated_share"] == stated["estimated_share"]
@@ -131,7 +133,7 @@ def test_maps_of_asymmetry_are_grey_where_a_side_is_not_observed() -> None:
     pair = sorted((9, int(thing.other[9])))
     np.testing.assert_array_equal(np.flatnonzero(found.blank), pair)
     assert (found.directional_p[pair] == 1).all() and np.abs(found.difference[:, pair]).max() == 0
-    grey = np.isnan(found.answer().arrays["asymmetry.npz"]["maps_mm"])
+    grey = np.isnan(analysis_report(found).arrays["asymmetry.npz"]["maps_mm"])
     np.testing.assert_array_equal(np.flatnonzero(grey[2]), sorted({7, int(thing.other[7]), *pair}))
     assert grey[:, 30].sum() == 0
 
@@ -148,22 +150,24 @@ def test_changes_are_grey_where_a_visit_is_not_observed() -> None:
         visits, table, faces=training_meshes(3, vertices=V)[0].faces, gauge="form", observed=observed
     )
     found = change(made)
-    assert found.blank is not None and found.group is not None
+    assert found.blank is not None and found.mean_change is not None
     np.testing.assert_array_equal(np.flatnonzero(found.blank), [30])
-    assert found.group.p[30] == 1 and np.isnan(found.answer().arrays["change.npz"]["mean"][30])
-    maps = found.answer().arrays["subjects.npz"]["change_mm"]
+    assert found.mean_change.surface.p[30] == 1 and np.isnan(analysis_report(found).arrays["change.npz"]["mean"][30])
+    maps = analysis_report(found).arrays["subjects.npz"]["change_mm"]
     np.testing.assert_array_equal(np.argwhere(np.isnan(maps[:, 20])).ravel(), [1])
 
 
 def test_regression_and_score_take_missing_vertices() -> None:
     made = cohort(age=[float(k) for k in np.random.default_rng(0).permutation(N)])
     found = regress(made, "age", folds=4, permutations=0)
-    assert np.isfinite(found.map).all() and any("estimates" in note for note in found.answer().notes)
+    assert np.isfinite(found.map).all() and any("estimates" in note for note in analysis_report(found).notes)
     more = np.where(mask(24)[20:, :, None], shapes(24)[20:], np.nan)
     subjects = Cohort.of_shapes(more, {}, names=["x1", "x2", "x3", "x4"], onto=made)
     scores = score(made, subjects)
     np.testing.assert_array_equal(np.isnan(scores.z), np.isnan(more[:, :, 0]))
-    assert np.isfinite(scores.beyond_2).all() and any("in 4 of 4 shapes" in note for note in scores.answer().notes)
+    assert np.isfinite(scores.beyond_2).all() and any(
+        "in 4 of 4 shapes" in note for note in analysis_report(scores).notes
+    )
 
 
 @pytest.mark.parametrize("gauge", ["shape", "form"])

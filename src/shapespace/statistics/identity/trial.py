@@ -23,7 +23,7 @@ _FOLDS, _GROUPS = 4, 5
 
 
 @dataclass(frozen=True)
-class IdentityOptions:
+class IdentityConfig:
     """Who is compared with whom, and how.
 
     Args:
@@ -74,7 +74,7 @@ class Round:
     probes: tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Trial:
     """A cohort ready to be compared.
 
@@ -140,30 +140,30 @@ def rows_of(table: Table, expression: str) -> list[int]:
     return rows
 
 
-def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -> Trial:
+def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> Trial:
     """Return who is compared with whom.
 
     Args:
         cohort: the scans.
-        options: who is who.
+        config: who is who.
         enrol: whether there must be a gallery; without one, the first scan of each person is it.
 
     Raises:
         InputError: columns or scores that are not there, people who are both tested and learned from, or too few of
             them.
     """
-    refuse_unknown_scores(options.scores)
-    role = options.role
-    if role is None and "role" in cohort.table.columns and not (options.gallery or options.probe or options.train):
+    refuse_unknown_scores(config.scores)
+    role = config.role
+    if role is None and "role" in cohort.table.columns and not (config.gallery or config.probe or config.train):
         role = "role"
-    used = [options.subject, *([role] if role else []), *([options.by] if options.by else [])]
-    cohort = cohort.complete(used, drop_missing=options.drop_missing)
+    used = [config.subject, *([role] if role else []), *([config.by] if config.by else [])]
+    cohort = cohort.complete(used, drop_missing=config.drop_missing)
     table, notes = cohort.table, list(cohort.notes)
-    subjects = table.texts(options.subject)
+    subjects = table.texts(config.subject)
     people = sorted(set(subjects))
     place = {name: k for k, name in enumerate(people)}
     person = np.array([place[name] for name in subjects], dtype=np.int32)
-    gallery, probes, training = _roles(table, role, options)
+    gallery, probes, training = _roles(table, role, config)
     tested = sorted({*gallery, *probes})
     both = sorted({subjects[row] for row in tested} & {subjects[row] for row in training})
     if both:
@@ -179,14 +179,22 @@ def trial_of(cohort: Cohort, options: IdentityOptions, *, enrol: bool = False) -
     all_pairs = not gallery
     if all_pairs:
         gallery = probes
-    group, rounds = _rounds(person, len(people), gallery, probes, training, options)
-    trial = Trial(cohort, tuple(people), person, rounds, group, all_pairs, tuple(notes))
+    group, rounds = _rounds(person, len(people), gallery, probes, training, config)
+    trial = Trial(
+        cohort=cohort,
+        people=tuple(people),
+        person=person,
+        rounds=rounds,
+        group=group,
+        all_pairs=all_pairs,
+        notes=tuple(notes),
+    )
     _refuse_too_few(trial, table)
     return trial
 
 
 def scores_of(
-    trial: Trial, options: IdentityOptions, modes: int | None
+    trial: Trial, config: IdentityConfig, modes: int | None
 ) -> Iterator[tuple[Round, Mapping[str, FloatArray]]]:
     """Yield each round with the (G, P) scores of its gallery and probes by name.
 
@@ -194,17 +202,17 @@ def scores_of(
         InputError: too few people to learn from, or more modes than there are.
     """
     for one in trial.rounds:
-        samples = samples_of(trial.cohort, trial.subjects, one.training, uncertainty=options.uncertainty)
+        samples = samples_of(trial.cohort, trial.subjects, one.training, uncertainty=config.uncertainty)
         samples = samples.leading(modes)
         training, gallery, probes = (samples.take(rows) for rows in (one.training, one.gallery, one.probes))
-        yield one, {name: _scored(name, training, gallery, probes) for name in options.scores}
+        yield one, {name: _scored(name, training, gallery, probes) for name in config.scores}
 
 
 def _scored(name: str, training: Samples, gallery: Samples, probes: Samples) -> FloatArray:
     return SCORES[name](training)(gallery, probes)
 
 
-def _roles(table: Table, role: str | None, options: IdentityOptions) -> tuple[list[int], list[int], list[int]]:
+def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list[int], list[int], list[int]]:
     """Return the rows of gallery, probes and training; no gallery for all against all."""
     if role is not None:
         cells = [cell.lower() for cell in table.texts(role)]
@@ -215,12 +223,12 @@ def _roles(table: Table, role: str | None, options: IdentityOptions) -> tuple[li
         if gallery and not probes:
             raise InputError(f"{table.where}: {role!r} names a gallery and no probe.")
         return gallery, probes, training
-    training = rows_of(table, options.train) if options.train else []
-    gallery = [row for row in rows_of(table, options.gallery) if row not in set(training)] if options.gallery else []
-    if options.probe and not gallery:
+    training = rows_of(table, config.train) if config.train else []
+    gallery = [row for row in rows_of(table, config.gallery) if row not in set(training)] if config.gallery else []
+    if config.probe and not gallery:
         raise InputError("Probes need a gallery; name it with --gallery.")
     taken = {*training, *gallery}
-    probes = rows_of(table, options.probe) if options.probe else range(len(table))
+    probes = rows_of(table, config.probe) if config.probe else range(len(table))
     return gallery, [row for row in probes if row not in taken], training
 
 
@@ -230,7 +238,7 @@ def _rounds(
     gallery: Sequence[int],
     probes: Sequence[int],
     training: Sequence[int],
-    options: IdentityOptions,
+    config: IdentityConfig,
 ) -> tuple[IntArray, tuple[Round, ...]]:
     """Return the group of each person, and the rounds."""
     if not gallery:
@@ -239,17 +247,17 @@ def _rounds(
     if training:
         parts = max(min(_GROUPS, len(tested) // 2), 1)
     else:
-        parts = options.folds or max(min(_FOLDS, len(tested) // 2), 1)
-        if options.folds and not 2 <= options.folds <= len(tested) // 2:
+        parts = config.folds or max(min(_FOLDS, len(tested) // 2), 1)
+        if config.folds and not 2 <= config.folds <= len(tested) // 2:
             raise InputError(
-                f"{len(tested)} subjects cannot be split into {options.folds} folds; each needs two of them, and two "
+                f"{len(tested)} subjects cannot be split into {config.folds} folds; each needs two of them, and two "
                 "folds are the least."
             )
         if parts < 2:
             raise InputError(
                 f"There are {len(tested)} subjects, but at least four are needed: two for training and two for testing."
             )
-    order = np.random.default_rng((options.seed, 3)).permutation(len(tested))
+    order = np.random.default_rng((config.seed, 3)).permutation(len(tested))
     group = np.zeros(people, dtype=np.int32)
     group[tested[order]] = np.arange(len(tested)) % parts
     if training:

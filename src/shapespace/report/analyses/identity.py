@@ -1,4 +1,4 @@
-"""Figures of who-is-it in words, tables and curves."""
+"""Sentences, cells and curves shared by the reports of verification and identification."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.proportions import zero_bound
+from shapespace.report.analyses.analysis_report import Rows
 from shapespace.schemas import Series
-from shapespace.statistics.answer import Rows
-from shapespace.statistics.identity.rates import Figure
-from shapespace.statistics.identity.rounds import IdentityOptions, Trial
+from shapespace.statistics.identity.rates import RateEstimate
+from shapespace.statistics.identity.trial import IdentityConfig, Trial
 from shapespace.types import FloatArray
 
 _POINTS = 300
-CALLED = {
+SCORE_NAMES = {
     "plda": "PLDA score",
     "cosine": "cosine",
     "mahalanobis": "whitened distance",
@@ -30,12 +30,12 @@ INTERVALS = (
 """Description of the intervals of error rates, for reports."""
 
 
-def called(name: str) -> str:
+def score_label(name: str) -> str:
     """Return what a score is called in words."""
-    return CALLED.get(name, name)
+    return SCORE_NAMES.get(name, name)
 
 
-def in_percent(one: Figure) -> str:
+def percent_text(one: RateEstimate) -> str:
     """Return a share with its interval in words."""
     if one.value is None:
         return "not known"
@@ -43,27 +43,27 @@ def in_percent(one: Figure) -> str:
     return f"{100 * one.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
 
 
-def interval(one: Figure) -> tuple[float, float] | None:
+def interval(one: RateEstimate) -> tuple[float, float] | None:
     """Return the ends of an interval, or None if there is none."""
     return None if one.low is None or one.high is None else (one.low, one.high)
 
 
-def cells(one: Figure) -> list[object]:
+def csv_cells(one: RateEstimate) -> list[object]:
     """Return value, low and high of a figure as cells of a CSV table."""
     return ["" if value is None else value for value in (one.value, one.low, one.high)]
 
 
-def thinned(x: FloatArray, y: FloatArray, label: str) -> Series:
+def thin_curve(x: FloatArray, y: FloatArray, label: str) -> Series:
     """Return a line through the ends and a few hundred points of a curve, those where it turns first."""
     corners = np.ones(len(x), dtype=np.bool_)
     corners[1:-1] = ~(((x[1:-1] == x[:-2]) & (x[1:-1] == x[2:])) | ((y[1:-1] == y[:-2]) & (y[1:-1] == y[2:])))
-    at = np.flatnonzero(corners)
-    if len(at) > _POINTS:
-        at = at[np.unique(np.linspace(0, len(at) - 1, _POINTS).round().astype(np.intp))]
-    return Series(x=tuple(x[at].tolist()), y=tuple(y[at].tolist()), label=label)
+    kept_points = np.flatnonzero(corners)
+    if len(kept_points) > _POINTS:
+        kept_points = kept_points[np.unique(np.linspace(0, len(kept_points) - 1, _POINTS).round().astype(np.intp))]
+    return Series(x=tuple(x[kept_points].tolist()), y=tuple(y[kept_points].tolist()), label=label)
 
 
-def who_was_tested(trial: Trial, trained_on: int) -> str:
+def subjects_sentence(trial: Trial, trained_on: int) -> str:
     """Return in words who was compared, and who was learned from."""
     tested = int(trial.tested.sum())
     training = f"on {trained_on} other subjects" if trained_on else "on no subjects"
@@ -75,17 +75,12 @@ def who_was_tested(trial: Trial, trained_on: int) -> str:
     )
 
 
-def settings(options: IdentityOptions) -> dict[str, Any]:
+def config_settings(config: IdentityConfig) -> dict[str, Any]:
     """Return all that the result depends on."""
-    return asdict(options)
+    return asdict(config)
 
 
-def hashes(trial: Trial) -> tuple[str, ...]:
-    """Return the hash of the model of the fits."""
-    return () if trial.cohort.fitted is None else (trial.cohort.fitted.model.content_hash,)
-
-
-def scans_told(trial: Trial) -> Rows:
+def scan_rows(trial: Trial) -> Rows:
     """Return each scan with its subject, and what it was in the round in which its person was tested."""
     role = dict.fromkeys(range(len(trial.cohort)), "train")
     for one in trial.rounds:
@@ -93,11 +88,13 @@ def scans_told(trial: Trial) -> Rows:
         if not trial.all_pairs:
             role |= dict.fromkeys(one.probes, "probe")
     used = {row for one in trial.rounds for row in (*one.training, *one.gallery, *one.probes)}
-    told = zip(trial.cohort.names, trial.subjects, role.items(), strict=True)
-    return ("scan", "subject", "role"), [(name, who, what if row in used else "") for name, who, (row, what) in told]
+    rows = zip(trial.cohort.names, trial.subjects, role.items(), strict=True)
+    return ("scan", "subject", "role"), [
+        (name, subject, role_of_scan if row in used else "") for name, subject, (row, role_of_scan) in rows
+    ]
 
 
-def none_missed(errors: bool, people: int) -> str:
+def no_error_sentence(errors: bool, people: int) -> str:
     """Return a sentence on the exact upper bound where no error was found among some people."""
     return (
         ""
@@ -108,6 +105,6 @@ def none_missed(errors: bool, people: int) -> str:
     )
 
 
-def seen(values: Sequence[str]) -> tuple[str, ...]:
+def without_empty(values: Sequence[str]) -> tuple[str, ...]:
     """Return the sentences that say something."""
     return tuple(value for value in values if value)

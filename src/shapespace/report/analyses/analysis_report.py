@@ -1,4 +1,4 @@
-"""An answer as it is kept: analysis.json with the parts of its report, and tables, arrays and meshes beside it."""
+"""Report of an analysis and its files: analysis.json with the parts, and tables, arrays and meshes beside it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
 
 
-NOTE_OF_REDUCED_MORPH = "Drawn smaller than it is, so that no triangle flips."
+REDUCED_MORPH_NOTE = "Drawn smaller than it is, so that no triangle flips."
 """The note of a morph whose full size would flip triangles."""
 
 
 @dataclass(frozen=True)
-class Lengths:
+class LengthFormat:
     """Format of lengths: in mm, or without a unit if the coordinates have none.
 
     Args:
@@ -75,7 +75,7 @@ class Lengths:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class AnalysisReport:
     """What an analysis found, ready to be kept.
 
     Args:

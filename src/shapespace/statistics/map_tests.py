@@ -24,7 +24,7 @@ LEVEL = 0.05
 """Family-wise error of maps, and one minus the confidence of their intervals."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MapTest:
     """What a test of maps says.
 
@@ -64,7 +64,7 @@ def mean_test(
     area: FloatArray,
     permutations: int,
     seed: int,
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> MapTest:
     """Return whether the mean of `maps` (N, V) differs from none, each as likely with the other sign if it does not.
 
@@ -73,7 +73,7 @@ def mean_test(
         area: (V,) with which vertices count in the omnibus test: that of the mean's square.
         permutations: at most; all sign flips where they are no more.
         seed: of random ones.
-        on_step: called with (done, total) permutations.
+        progress: called with (done, total) permutations.
     """
     n = len(maps)
     every = 2 ** (n - 1) <= permutations
@@ -92,8 +92,17 @@ def mean_test(
         yield np.ones(n)
         yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
 
-    t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, on_step)
-    return MapTest(maps.mean(axis=0), t, p, omnibus_p, count, every, (n,), critical)
+    t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, progress)
+    return MapTest(
+        effect=maps.mean(axis=0),
+        t=t,
+        p=p,
+        omnibus_p=omnibus_p,
+        permutations=count,
+        every=every,
+        n=(n,),
+        critical_t=critical,
+    )
 
 
 def difference_test(
@@ -102,7 +111,7 @@ def difference_test(
     area: FloatArray,
     permutations: int,
     seed: int,
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
     *,
     unequal_variances: bool = False,
 ) -> MapTest:
@@ -119,7 +128,17 @@ def difference_test(
         omnibus = float((whole >= whole[0] * (1 - _TIE)).mean())
         counts = (int((~second).sum()), int(second.sum()))
         effect = maps[second].mean(axis=0) - maps[~second].mean(axis=0)
-        return MapTest(effect, t, p, omnibus, len(largest), every, counts, _critical(largest), unequal_variances=True)
+        return MapTest(
+            effect=effect,
+            t=t,
+            p=p,
+            omnibus_p=omnibus,
+            permutations=len(largest),
+            every=every,
+            n=counts,
+            critical_t=_critical(largest),
+            unequal_variances=True,
+        )
     n, of_second = len(maps), int(second.sum())
     of_first = n - of_second
     every = math.comb(n, of_second) <= permutations
@@ -146,8 +165,17 @@ def difference_test(
         rng = np.random.default_rng(seed)
         yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
 
-    t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, on_step)
-    return MapTest(contrast(second) @ maps, t, p, omnibus_p, count, every, (of_first, of_second), critical)
+    t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, progress)
+    return MapTest(
+        effect=contrast(second) @ maps,
+        t=t,
+        p=p,
+        omnibus_p=omnibus_p,
+        permutations=count,
+        every=every,
+        n=(of_first, of_second),
+        critical_t=critical,
+    )
 
 
 def _permuted(
@@ -156,7 +184,7 @@ def _permuted(
     draws: Iterator[FloatArray],
     count: int,
     t_of: Callable[[FloatArray], FloatArray],
-    on_step: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None] | None,
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return t of the first of `draws`, its p (V,) by the maxima of all draws, the omnibus p and the critical |t|."""
     gram = (maps * area) @ maps.T
@@ -171,8 +199,8 @@ def _permuted(
             observed, own = t[0], float(overall[0])
         maxima += list(np.abs(t).max(axis=1))
         as_large += int((overall >= own * (1 - _TIE)).sum())
-        if on_step is not None:
-            on_step(len(maxima), count)
+        if progress is not None:
+            progress(len(maxima), count)
     ordered = np.sort(maxima)
     below = np.searchsorted(ordered, np.abs(observed) * (1 - _TIE))  # S26
     return observed, (len(maxima) - below) / len(maxima), as_large / len(maxima), _critical(ordered)

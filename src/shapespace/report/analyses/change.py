@@ -1,4 +1,4 @@
-"""What changed, as a report: sentences, maps, tables, and the change as a morph."""
+"""Report of changes between visits: sentences, maps, tables, and the mean change as a morph."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ import numpy.typing as npt
 
 from shapespace.cohort.table import named
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
+from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Rows
+from shapespace.report.analyses.methods import (
+    dispersion_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
 from shapespace.schemas import (
     CurvePart,
     MorphPart,
@@ -21,22 +29,22 @@ from shapespace.schemas import (
     TablePart,
     TextPart,
 )
-from shapespace.statistics.answer import NOTE_OF_REDUCED_MORPH, Answer, Rows
-from shapespace.statistics.change_found import Found, SubjectChange, effect_of, interval_of_mean
-from shapespace.statistics.change_group import LEVEL, MapTest
-from shapespace.statistics.methods_answer import (
-    dispersion_sentence,
-    is_dispersion_warning,
-    methods_parts,
-    multiplicity_sentence,
+from shapespace.statistics.change_result import (
+    ChangeResult,
+    GroupDifferenceTests,
+    MeanChangeTests,
+    SubjectChange,
+    change_or_rate,
+    interval_of_mean,
 )
-from shapespace.statistics.observed import blank_sentence, blank_where, with_shape_data
+from shapespace.statistics.map_tests import LEVEL, MapTest
+from shapespace.statistics.observation_weights import blank_where
 from shapespace.types import FloatArray, Mesh
 
 ARRAYS, MAPS = "change.npz", "subjects.npz"
-SHOWN = 6
+MOST_MAPS = 6
 """Subjects whose maps the report draws."""
-LISTED, CURVES = 50, 12
+MOST_ROWS, MOST_CURVES = 50, 12
 _LEVEL = LEVEL
 _MM3_PER_ML = 1000.0
 _LEAST_ML_MM3 = 100.0
@@ -51,9 +59,9 @@ _SOURCES = {
 }
 
 
-def answer_of(change: Found) -> Answer:
+def change_report(change: ChangeResult) -> AnalysisReport:
     """Return the report, tables, arrays and meshes of what changed."""
-    settings = change.settings
+    config = change.config
     arrays: dict[str, npt.NDArray[Any]] = {
         "before": change.before,
         "after": change.after,
@@ -61,23 +69,23 @@ def answer_of(change: Found) -> Answer:
         "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
     }
     parts: list[Part] = []
-    if change.group is not None:
-        parts += _of_group(change, change.group, arrays)
-    if change.between is not None:
-        parts += _between(change, change.between, arrays)
-    parts += _of_noise(change, arrays)
-    parts += _of_subjects(change, arrays)
-    parts += _over_time(change)
+    if change.mean_change is not None:
+        parts += _mean_change_parts(change, change.mean_change, arrays)
+    if change.group_difference is not None:
+        parts += _group_difference_parts(change, change.group_difference, arrays)
+    parts += _noise_parts(change, arrays)
+    parts += _subject_parts(change, arrays)
+    parts += _time_series(change)
     parts.append(
         SurfaceMapPart(
             title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
             unit="share of subjects", signed=False, limit=1.0,
-            note=f"Asked for: {settings.stable if isinstance(settings.stable, str) else 'vertices of a list'}. The "
+            note=f"Asked for: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
             "scans of a subject were brought to each other rigidly by these vertices.",
         )
     )  # fmt: skip
-    stable = settings.stable
-    answer = Answer(
+    stable = config.stable
+    report = AnalysisReport(
         "change",
         "What changed?",
         tuple(_summary(change)),
@@ -90,53 +98,56 @@ def answer_of(change: Found) -> Answer:
         },
         notes=(*change.cohort.notes, *_notes(change)),
         settings={
-            "subject": settings.subject,
-            "time": settings.time,
-            "order": settings.order,
+            "subject": config.subject,
+            "time": config.time,
+            "order": config.order,
             "stable": str(stable) if isinstance(stable, str) or not isinstance(stable, Sequence) else list(stable),
-            "group": settings.group,
-            "rate": settings.rate,
-            "permutations": settings.permutations,
-            "seed": settings.seed,
-            "unequal_variances": settings.unequal_variances,
+            "group": config.group,
+            "rate": config.rate,
+            "permutations": config.permutations,
+            "seed": config.seed,
+            "unequal_variances": config.unequal_variances,
             "uncertainty": change.uncertainty,
         },
-        model_hashes=() if change.cohort.fitted is None else (change.cohort.fitted.model.content_hash,),
+        model_hashes=model_hashes(change.cohort),
         methods=change.methods,
     )
-    return with_shape_data(answer, change.cohort)
+    return add_shape_data(report, change.cohort)
 
 
-def _summary(change: Found) -> list[str]:
+def _summary(change: ChangeResult) -> list[str]:
     subjects = change.subjects
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
-    who = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
+    subjects_text = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
     sentences = [
-        f"{who} changed by {rms:.2f} mm (RMS along the normals{'' if len(subjects) == 1 else ', median'}), and on "
+        f"{subjects_text} changed by {rms:.2f} mm (RMS along the "
+        f"normals{'' if len(subjects) == 1 else ', median'}), and on "
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     ]
-    if change.group is not None and change.group_volumes is not None:
-        volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3[0] for one in subjects])
+    if change.mean_change is not None:
+        volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3[0] for one in subjects])
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
-        sentences.append(_of_test(change, change.group, "the mean change", "none"))
-        what = "The volume changed by" if change.closed else "The open surface swept"
+        sentences.append(_test_sentence(change, change.mean_change.surface, "the mean change", "none"))
+        verb = "The volume changed by" if change.is_closed else "The open surface swept"
         sentences.append(
-            f"{what} {unit.text(volumes.mean())} {unit.name}{_per(change)} on average (95 %: {unit.text(low)} to "
+            f"{verb} {unit.text(volumes.mean())} {unit.name}{_per_time(change)} on average (95 %: {unit.text(low)} to "
             f"{unit.text(high)}), "
-            f"{_p(float(change.group_volumes.p[0]))}."
+            f"{_p_text(float(change.mean_change.volumes.p[0]))}."
         )
-    if change.between is not None and change.between_volumes is not None:
-        first, second = change.groups
-        sentences.append(_of_test(change, change.between, f"the change of {second}", f"that of {first}"))
-        difference = float(change.between_volumes.effect[0])
+    if change.group_difference is not None:
+        first, second = change.group_difference.groups
+        sentences.append(
+            _test_sentence(change, change.group_difference.surface, f"the change of {second}", f"that of {first}")
+        )
+        difference = float(change.group_difference.volumes.effect[0])
         unit = _VolumeUnit.of(difference)
         sentences.append(
-            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per(change)} "
-            f"more than that of {first}, {_p(float(change.between_volumes.p[0]))}."
+            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per_time(change)} "
+            f"more than that of {first}, {_p_text(float(change.group_difference.volumes.p[0]))}."
         )
-        unequal = change.settings.unequal_variances
+        unequal = change.config.unequal_variances
         sentences += [
             dispersion_sentence(one, unequal, "mm")
             for one in change.methods.dispersions
@@ -145,16 +156,17 @@ def _summary(change: Found) -> list[str]:
     if change.repeatability is None:
         sentences.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
     else:
-        known, smallest = change.repeatability, change.repeatability.smallest_mm
-        least = float(known.volumes_smallest_mm3[0])
+        repeatability, smallest = change.repeatability, change.repeatability.smallest_mm
+        least = float(repeatability.volumes_smallest_mm3[0])
         unit = _VolumeUnit.of(least)
         sentences.append(
-            f"By {known.scans} scans of {known.visits} {'visit' if known.visits == 1 else 'visits'} with rescans, the "
+            f"By {repeatability.scans} scans of {repeatability.visits} "
+            f"{'visit' if repeatability.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
             f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
             "volume; less is noise."
         )
-    if change.group is not None:
+    if change.mean_change is not None:
         sentences.append(multiplicity_sentence(change.methods))
     return sentences
 
@@ -177,36 +189,39 @@ class _VolumeUnit:
         return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
 
 
-def _of_test(change: Found, test: MapTest, what: str, other: str) -> str:
-    at = int(np.abs(test.t).argmax())
-    found = test.p <= _LEVEL
-    low, high = test.interval(at)
-    where = (
-        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * found.mean():.0f} % of the vertices differ, "
-        f"clearest by {test.effect[at]:+.2f} mm{_per(change)} (simultaneous 95 % interval {low:+.2f} to {high:+.2f} "
+def _test_sentence(change: ChangeResult, test: MapTest, quantity: str, other: str) -> str:
+    vertex = int(np.abs(test.t).argmax())
+    significant = test.p <= _LEVEL
+    low, high = test.interval(vertex)
+    vertices = (
+        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * significant.mean():.0f} % of the vertices "
+        "differ, "
+        f"clearest by {test.effect[vertex]:+.2f} mm{_per_time(change)} (simultaneous 95 % interval {low:+.2f} to "
+        f"{high:+.2f} "
         "mm)"
-        if found.any()
-        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[at]:.3g})"
+        if significant.any()
+        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[vertex]:.3g})"
     )
     differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
-    if found.any() and test.omnibus_p > _LEVEL:
-        where = f"exploratory, since the test of the whole surface is not significant: {where}"
-    few = (
+    if significant.any() and test.omnibus_p > _LEVEL:
+        vertices = f"exploratory, since the test of the whole surface is not significant: {vertices}"
+    limit = (
         f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
     )
-    return f"As a whole {what} {differs} {other} ({_p(test.omnibus_p)}); {where}{few}."
+    return f"As a whole {quantity} {differs} {other} ({_p_text(test.omnibus_p)}); {vertices}{limit}."
 
 
-def _p(p: float) -> str:
+def _p_text(p: float) -> str:
     return f"p = {p:.3g}"
 
 
-def _per(change: Found) -> str:
-    return f" per {change.unit}" if change.settings.rate else ""
+def _per_time(change: ChangeResult) -> str:
+    return f" per {change.time_unit}" if change.config.rate else ""
 
 
-def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    unit = f"mm{_per(change)}"
+def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    test = tests.surface
+    unit = f"mm{_per_time(change)}"
     arrays |= {
         "mean": blank_where(test.effect, change.blank),
         "mean_t": test.t,
@@ -229,10 +244,10 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
         ),
         _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change"),
     ]  # fmt: skip
-    if change.group_volumes is not None and len(change.parts) > 1:
-        parts.append(_region_table(change, change.group_volumes))
-    if change.group_landmarks is not None:
-        header, rows = _group_landmarks(change, change.group_landmarks)
+    if len(change.regions) > 1:
+        parts.append(_region_table(change, tests.volumes))
+    if tests.landmarks is not None:
+        header, rows = _landmark_summary(change, tests.landmarks)
         kinds = ("text", "mm", "mm", "mm", "mm", "p")
         columns = tuple(TableColumn(name=name, kind=kind) for name, kind in zip(header, kinds, strict=True))  # type: ignore[arg-type]
         parts.append(
@@ -244,13 +259,13 @@ def _of_group(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]])
     return parts
 
 
-def _region_table(change: Found, test: MapTest) -> Part:
+def _region_table(change: ChangeResult, test: MapTest) -> Part:
     rows: list[tuple[Any, ...]] = []
-    volumes = np.array([effect_of(one, rate=change.settings.rate).volumes_mm3 for one in change.subjects])
+    volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
-    for at, name in enumerate(change.parts):
-        own = volumes[:, at] / unit.mm3
-        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[at])))
+    for k, name in enumerate(change.regions):
+        own = volumes[:, k] / unit.mm3
+        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
     return TablePart(
         title="Volumes swept",
         columns=(
@@ -263,17 +278,19 @@ def _region_table(change: Found, test: MapTest) -> Part:
     )
 
 
-def _group_landmarks(change: Found, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
+def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
     rows: list[list[Any]] = []
-    maps = np.stack([effect_of(one, rate=change.settings.rate).along_mm for one in change.subjects])
-    for at, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
+    maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
+    for k, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
         low, high = interval_of_mean(values)
-        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[at]])
+        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[k]])
     return ("landmark", "mean", "stddev", "low", "high", "p"), rows
 
 
-def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    first, second = change.groups
+def _group_difference_parts(
+    change: ChangeResult, tests: GroupDifferenceTests, arrays: dict[str, npt.NDArray[Any]]
+) -> list[Part]:
+    (first, second), test = tests.groups, tests.surface
     arrays |= {
         "difference": blank_where(test.effect, change.blank),
         "difference_p": test.p,
@@ -288,50 +305,55 @@ def _between(change: Found, test: MapTest, arrays: dict[str, npt.NDArray[Any]]) 
     return [
         SurfaceMapPart(
             title=f"{second} beside {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
-            mask="difference_found", unit=f"mm{_per(change)}", note=note,
+            mask="difference_found", unit=f"mm{_per_time(change)}", note=note,
         )
     ]  # fmt: skip
 
 
-def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
-    found = change.repeatability
-    if found is None:
+def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    repeatability = change.repeatability
+    if repeatability is None:
         text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
         return [TextPart(title="What is noise", level=2, text=text)]
-    arrays |= {"smallest_mm": found.smallest_mm, "icc": found.icc}
+    arrays |= {"smallest_mm": repeatability.smallest_mm, "icc": repeatability.icc}
     rows: list[tuple[Any, ...]] = [
         (
             "surface (mm, median)",
-            *(float(np.median(of)) for of in (found.within_mm, found.smallest_mm)),
-            found.shape_icc,
+            *(float(np.median(of)) for of in (repeatability.within_mm, repeatability.smallest_mm)),
+            repeatability.shape_icc,
         ),
         *(
             (
                 f"volume of {name} (mm3)",
-                float(found.volumes_within_mm3[at]),
-                float(found.volumes_smallest_mm3[at]),
-                found.volume_icc if at == 0 else None,
+                float(repeatability.volumes_within_mm3[k]),
+                float(repeatability.volumes_smallest_mm3[k]),
+                repeatability.volume_icc if k == 0 else None,
             )
-            for at, name in enumerate(change.parts)
+            for k, name in enumerate(change.regions)
         ),
         *(
             (f"{name} (mm)", float(within), float(smallest), float(icc))
             for name, within, smallest, icc in zip(
                 change.landmarks.names,
-                found.landmarks_within_mm,
-                found.landmarks_smallest_mm,
-                change.landmarks.interpolate(found.icc),
+                repeatability.landmarks_within_mm,
+                repeatability.landmarks_smallest_mm,
+                change.landmarks.interpolate(repeatability.icc),
                 strict=True,
             )
         ),
     ]
-    few = f" {found.freedom} degrees of freedom are few, so these are rough." if found.freedom < _FEW else ""
+    few = (
+        f" {repeatability.freedom} degrees of freedom are few, so these are rough."
+        if repeatability.freedom < _FEW
+        else ""
+    )
     return [
         SurfaceMapPart(
             title="What is noise", level=2, arrays=ARRAYS, vertices="before",
             values="smallest_mm", signed=False,
             note="The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of "
-            f"{found.scans} scans of {found.visits} visits. A change of one scan against another that is "
+            f"{repeatability.scans} scans of {repeatability.visits} visits. A change of one scan against another "
+            "that is "
             f"smaller is noise.{few}",
         ),
         TablePart(
@@ -345,34 +367,35 @@ def _of_noise(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     ]  # fmt: skip
 
 
-def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
     every = len(change.subjects)
-    more = f" The first {LISTED} of {every}; all are in subjects.csv." if every > LISTED else ""
-    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:LISTED])
+    more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
+    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS])
     unit = _VolumeUnit.of(*volumes)
     columns = [
         TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
         TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
         *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
     ]  # fmt: skip
-    if change.closed:
+    if change.is_closed:
         columns.append(TableColumn(name="of the volume before", kind="percent"))
-    if change.groups:
+    has_groups = change.group_difference is not None
+    if has_groups:
         columns.append(TableColumn(name="group"))
     rows: list[tuple[Any, ...]] = []
-    for one in change.subjects[:LISTED]:
+    for one in change.subjects[:MOST_ROWS]:
         volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
         row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
-        row += [volume / unit.mm3, _or_none(stddev / unit.mm3)]
-        row += [volume / one.before_mm3] if change.closed else []
-        rows.append((*row, *([one.group] if change.groups else [])))
+        row += [volume / unit.mm3, _finite_or_none(stddev / unit.mm3)]
+        row += [volume / one.volume_before_mm3] if change.is_closed else []
+        rows.append((*row, *([one.group] if has_groups else [])))
     parts: list[Part] = [
         TablePart(
             title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
             note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
         )
     ]  # fmt: skip
-    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:SHOWN]
+    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
         before, after = change.surfaces(subject.name)
         key = f"subject{number}"
@@ -397,7 +420,7 @@ def _of_subjects(change: Found, arrays: dict[str, npt.NDArray[Any]]) -> list[Par
                     subject.visits[0].label, subject.visits[-1].label,
                 )
             )  # fmt: skip
-    if len(change.subjects) > SHOWN:
+    if len(change.subjects) > MOST_MAPS:
         parts.append(TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}."))
     return parts
 
@@ -413,38 +436,42 @@ def _morph(
         arrays[high] = before + times * change
     return MorphPart(
         title=title, arrays=ARRAYS, low=low, high=high, low_label=low_label, high_label=high_label, times=times,
-        note="" if times == 1 else NOTE_OF_REDUCED_MORPH,
+        note="" if times == 1 else REDUCED_MORPH_NOTE,
     )  # fmt: skip
 
 
-def _over_time(change: Found) -> list[Part]:
-    if not change.unit or all(len(one.visits) < 3 for one in change.subjects):
+def _time_series(change: ChangeResult) -> list[Part]:
+    if not change.time_unit or all(len(one.visits) < 3 for one in change.subjects):
         return []
-    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:CURVES] for visit in one.visits))
+    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:MOST_CURVES] for visit in one.visits))
     series = tuple(
         Series(
             label=one.name,
-            x=tuple(visit.at for visit in one.visits),
+            x=tuple(visit.time for visit in one.visits),
             y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
         )
-        for one in change.subjects[:CURVES]
+        for one in change.subjects[:MOST_CURVES]
     )
     every = len(change.subjects)
-    more = f" The first {CURVES} of {every}; all are in visits.csv." if every > CURVES else ""
+    more = f" The first {MOST_CURVES} of {every}; all are in visits.csv." if every > MOST_CURVES else ""
     return [
         CurvePart(
-            title="Over time", level=2, series=series, x=change.unit, y=f"volume since the first visit, {unit.name}",
+            title="Over time",
+            level=2,
+            series=series,
+            x=change.time_unit,
+            y=f"volume since the first visit, {unit.name}",
             note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
         )
-    ]  # fmt: skip
+    ]
 
 
-def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
+def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
     header = [
         "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
         "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
     ]  # fmt: skip
-    if change.unit:
+    if change.time_unit:
         header += ["rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit"]
     rows: list[list[Any]] = []
     for one in change.subjects:
@@ -457,8 +484,8 @@ def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
             _largest(one),
             one.beyond_share,
             float(one.change.volumes_mm3[0]),
-            _or_none(one.change.volumes_stddev_mm3[0]),
-            _or_none(one.change.volumes_mm3[0] / one.before_mm3),
+            _finite_or_none(one.change.volumes_stddev_mm3[0]),
+            _finite_or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
             len(one.visits),
             sum(visit.scans for visit in one.visits),
             float(np.median(one.change.stddev_mm)),
@@ -467,30 +494,30 @@ def _subject_rows(change: Found) -> tuple[list[str], list[list[Any]]]:
             row += [
                 float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
                 float(one.rate.volumes_mm3[0]),
-                _or_none(one.rate.volumes_stddev_mm3[0]),
-                change.unit,
+                _finite_or_none(one.rate.volumes_stddev_mm3[0]),
+                change.time_unit,
             ]
         rows.append(row)
     return header, rows
 
 
-def _tables(change: Found) -> dict[str, Rows]:
+def _tables(change: ChangeResult) -> dict[str, Rows]:
     tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
     tables["visits.csv"] = (
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
-            (one.name, visit.label, visit.at, visit.scans, visit.rms_mm, visit.volume_mm3)
+            (one.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
             for one in change.subjects
             for visit in one.visits
         ],
     )
-    if len(change.parts) > 1:
+    if len(change.regions) > 1:
         tables["regions.csv"] = (
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
-                (one.name, name, float(one.change.volumes_mm3[at]), _or_none(one.change.volumes_stddev_mm3[at]))
+                (one.name, name, float(one.change.volumes_mm3[k]), _finite_or_none(one.change.volumes_stddev_mm3[k]))
                 for one in change.subjects
-                for at, name in enumerate(change.parts)
+                for k, name in enumerate(change.regions)
             ],
         )
     if change.landmarks:
@@ -499,27 +526,31 @@ def _tables(change: Found) -> dict[str, Rows]:
              "along_normal_stddev_mm", "smallest_detectable_mm"),
             [row for one in change.subjects for row in _landmark_rows(change, one)],
         )  # fmt: skip
-        if change.group_landmarks is not None:
-            tables["group_landmarks.csv"] = _group_landmarks(change, change.group_landmarks)
+        if change.mean_change is not None and change.mean_change.landmarks is not None:
+            tables["group_landmarks.csv"] = _landmark_summary(change, change.mean_change.landmarks)
     return tables
 
 
-def _landmark_rows(change: Found, subject: SubjectChange) -> list[Sequence[object]]:
-    found, known = subject.change, change.repeatability
-    along, stddev = change.landmarks.interpolate(np.stack([found.along_mm, found.stddev_mm], axis=1)).T
-    smallest = [None] * len(change.landmarks) if known is None else list(map(float, known.landmarks_smallest_mm))
+def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequence[object]]:
+    estimate, repeatability = subject.change, change.repeatability
+    along, stddev = change.landmarks.interpolate(np.stack([estimate.along_mm, estimate.stddev_mm], axis=1)).T
+    smallest = (
+        [None] * len(change.landmarks)
+        if repeatability is None
+        else list(map(float, repeatability.landmarks_smallest_mm))
+    )
     return [
         (
             subject.name,
             name,
-            *map(float, found.landmarks_mm[at]),
-            float(np.linalg.norm(found.landmarks_mm[at])),
-            float(found.landmarks_stddev_mm[at]),
-            float(along[at]),
-            float(stddev[at]),
-            smallest[at],
+            *map(float, estimate.landmarks_mm[k]),
+            float(np.linalg.norm(estimate.landmarks_mm[k])),
+            float(estimate.landmarks_stddev_mm[k]),
+            float(along[k]),
+            float(stddev[k]),
+            smallest[k],
         )
-        for at, name in enumerate(change.landmarks.names)
+        for k, name in enumerate(change.landmarks.names)
     ]
 
 
@@ -529,32 +560,34 @@ def _largest(subject: SubjectChange) -> float:
     return float(along[np.abs(along).argmax()])
 
 
-def _maps(change: Found) -> dict[str, npt.NDArray[Any]]:
-    found = {
+def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
+    maps = {
         "subjects": np.array([one.name for one in change.subjects]),
         "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
             np.float32
         ),
         "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
     }
-    found["beyond"] = np.stack([one.change.beyond for one in change.subjects])
-    if change.unit:
-        rates = [effect_of(one, rate=True) for one in change.subjects]
-        found["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
-        found["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
-    return found
+    maps["beyond"] = np.stack([one.change.beyond for one in change.subjects])
+    if change.time_unit:
+        rates = [change_or_rate(one, rate=True) for one in change.subjects]
+        maps["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
+        maps["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
+    return maps
 
 
-def _notes(change: Found) -> list[str]:
+def _notes(change: ChangeResult) -> list[str]:
     notes: list[str] = []
-    if change.single:
-        alone, every = len(change.single), len(change.subjects) + len(change.single)
-        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({named(change.single)}).")
+    if change.single_visit_subjects:
+        alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
+        notes.append(
+            f"{alone} of {every} subjects are left out, who have one visit ({named(change.single_visit_subjects)})."
+        )
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
-    if not change.unit and len(ends) > 1:
-        told = named([f"{first} to {last}" for first, last in sorted(ends)])
-        notes.append(f"Not all subjects have the same first and last visit ({told}).")
-    if change.model_only:
+    if not change.time_unit and len(ends) > 1:
+        pairs_of_visits = named([f"{first} to {last}" for first, last in sorted(ends)])
+        notes.append(f"Not all subjects have the same first and last visit ({pairs_of_visits}).")
+    if change.is_model_only:
         notes.append(
             "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
             "give --surfaces dense."
@@ -562,5 +595,5 @@ def _notes(change: Found) -> list[str]:
     return notes
 
 
-def _or_none(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None

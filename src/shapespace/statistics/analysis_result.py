@@ -1,0 +1,36 @@
+"""Base class of the results of analyses: how they are saved and shown, which the layer `report` implements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from warnings import warn
+
+from shapespace.lazy import SavedReport, lazy_import
+
+
+class AnalysisResult:
+    """The result of an analysis of a cohort."""
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the report, tables, arrays and meshes to a folder.
+
+        `shapespace report FOLDER` draws the report from these files.
+
+        Args:
+            folder: is created if it does not exist.
+
+        Returns:
+            The path of analysis.json.
+
+        Raises:
+            FileError: the folder cannot be written, or the disk is full.
+        """
+        return lazy_import("save_analysis")(self, folder)
+
+    def answer(self) -> SavedReport:
+        """Return the report; deprecated, use `save`."""
+        warn("answer().save(folder) is now called save(folder).", DeprecationWarning, stacklevel=2)
+        return lazy_import("analysis_report")(self)
+
+    def _repr_html_(self) -> str:
+        return lazy_import("html_of_analysis")(self)
