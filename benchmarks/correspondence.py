@@ -28,7 +28,7 @@ import numpy as np
 from reliability import Femora
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.rounds import RoundRunner
 from shapespace.correspondence.rounds import Correspondence, CorrespondSettings, correspond, run_here
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
@@ -273,7 +273,7 @@ def main() -> None:
         if arguments.jobs < 2:
             return correspond(scans, settings, template=template, run=run_here)
         with tempfile.TemporaryDirectory() as folder:
-            kept = KeptRounds(Path(folder), ExecutionConfig(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
+            kept = RoundRunner(Path(folder), ExecutionConfig(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
             return correspond(scans, settings, template=template, run=kept)
 
     for name in arguments.cases or [*SETS, *OTHERS]:

@@ -16,6 +16,7 @@ import pytest
 from conftest import Run, World, leftovers
 from shapespace.batch.execution import EXECUTORS
 from shapespace.errors import FitError
+from shapespace.io import disk_cache
 from shapespace.io.meshes import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
 
@@ -223,3 +224,13 @@ def test_output_that_cannot_be_written_is_said(
     monkeypatch.setattr(sys, "stdout", _FullOutput())
     assert main(["info", str(world.model)]) == 2
     assert "No space left on device" in capsys.readouterr().err
+
+
+def test_the_cache_is_described_and_cleared(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SHAPESPACE_KEEP", str(tmp_path))
+    disk_cache.keep("x", {"a": np.zeros(3)})
+    assert run("cache").out.endswith("1 entries, 0.0 MB\n")
+    facts = run("cache", "--clear", "--json").facts
+    assert facts == {"folder": str(tmp_path), "entries": 0, "bytes": 0} and not list(tmp_path.iterdir())
+    monkeypatch.setenv("SHAPESPACE_KEEP", "no")
+    assert "off" in run("cache").out

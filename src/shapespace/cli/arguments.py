@@ -58,6 +58,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_export(commands)
     _add_convert(commands)
+    _add_cache(commands)
     return top
 
 
@@ -391,6 +392,12 @@ def _add_convert(commands: Any) -> None:
     sub.add_argument("--expressions", type=Path, metavar="FILE.bin",
                      help="blendshapes that eos keeps in a file of their own")  # fmt: skip
     sub.set_defaults(run=run.convert)
+
+
+def _add_cache(commands: Any) -> None:
+    sub = _add(commands, "cache", "print the folder and size of the cache, or clear it", "shapespace cache --clear")
+    sub.add_argument("--clear", action="store_true", help="remove all entries; fits compute them again")
+    sub.set_defaults(run=run.cache)
 
 
 def _add_recognise(commands: Any) -> None:

@@ -561,6 +561,23 @@ def export(arguments: argparse.Namespace) -> int:
     return 0 if not failed else 1 if written else 2
 
 
+def cache(arguments: argparse.Namespace) -> int:
+    """Folder and size of the cache on disk; empties it."""
+    from shapespace.io import disk_cache
+
+    if arguments.clear:
+        disk_cache.clear()
+    folder, entries = disk_cache.entries_folder(), disk_cache.entries()
+    size = sum(file.stat().st_size for file in entries)
+    if arguments.json:
+        show_json({"folder": None if folder is None else str(folder), "entries": len(entries), "bytes": size})
+    elif folder is None:
+        show("The cache is off (SHAPESPACE_KEEP).")
+    else:
+        show(f"{folder}: {len(entries)} entries, {size / 1e6:.1f} MB")
+    return 0
+
+
 def convert(arguments: argparse.Namespace) -> int:
     """Write a model in another format."""
     from shapespace.commands.convert import convert

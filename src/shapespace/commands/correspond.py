@@ -19,7 +19,7 @@ from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.rounds import RoundRunner
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.landmarks import astray, without_astray
@@ -243,10 +243,10 @@ class _Rounds:
         self._number += 1
         with progress(len(tasks), f"round {self._number}: registering", "scan", quiet=self._quiet) as bar:
 
-            def one_more() -> None:
+            def count() -> None:
                 bar.update()
 
-            return list(KeptRounds(self._folder, self._execution_config, self._quiet, one_more)(bench, tasks))
+            return list(RoundRunner(self._folder, self._execution_config, self._quiet, count)(bench, tasks))
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,10 @@ def verdict(method: Method, ended: Ended) -> tuple[Status, str]:
 
 def doubts_of_returned(ended: Ended) -> list[str]:
     """Return how pose, coefficients and surface contradict each other; none where they agree."""
-    from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
+    from shapespace.fit.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
     model, fitted, found = ended.model, ended.fitted, list[str]()
-    z = np.abs(fitted.b) / np.sqrt(new_shapes(model)[: len(fitted.b)])
+    z = np.abs(fitted.b) / np.sqrt(variance_of_new_shapes(model)[: len(fitted.b)])
     worst = int(z.argmax())
     if z[worst] > _FARTHEST_Z:
         found.append(
