@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,10 @@ def test_a_handful_of_points_never_passes_for_a_good_fit(run: Run, world: World,
 class _Killed:
     """Workers that the system ends, as it does when memory runs out."""
 
-    def run(self, work: Any, tasks: Any, /) -> Generator[Any]:
+    def run(self, work: Any, tasks: Any, /) -> closing[Generator[Any]]:
+        return closing(self._answers(work, tasks))
+
+    def _answers(self, work: Any, tasks: Any) -> Generator[Any]:
         yield tasks[0], work.do(tasks[0])
         yield tasks[1], work.give_up(tasks[1], "its worker ended by signal 9")
         raise FitError("The system ends worker processes as they start; use --jobs 1, or free some memory.")

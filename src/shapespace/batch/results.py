@@ -78,9 +78,9 @@ class Source:
             FileError: it cannot be read.
         """
         content_hash = sha256_of_file(file)
-        there = file.stat()
+        stat = file.stat()
         source = Source.at(file, content_hash, folder)
-        return replace(source, size_bytes=there.st_size, modified_ns=there.st_mtime_ns)
+        return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as it stands in a result file; what is not known is left out."""

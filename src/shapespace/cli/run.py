@@ -383,13 +383,13 @@ def fit(arguments: argparse.Namespace) -> int:
         strict=arguments.strict,
     )
     settings = BatchSettings(
-        config,
-        arguments.landmarks,
-        _execution_config(arguments),
-        arguments.again,
-        arguments.stages,
-        arguments.recursive,
-        arguments.store,
+        config=config,
+        landmarks=arguments.landmarks,
+        execution=_execution_config(arguments),
+        again=arguments.again,
+        stages=arguments.stages,
+        recursive=arguments.recursive,
+        store=arguments.store,
     )
     counts, records = fit_scans(
         arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn
