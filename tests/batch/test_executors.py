@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,11 @@ def executor(request: pytest.FixtureRequest) -> Callable[..., Executor]:
     if kind == "serial":
         return Serial
     if kind == "local":
-        return lambda timeout_s=None: Local(2, timeout_s)
+        return partial(Local, 2)
     client = request.getfixturevalue("cluster")
     from shapespace.batch.on_dask import OnDask
 
-    return lambda timeout_s=None: OnDask(client, timeout_s)
+    return partial(OnDask, client)
 
 
 def results(executor: Executor, work: Any, tasks: Any) -> list[tuple[Any, Any]]:

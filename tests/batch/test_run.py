@@ -2,7 +2,8 @@ import csv
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink
 from shapespace.errors import FileError
 from shapespace.fit.fit import FitConfig
+from shapespace.fit.state import IcpState
 from shapespace.io.files import atomic_path
 from shapespace.io.meshes import write_mesh
 from shapespace.model.shape_model import ShapeModel
@@ -58,12 +60,14 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 def fit_into(
     folder: Path, jobs: Sequence[Job], model: ShapeModel, config: FitConfig = CONFIG, *,
-    file: Path = Path("blob.h5"), executor: Executor | None = None, **options: Any,
+    file: Path = Path("blob.h5"), executor: Executor | None = None, stages: bool = False, reuse: bool = False,
+    on_plan: Callable[[Plan], None] | None = None,
+    on_done: Callable[[Job, Mapping[str, Any]], None] | None = None,
+    on_state: Callable[[IcpState], None] | None = None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Fit `jobs` into a folder, and return their records."""
-    own = {name: options.pop(name) for name in ("stages", "reuse") if name in options}
-    sink = FolderSink(folder)
-    fit_many(jobs, BatchConfig(model, file, config, **own), executor or Serial(), sink, **options)
+    sink, batch = FolderSink(folder), BatchConfig(model, file, config, stages, reuse)
+    fit_many(jobs, batch, executor or Serial(), sink, on_plan=on_plan, on_done=on_done, on_state=on_state)
     return [sink.records[job.name] for job in jobs]
 
 
@@ -220,7 +224,12 @@ def test_a_scan_given_twice_is_fitted_once(
 def count_fits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
     original = Job.readable
-    monkeypatch.setattr(Job, "readable", lambda job: (calls.append(job.name), original(job))[1])
+
+    def noted(job: Job) -> AbstractContextManager[Path]:
+        calls.append(job.name)
+        return original(job)
+
+    monkeypatch.setattr(Job, "readable", noted)
     return calls
 
 
@@ -355,6 +364,7 @@ def test_a_folder_that_goes_away_is_one_sentence(model: ShapeModel, scans: list[
 def test_half_written_files_of_killed_runs_go(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     code = f"""
 import os, pathlib
+from shapespace.fit.state import IcpState
 from shapespace.io.files import atomic_path
 with atomic_path(pathlib.Path({str(tmp_path)!r}) / "scan0.fitted.ply") as path:
     path.write_bytes(b"half")

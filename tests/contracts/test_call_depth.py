@@ -1,6 +1,5 @@
 """How many functions of shapespace a command passes through before the first numerical step of a fit."""
 
-import sys
 import traceback
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def test_few_frames_lie_between_the_command_and_the_first_matching_step(
         stacks.append(
             [
                 f"{frame.filename.removeprefix(package)}:{frame.name}"
-                for frame in traceback.extract_stack(sys._getframe(1))
+                for frame in traceback.extract_stack()
                 if frame.filename.startswith(package)
             ]
         )
