@@ -28,7 +28,7 @@ import numpy as np
 from reliability import Femora
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.rounds import RoundRunner
 from shapespace.correspondence.result import Correspondence
 from shapespace.correspondence.rounds import correspond, run_here
 from shapespace.correspondence.settings import CorrespondSettings
@@ -275,7 +275,7 @@ def main() -> None:
         if arguments.jobs < 2:
             return correspond(scans, settings, template=template, run=run_here)
         with tempfile.TemporaryDirectory() as folder:
-            kept = KeptRounds(Path(folder), ExecutionConfig(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
+            kept = RoundRunner(Path(folder), ExecutionConfig(jobs=arguments.jobs), quiet=True, on_done=lambda: None)
             return correspond(scans, settings, template=template, run=kept)
 
     for name in arguments.cases or [*SETS, *OTHERS]:

@@ -4,7 +4,7 @@
     python benchmarks/executors.py throughput [--scans 100] [--workers 2] [--rounds 2]
 
 Overhead is the CPU time of this process, where client and scheduler of the cluster are, for each task, and how much its
-memory grows. Throughput is that of `fit_files` on scans of the accuracy benchmark, with workers that are there already,
+memory grows. Throughput is that of `fit_many` on scans of the accuracy benchmark, with workers that are there already,
 each executor in turn; what compiles is compiled before.
 """
 
@@ -23,8 +23,8 @@ from trivial import Nothing
 
 from shapespace.batch.executors import Executor, Local
 from shapespace.batch.on_dask import OnDask
-from shapespace.batch.run import fit_files, make_jobs
-from shapespace.fit.fit import FitConfig
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.io.meshes import write_mesh
 
 
@@ -36,11 +36,13 @@ def resident_mb() -> float:
 
 def overhead(client: Client, tasks: int) -> dict[str, float]:
     """Return what tasks cost client and scheduler."""
-    sum(1 for _ in OnDask(client).run(Nothing(), range(2000)))
+    with OnDask(client).run(Nothing(), range(2000)) as results:
+        list(results)
     before, began, wall, most = resident_mb(), time.process_time(), time.perf_counter(), 0.0
-    for number, _ in enumerate(OnDask(client).run(Nothing(), range(tasks))):
-        if number % 1000 == 0:
-            most = max(most, resident_mb())
+    with OnDask(client).run(Nothing(), range(tasks)) as results:
+        for number, _ in enumerate(results):
+            if number % 1000 == 0:
+                most = max(most, resident_mb())
     return {
         "tasks": tasks,
         "client_and_scheduler_ms_a_task": 1e3 * (time.process_time() - began) / tasks,
@@ -58,6 +60,7 @@ def throughput(client: Client, scans: int, workers: int, rounds: int, cache: Pat
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         model.save(folder / "model.h5")
+        config = BatchConfig(model, folder / "model.h5")
         paths = [folder / f"scan_{index:04d}.ply" for index in range(scans)]
         for index, path in enumerate(paths):
             write_mesh(path, bench.scan("complete", index % 20).mesh)
@@ -65,10 +68,7 @@ def throughput(client: Client, scans: int, workers: int, rounds: int, cache: Pat
             for kind, executor in executors.items():
                 some = paths if number else paths[: 2 * workers]
                 began = time.perf_counter()
-                fit_files(
-                    make_jobs(some), model, folder / "model.h5", folder / f"{kind}{number}", FitConfig(),
-                    executor=executor,
-                )  # fmt: skip
+                fit_many(make_jobs(some), config, executor, FolderSink(folder / f"{kind}{number}"))
                 if number:
                     taken[kind].append(60 * scans / (time.perf_counter() - began))
     ratios = np.array(taken["dask"]) / taken["local"]

@@ -21,7 +21,8 @@ from tqdm import tqdm
 
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.results import read_record
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
@@ -347,19 +348,18 @@ def _fit_all(
     def show(state: IcpState) -> None:
         clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
 
-    records = fit_files(
+    sink = FolderSink(home / "fits")
+    fit_many(
         make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
-        model,
-        home / model_name,
-        make_folder(home / "fits"),
-        config,
-        executor=ExecutionConfig().executor(len(scans)),
-        stages=True,
+        BatchConfig(model, home / model_name, config, stages=True),
+        ExecutionConfig().executor(len(scans)),
+        sink,
         on_done=lambda job, _: clock.step(f"fitted {job.name}"),
         on_state=show,
     )
     entries: list[FitEntry] = []
-    for (name, scan), record in zip(scans.items(), records, strict=True):
+    for name, scan in scans.items():
+        record = sink.records[name]
         base, fitted = f"{home.name}/fits/{name}", record.is_fitted
         errors: dict[str, VertexErrors] = {}
         if isinstance(scan, SimulatedScan) and (T := record.T_scan_model) is not None:

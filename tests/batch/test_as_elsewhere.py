@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from shapespace.batch import workers
-from shapespace.batch.executors import Local
-from shapespace.batch.run import fit_files, make_jobs
-from shapespace.fit.fit import FitConfig
+from shapespace.batch.executors import Local, Serial
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.io.meshes import write_mesh
 from shapespace.report.saved import Folder, find_fits
 from shapespace.report.saved import raw_scan as saved_scan
@@ -80,9 +80,10 @@ def test_workers_that_start_from_nothing_fit_scans_of_any_name(tmp_path: Path, m
     model, model_file, out = blob_model(), folder / "the model.h5", folder / "öut put"
     model.save(model_file)
     jobs = make_jobs(sorted(folder.glob("*.ply")), folder=out)
-    records = fit_files(jobs, model, model_file, out, FitConfig(), executor=Local(workers=2))
-    here = fit_files(jobs, model, model_file, tmp_path / "serial", FitConfig())
-    assert [record.b for record in records] == [record.b for record in here]
+    parallel, serial = FolderSink(out), FolderSink(tmp_path / "serial")
+    for executor, sink in ((Local(workers=2), parallel), (Serial(), serial)):
+        fit_many(jobs, BatchConfig(model, model_file), executor, sink)
+    assert [parallel.records[job.name].b for job in jobs] == [serial.records[job.name].b for job in jobs]
     with (out / "coefficients.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert sorted(row["scan"] for row in rows) == sorted(names)

@@ -6,8 +6,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +54,16 @@ def executor(request: pytest.FixtureRequest) -> Callable[..., Executor]:
     if kind == "serial":
         return Serial
     if kind == "local":
-        return lambda timeout_s=None: Local(2, timeout_s)
+        return partial(Local, 2)
     client = request.getfixturevalue("cluster")
     from shapespace.batch.on_dask import OnDask
 
-    return lambda timeout_s=None: OnDask(client, timeout_s)
+    return partial(OnDask, client)
+
+
+def results(executor: Executor, work: Any, tasks: Any) -> list[tuple[Any, Any]]:
+    with executor.run(work, tasks) as found:
+        return list(found)
 
 
 def several(executor: Callable[..., Executor]) -> Callable[..., Executor]:
@@ -69,22 +74,22 @@ def several(executor: Callable[..., Executor]) -> Callable[..., Executor]:
 
 def test_each_task_is_answered_once(executor: Callable[..., Executor], tmp_path: Path) -> None:
     tasks = [f"t{k}" for k in range(40)]
-    answers = list(executor().run(Letters(tmp_path), tasks))
+    answers = results(executor(), Letters(tmp_path), tasks)
     assert sorted((task, answer[0]) for task, answer in answers) == sorted((task, task.upper()) for task in tasks)
     assert all(len((tmp_path / f"{task}.done").read_text().splitlines()) == 1 for task in tasks)
-    assert list(executor().run(Letters(tmp_path), [])) == []
+    assert results(executor(), Letters(tmp_path), []) == []
 
 
 def test_what_stops_every_task_is_raised(executor: Callable[..., Executor], tmp_path: Path) -> None:
     with pytest.raises(FileError, match="disk is full"):
-        list(executor().run(Letters(tmp_path), ["a", "full", *(f"t{k}" for k in range(20))]))
+        results(executor(), Letters(tmp_path), ["a", "full", *(f"t{k}" for k in range(20))])
 
 
 def test_a_task_that_kills_its_workers_is_given_up_and_the_others_go_on(
     executor: Callable[..., Executor], tmp_path: Path
 ) -> None:
     tasks = ["a", "kill", "b", "unlucky1", "c", "unlucky2", "d"]
-    answers = {task: answer[0] for task, answer in several(executor)().run(Letters(tmp_path), tasks)}
+    answers = {task: answer[0] for task, answer in results(several(executor)(), Letters(tmp_path), tasks)}
     assert "lack of memory" in answers.pop("kill")
     assert answers == {task: task.upper() for task in tasks if task != "kill"}
 
@@ -92,7 +97,8 @@ def test_a_task_that_kills_its_workers_is_given_up_and_the_others_go_on(
 def test_a_task_that_hangs_is_given_up_and_the_others_go_on(executor: Callable[..., Executor], tmp_path: Path) -> None:
     began = time.monotonic()
     tasks = ["a", "hang", *"bcd"]
-    answers = {task: answer[0] for task, answer in several(executor)(timeout_s=TIMEOUT_S).run(Letters(tmp_path), tasks)}
+    limited = several(executor)(timeout_s=TIMEOUT_S)
+    answers = {task: answer[0] for task, answer in results(limited, Letters(tmp_path), tasks)}
     assert "--timeout" in answers.pop("hang")
     assert answers == {task: task.upper() for task in tasks if task != "hang"}
     assert time.monotonic() - began < 60
@@ -100,7 +106,7 @@ def test_a_task_that_hangs_is_given_up_and_the_others_go_on(executor: Callable[.
 
 def test_closed_early_nothing_goes_on(executor: Callable[..., Executor], tmp_path: Path) -> None:
     tasks = [f"t{k:03d}" for k in range(400)]
-    with closing(executor().run(Letters(tmp_path), tasks)) as ended:
+    with executor().run(Letters(tmp_path), tasks) as ended:
         next(ended)
     time.sleep(0.3)
     done = len(list(tmp_path.glob("*.done")))
@@ -113,9 +119,9 @@ def test_workers_end_with_their_parent_whatever_ends_it(tmp_path: Path) -> None:
     code = f"""
 from pathlib import Path
 from shapespace.batch.executors import Local
-from test_executors import Letters
+from test_executors import Letters, results
 if __name__ == "__main__":
-    list(Local(2).run(Letters(Path({str(tmp_path)!r})), ["hang1", "hang2"]))
+    results(Local(2), Letters(Path({str(tmp_path)!r})), ["hang1", "hang2"])
 """
     (tmp_path / "main.py").write_text(code)
     path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
@@ -148,7 +154,7 @@ class Unloadable:
 
 def test_workers_that_cannot_start_are_one_sentence() -> None:
     with pytest.raises(FitError, match="--jobs 1"):
-        list(Local(2).run(Unloadable(), ["a", "b", "c"]))
+        results(Local(2), Unloadable(), ["a", "b", "c"])
 
 
 @pytest.mark.parametrize(
@@ -171,7 +177,7 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path) -> None:
     on_dask.FINDS_S, before = 0.2, on_dask.FINDS_S
     try:
         with pytest.raises(InputError, match=r"127\.0\.0\.1:9"):
-            list(on_dask.OnDask("tcp://127.0.0.1:9").run(Letters(tmp_path), ["a"]))
+            results(on_dask.OnDask("tcp://127.0.0.1:9"), Letters(tmp_path), ["a"])
     finally:
         on_dask.FINDS_S = before
 
@@ -192,7 +198,7 @@ def test_workers_of_another_version_are_refused_by_name(cluster: Any, tmp_path: 
     cluster.run(set_version, "9.8.7", workers=[other])
     try:
         with pytest.raises(FitError) as refused:
-            list(on_dask.OnDask(cluster).run(Letters(tmp_path), ["a", "b"]))
+            results(on_dask.OnDask(cluster), Letters(tmp_path), ["a", "b"])
         said = str(refused.value)
         assert __version__ in said and f"9.8.7 at {other}" in said and same not in said and said.endswith(".")
         assert not list(tmp_path.iterdir())
@@ -205,7 +211,7 @@ def test_workers_of_another_version_are_refused_by_name(cluster: Any, tmp_path: 
         assert not list(tmp_path.iterdir())
     finally:
         cluster.run(set_version, __version__, workers=[other])
-    assert [answer[0] for _, answer in on_dask.OnDask(cluster).run(Letters(tmp_path), ["a"])] == ["A"]
+    assert [answer[0] for _, answer in results(on_dask.OnDask(cluster), Letters(tmp_path), ["a"])] == ["A"]
 
 
 def test_a_cluster_without_workers_is_told_while_it_is_waited_for(
@@ -214,14 +220,14 @@ def test_a_cluster_without_workers_is_told_while_it_is_waited_for(
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     from shapespace.batch import on_dask
 
-    assert on_dask.TELLS_S == 10.0
-    monkeypatch.setattr(on_dask, "TELLS_S", 0.1)
+    assert on_dask.REPORT_S == 10.0
+    monkeypatch.setattr(on_dask, "REPORT_S", 0.1)
     monkeypatch.setattr(on_dask, "WORKERS_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
         distributed.Client(empty) as client,
         pytest.raises(FitError, match=r"no worker after 0\.5 s"),
     ):
-        list(on_dask.OnDask(client).run(Letters(tmp_path), ["a"]))
+        results(on_dask.OnDask(client), Letters(tmp_path), ["a"])
     said = capsys.readouterr().err
     assert "No Dask worker has connected" in said and "dask worker" in said and said.count("\n") == 1

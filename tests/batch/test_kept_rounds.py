@@ -9,7 +9,7 @@ import pytest
 
 from raw_blobs import marked, raw_blob
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.rounds import RoundRunner
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
@@ -43,8 +43,8 @@ def placed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return done
 
 
-def kept(folder: Path, jobs: int = 1, on_done: Callable[[], None] = lambda: None) -> KeptRounds:
-    return KeptRounds(folder, ExecutionConfig(jobs=jobs), True, on_done)
+def kept(folder: Path, jobs: int = 1, on_done: Callable[[], None] = lambda: None) -> RoundRunner:
+    return RoundRunner(folder, ExecutionConfig(jobs=jobs), True, on_done)
 
 
 def test_what_was_done_before_an_interruption_is_not_done_again(

@@ -1,16 +1,16 @@
 """Quality measured in one process, in several and on a Dask cluster: the same numbers, and nothing left behind."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from shapespace.batch import quality_work
-from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.execution import EXECUTORS, ExecutionConfig
 from shapespace.batch.executors import Serial
-from shapespace.batch.quality_work import QualityElsewhere, QualityWork
+from shapespace.batch.quality_work import QualityRunner, QualityWork
 from shapespace.errors import FitError
 from shapespace.model.quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
 from shapespace.types import Mesh
@@ -37,7 +37,7 @@ def test_every_executor_measures_the_same_to_the_bit(
     kind: str, meshes: list[Mesh], tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     dask = request.getfixturevalue("cluster").scheduler.address if kind == "dask" else ""
-    run = QualityElsewhere(
+    run = QualityRunner(
         ExecutionConfig(kind, jobs=2 if kind == "local" else 0, dask=dask), tmp_path / "out", quiet=True
     )
     assert numbers(measure_quality(meshes, SETTINGS, run=run)) == numbers(measure_quality(meshes, SETTINGS))
@@ -56,7 +56,7 @@ def test_what_workers_read_is_what_was_to_be_measured(judged_by: str, meshes: li
     first, last = shapes.parts()[0], shapes.parts()[-1]
     for part in (first, last):
         assert np.array_equal(np.asarray(work.do(part)[0]), shapes.do(part))
-    read = quality_work._shapes[work.file]  # pyright: ignore[reportPrivateUsage]
+    read = work._load()  # pyright: ignore[reportPrivateUsage]
     assert read.settings == settings
     assert [mesh.name for mesh in read.meshes] == [mesh.name for mesh in meshes]
 
@@ -66,9 +66,9 @@ def test_a_part_that_no_worker_survives_ends_in_a_sentence(
 ) -> None:
     class Lost(Serial):
         def run(self, work: Any, tasks: Sequence[Part], /) -> Any:
-            return ((task, work.give_up(task, "its worker ended by signal 9")) for task in tasks)
+            return nullcontext((task, work.give_up(task, "its worker ended by signal 9")) for task in tasks)
 
-    monkeypatch.setattr("shapespace.batch.quality_work.Serial", Lost)
-    run = QualityElsewhere(ExecutionConfig("serial"), tmp_path, quiet=True)
+    monkeypatch.setitem(EXECUTORS, "serial", lambda *_: Lost())
+    run = QualityRunner(ExecutionConfig("serial"), tmp_path, quiet=True)
     with pytest.raises(FitError, match="signal 9; run it with fewer"):
         measure_quality(meshes, SETTINGS, run=run)

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from conftest import Outcome, Run, World, leftovers
-from shapespace.batch import fit_work
-from shapespace.batch.fit_work import Job, fit_file
+from shapespace.batch.fit_work import FitTask, FitWork
 from shapespace.commands import fit
 from shapespace.errors import FileError, FileFormatError
 from shapespace.io.meshes import probe_mesh, read_mesh, write_mesh
@@ -173,11 +172,13 @@ def test_scans_that_cannot_be_read_are_reported_before_the_first_fit(
     empty.write_bytes(b"")
     order: list[str] = []
 
-    def noted(job: Job, *rest: Any, **options: Any) -> Any:
-        order.append(job.name)
-        return fit_file(job, *rest, **options)
+    do = FitWork.do
 
-    monkeypatch.setattr(fit_work, "fit_file", noted)
+    def noted(work: FitWork, task: FitTask) -> dict[str, Any]:
+        order.append(task.job.name)
+        return do(work, task)
+
+    monkeypatch.setattr(FitWork, "do", noted)
     outcome = run(
         "fit", world.model, *world.scans[:2], empty, cut, "-o", tmp_path / "out", "--max-iterations", 2, "--jobs", 1
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from conftest import Run, World, leftovers
-from shapespace.batch import into_store
+from shapespace.batch import sinks
 from shapespace.store.results import Results
 
 pytest.importorskip("zarr", reason="the extra 'store' is not installed")
@@ -45,7 +45,7 @@ def test_a_store_holds_what_single_files_hold_and_is_kept(run: Run, world: World
     shutil.copy(world.scans[0], raw / "s004.ply")
     shutil.copy(world.scans[2], raw / "s000.ply")
     again = run("fit", world.model, raw, "-o", tmp_path / "store", *FAST)
-    assert "3 of 6 scans have results that still hold" in again.err and "1 of 6 scan is fitted anew" in again.err
+    assert "3 of 6 scans have valid results" in again.err and "1 of 6 scan is fitted again" in again.err
     found = Results(tmp_path / "store")
     assert len(found) == 6 and found.record("s000")["b"] == found.record("s002")["b"]
     assert leftovers(tmp_path) == []
@@ -57,7 +57,7 @@ def test_a_run_into_a_store_that_is_killed_goes_on(
 ) -> None:
     raw, out = scans(world, tmp_path, 60), tmp_path / "out"
     code = (
-        "from shapespace.batch import into_store; into_store.ROWS = 10\n"
+        "from shapespace.batch import sinks; sinks.ROWS = 10\n"
         "import sys\nfrom shapespace.cli import main\nsys.exit(main(sys.argv[1:]))"
     )
     told = ["fit", str(world.model), str(raw), "-o", str(out), "--store", "--jobs", "1", *FAST]
@@ -71,7 +71,7 @@ def test_a_run_into_a_store_that_is_killed_goes_on(
     process.wait()
     done = Results(out).identities()
     assert 0 < len(done) < 60
-    monkeypatch.setattr(into_store, "ROWS", 10)
+    monkeypatch.setattr(sinks, "ROWS", 10)
     outcome = run(*told)
     assert outcome.code == 0 and f"{len(done)} of 60" in outcome.err, outcome.err
     found = Results(out)

@@ -93,9 +93,9 @@ def test_a_folder_gives_each_scan_its_landmarks_and_says_what_belongs_to_none(
         assert record["evidence"]["marks_rms_mm"] < 2.0
         for name, at in marks_of(world, k).items():
             assert np.linalg.norm(np.array(record["found_landmarks"][name]["at"]) - at) < 4.0
-    assert "3 of 3 scans have results that still hold" in run(*command).err
+    assert "3 of 3 scans have valid results" in run(*command).err
     write_landmarks(marks / "scan_0.csv", marks_of(world, 1))
-    assert "2 of 3 scans have results that still hold" in run(*command).err
+    assert "2 of 3 scans have valid results" in run(*command).err
 
 
 def test_a_column_of_a_list_names_landmarks_and_goes_before_the_folder(run: Run, world: World, tmp_path: Path) -> None:

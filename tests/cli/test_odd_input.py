@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from conftest import Run, World, leftovers
 from shapespace.batch.execution import EXECUTORS
 from shapespace.errors import FitError
+from shapespace.io import disk_cache
 from shapespace.io.meshes import MESH_FORMATS, write_mesh
 from shapespace.types import Mesh
 
@@ -128,7 +130,10 @@ def test_a_handful_of_points_never_passes_for_a_good_fit(run: Run, world: World,
 class _Killed:
     """Workers that the system ends, as it does when memory runs out."""
 
-    def run(self, work: Any, tasks: Any, /) -> Generator[Any]:
+    def run(self, work: Any, tasks: Any, /) -> closing[Generator[Any]]:
+        return closing(self._answers(work, tasks))
+
+    def _answers(self, work: Any, tasks: Any) -> Generator[Any]:
         yield tasks[0], work.do(tasks[0])
         yield tasks[1], work.give_up(tasks[1], "its worker ended by signal 9")
         raise FitError("The system ends worker processes as they start; use --jobs 1, or free some memory.")
@@ -223,3 +228,13 @@ def test_output_that_cannot_be_written_is_said(
     monkeypatch.setattr(sys, "stdout", _FullOutput())
     assert main(["info", str(world.model)]) == 2
     assert "No space left on device" in capsys.readouterr().err
+
+
+def test_the_cache_is_described_and_cleared(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SHAPESPACE_KEEP", str(tmp_path))
+    disk_cache.keep("x", {"a": np.zeros(3)})
+    assert run("cache").out.endswith("1 entries, 0.0 MB\n")
+    facts = run("cache", "--clear", "--json").facts
+    assert facts == {"folder": str(tmp_path), "entries": 0, "bytes": 0} and not list(tmp_path.iterdir())
+    monkeypatch.setenv("SHAPESPACE_KEEP", "no")
+    assert "off" in run("cache").out

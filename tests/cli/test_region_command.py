@@ -37,7 +37,7 @@ def test_a_region_is_kept_by_name_and_fits_are_held_to_it_or_to_the_same_file(
             rows += [{key: cell for key, cell in row.items() if key[0] in "bz"} for row in csv.DictReader(stream)]
     assert rows[0] == rows[1]
     whole = run("fit", model, world.scan, "-o", tmp_path / "o0", *FAST)
-    assert "fitted anew" in whole.err, "another region is another fit"
+    assert "fitted again" in whole.err, "another region is another fit"
 
 
 def test_regions_follow_vertices_that_are_taken_out(run: Run, world: World, tmp_path: Path) -> None:

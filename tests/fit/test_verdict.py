@@ -10,7 +10,7 @@ from shapespace.fit.equations import Estimate
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.fit.methods import METHODS
 from shapespace.fit.moving_model import prepare
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.fit.result import FitResult
 from shapespace.fit.span import in_span
 from shapespace.geometry.distance import surface_distances
@@ -57,7 +57,7 @@ def test_what_is_returned_agrees_or_the_fit_is_not_converged(
         result.overlap_distances.scan_to_model.mean * result.T_scan_model.scale
     )
     if result.status == "converged":
-        assert (np.abs(result.b) <= 10 * np.sqrt(new_shapes(model))).all()
+        assert (np.abs(result.b) <= 10 * np.sqrt(variance_of_new_shapes(model))).all()
         assert 0.8 < result.T_scan_model.scale < 1.25
         assert result.overlap_distances.model_to_scan.mean < 3.0
 
@@ -67,7 +67,7 @@ def test_what_is_returned_agrees_or_the_fit_is_not_converged(
 def test_a_scan_outside_the_span_sends_neither_pose_nor_faint_modes_away(shapes: int, gauge: str) -> None:
     result = fitted(shapes, gauge, "robust", True)
     assert result.T_scan_model.scale == pytest.approx(1.0, abs=0.1)
-    assert (np.abs(result.b) <= 10 * np.sqrt(new_shapes(result.model))).all()
+    assert (np.abs(result.b) <= 10 * np.sqrt(variance_of_new_shapes(result.model))).all()
 
 
 def test_a_mode_inside_the_tangent_of_the_pose_moves_neither() -> None:
@@ -96,7 +96,7 @@ def test_faint_modes_that_run_away_are_doubted_by_name(method: str) -> None:
     narrow = ShapeModel(model.mean, model.basis, stddev, model.total_variance, 40, model.faces, gauge="shape")
     raw = raw_scan(np.array([0.0, 0.0, 0.0, 0.0, 2.5]), noise_mm=0.1)
     result = fit_scan(narrow, raw.scan, FitConfig(method, unit="mm", max_iterations=60))
-    if np.abs(result.b[4]) > 10 * np.sqrt(new_shapes(narrow)[4]):
+    if np.abs(result.b[4]) > 10 * np.sqrt(variance_of_new_shapes(narrow)[4]):
         assert result.status == "doubtful"
         assert "mode 5 lies" in result.reason
 

@@ -110,3 +110,17 @@ def test_writers_at_the_same_time_leave_whole_files_alone(folder: Path) -> None:
     writers = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(3)]
     assert [writer.wait(120) for writer in writers] == [0, 0, 0]
     assert [file.name for file in folder.iterdir()] == ["x.kept"]
+
+
+def test_the_key_depends_on_kind_version_and_every_dependency() -> None:
+    keys = {disk_cache.key(*parts) for parts in (("a", 1, "x"), ("b", 1, "x"), ("a", 2, "x"), ("a", 1, "y"), ("a", 1))}
+    assert len(keys) == 5 and disk_cache.key("a", 1, "x") in keys
+
+
+def test_clearing_removes_the_entries_and_nothing_else(folder: Path) -> None:
+    disk_cache.clear()
+    disk_cache.keep("x", ARRAYS)
+    disk_cache.keep("y", ARRAYS)
+    (folder / "note.txt").touch()
+    disk_cache.clear()
+    assert disk_cache.recall("x") is None and [file.name for file in folder.iterdir()] == ["note.txt"]

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from report_page import edit
 
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.executors import Serial
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.fit.fit import FitConfig
 from shapespace.io.meshes import write_mesh
 from shapespace.io.tables import write_rows
@@ -40,7 +42,8 @@ def write_fits(home: Path, names: Sequence[str], *, stages: bool = True, sub: st
         write_mesh(home / "scans" / f"{name}.ply", raw_scan(z, seed=k, vertices=500).scan)
     scans = [home / "scans" / f"{name}.ply" for name in names]
     config = FitConfig(**{"method": "paper", "max_iterations": 4, **settings})
-    fit_files(make_jobs(scans), model, home / "model.h5", home / sub, config, stages=stages)
+    batch = BatchConfig(model, home / "model.h5", config, stages=stages)
+    fit_many(make_jobs(scans), batch, Serial(), FolderSink(home / sub))
 
 
 def write_demo(root: Path) -> dict[str, Any]:
@@ -137,10 +140,8 @@ def fits_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("fits")
     write_fits(root, ["able", "baker", "charlie", "dog", "easy"], sub="out")
     (root / "scans" / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
-    fit_files(
-        make_jobs([root / "scans" / "broken.ply"]), blob_model(VERTICES, MODES), root / "model.h5", root / "out",
-        FitConfig(method="paper"), stages=True,
-    )  # fmt: skip
+    batch = BatchConfig(blob_model(VERTICES, MODES), root / "model.h5", FitConfig(method="paper"), stages=True)
+    fit_many(make_jobs([root / "scans" / "broken.ply"]), batch, Serial(), FolderSink(root / "out"))
     for name, status in (("able", "converged"), ("baker", "converged"), ("charlie", "doubtful")):
         edit(root / "out", lambda record, status=status: record.update(status=status), f"{name}.fit.json")
     rows = [("able.ply", "calm", "0.5"), ("baker.ply", EVIL, "1"), ("charlie.ply", "calm", "1"), ("dog.ply", EVIL, "")]

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.executors import Serial
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.errors import FileFormatError, InputError
 from shapespace.fit.fit import FitConfig, fit_scan
 from shapespace.io.meshes import read_mesh, write_mesh
@@ -35,7 +37,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_mesh(home / f"scan{k}.ply", raw_scan(np.full(5, 0.3 * k), seed=k).scan)
     (home / "broken.ply").write_bytes(b"ply\nnonsense")
     jobs = make_jobs([home / "scan0.ply", home / "scan1.ply", home / "broken.ply"])
-    fit_files(jobs, blob_model(), home / "model.h5", home / "out", CONFIG, stages=True)
+    fit_many(
+        jobs, BatchConfig(blob_model(), home / "model.h5", CONFIG, stages=True), Serial(), FolderSink(home / "out")
+    )
     return home
 
 

@@ -12,7 +12,7 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.read import CohortOptions, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, InputError
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.geometry.surface import vertex_normals
 from shapespace.io.files import write_text
 from shapespace.io.meshes import write_mesh
@@ -23,7 +23,7 @@ from shapespace.types import FloatArray, Mesh
 from stored_fits import MODES, VERTICES, model, write_fit
 from synthetic_shapes import similarity, training_meshes
 
-SPREAD = np.sqrt(new_shapes(model()))
+SPREAD = np.sqrt(variance_of_new_shapes(model()))
 LEVELS = (0.1, 0.2, 0.5, 0.8)
 
 

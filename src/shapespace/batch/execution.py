@@ -1,27 +1,27 @@
-"""Where the tasks of a command run, as a user says it."""
+"""Execution settings from the command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from shapespace.batch.executors import Executor, Local
+from shapespace.batch.executors import Executor, Local, Serial
 from shapespace.batch.workers import cores
 from shapespace.errors import InputError
 
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """Where tasks run.
+    """Execution settings.
 
     Args:
         kind: a name of `EXECUTORS`.
-        jobs: at a time; 0 for one a core. A cluster has as many as it has workers.
+        jobs: number of parallel tasks; 0 for one per core. On a cluster it is the number of its workers.
         timeout_s: a task that takes longer is given up; None for no limit.
-        dask: address of a Dask scheduler, a scheduler file, or empty for a cluster as Dask's configuration has it.
+        dask: address of a Dask scheduler, a scheduler file, or empty for a cluster by Dask's configuration.
 
     Raises:
-        InputError: there is no such kind, or it cannot do what is asked.
+        InputError: the kind does not exist, or does not support the other settings.
     """
 
     kind: str = "local"
@@ -37,23 +37,25 @@ class ExecutionConfig:
         if self.kind == "serial" and self.timeout_s is not None:
             raise InputError("--executor serial cannot stop a scan that hangs; leave out --timeout or --executor.")
 
-    def executor(self, tasks: int, *, quiet: bool = True) -> Executor | None:
-        """Return what does as many tasks; None for one after the other in this process.
+    def executor(self, tasks: int, *, quiet: bool = True) -> Executor:
+        """Return the executor for a number of tasks.
 
         Args:
-            tasks: how many there are.
-            quiet: whether workers say nothing of compiling.
+            tasks: their number; one task alone runs in this process where nothing else is asked for.
+            quiet: whether workers do not report that code is compiled.
         """
         return EXECUTORS[self.kind](self, tasks, quiet)
 
 
-def _local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor | None:
+def _local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor:
     workers = min(execution.jobs or cores(), tasks)
-    return None if workers <= 1 and execution.timeout_s is None else Local(max(workers, 1), execution.timeout_s, quiet)
+    if workers <= 1 and execution.timeout_s is None:
+        return Serial()
+    return Local(max(workers, 1), execution.timeout_s, quiet)
 
 
-def _serial(_execution_config: ExecutionConfig, _tasks: int, _quiet: bool) -> None:
-    return None
+def _serial(_execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
+    return Serial()
 
 
 def _dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
@@ -62,9 +64,9 @@ def _dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
     return OnDask(execution.dask, execution.timeout_s)
 
 
-EXECUTORS: dict[str, Callable[[ExecutionConfig, int, bool], Executor | None]] = {
+EXECUTORS: dict[str, Callable[[ExecutionConfig, int, bool], Executor]] = {
     "local": _local,
     "serial": _serial,
     "dask": _dask,
 }
-"""Executors by name: each made of where, how many tasks there are, and whether to be quiet."""
+"""Executors by name: functions of the settings, the number of tasks, and whether to be quiet."""

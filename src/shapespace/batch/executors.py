@@ -1,16 +1,16 @@
-"""Where tasks run: one after the other here, on the cores of this machine, or on a Dask cluster.
+"""Execution of many tasks: serially in this process, in processes on this machine, or on a Dask cluster (`on_dask`).
 
-All have one face, `Executor.run`, and one contract: each task is answered once, in whatever order, and a task that its
-workers do not survive is given up with a reason while the others go on.
+All executors have one interface, `Executor.run`, and one contract: each task has one answer, in any order, and a task
+that its workers do not survive is given up with a reason while the others continue.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol, TypeVar
 
@@ -25,10 +25,11 @@ TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
 ATTEMPTS = 2
-"""Workers that a task may cost before it is given up."""
+"""Number of workers that a task may cost before it is given up."""
 GRACE_S = 5.0
-"""What runs when a run is stopped may end within this; a second Ctrl-C ends it at once."""
+"""Time for running tasks to end when a run is stopped; a second Ctrl-C ends them at once."""
 _STARTS = 3
+_FOREVER = float("inf")
 _NO_START = (
     "Worker processes end as they start; use --jobs 1, free some memory, or, in a script of your own, put what it does "
     'under if __name__ == "__main__".'
@@ -36,223 +37,173 @@ _NO_START = (
 
 
 class Work(Protocol[TaskT, AnswerT]):
-    """What is done with each of many tasks: frozen, small, and sent to every worker.
+    """What is done with each task: frozen, small, and sent to every worker.
 
-    What the tasks share is named by it, by path or hash, and loaded by `do` once a process.
+    It names the data that the tasks share by path or hash; `do` loads them once in each process (`LatestValue`).
     """
 
     def do(self, task: TaskT, /) -> AnswerT:
-        """Do one task; what is wrong with the task itself is in the answer.
+        """Do one task; an error of the task itself is part of the answer.
 
         Raises:
-            ShapespaceError: what would stop every other task too, such as a full disk.
+            ShapespaceError: an error that would stop every other task too, such as a full disk.
         """
         ...
 
     def give_up(self, task: TaskT, reason: str, /) -> AnswerT:
-        """Return what stands for a task that could not be done; `do` of the same run then returns it too."""
+        """Return the answer for a task that could not be done; `do` in the same run then returns it too."""
         ...
 
 
 class Executor(Protocol):
-    """Does tasks somewhere."""
+    """Does tasks."""
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> Generator[tuple[T, R]]:
-        """Yield each task with what came of it as it ends; closed earlier, it stops what runs.
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
+        """Return a context whose value yields each task with its answer; leaving it early stops running tasks.
 
         Raises:
-            FitError: there are no workers, or none any more.
-            ShapespaceError: that `work` raised.
+            FitError: no workers are left, or none can start.
+            ShapespaceError: raised by `work`.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Serial:
-    """One after the other in this process; a task that hangs is not stopped."""
+    """One task after the other in this process; a task that hangs is not stopped."""
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> Generator[tuple[T, R]]:
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
         """As `Executor.run`."""
-        for task in tasks:
-            yield task, work.do(task)
+        return nullcontext(zip(tasks, map(work.do, tasks), strict=True))
 
 
 @dataclass(frozen=True)
 class Local:
-    """Processes on this machine, each with one thread of BLAS.
+    """Processes on this machine, each with one BLAS thread.
 
     Args:
-        workers: how many; 0 for one a core.
+        workers: number of processes; 0 for one per core.
         timeout_s: a task that takes longer is given up; None for no limit.
-        quiet: whether the first worker keeps from saying that code is compiled.
+        quiet: whether the first worker does not report that code is compiled.
     """
 
     workers: int = 0
     timeout_s: float | None = None
     quiet: bool = True
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> Generator[tuple[T, R]]:
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
         """As `Executor.run`."""
-        count = min(self.workers or cores(), len(tasks))
-        if not count:
+        return closing(self._answers(work, tasks))
+
+    def _answers(self, work: Work[T, R], tasks: Sequence[T]) -> Generator[tuple[T, R]]:
+        if not tasks:
             return
-        start_loading(tell=not self.quiet)
-        wait_until_loaded()
-        with life_line() as life:
-            team = _Team(lambda: Worker(_serve, (work,), life), self.timeout_s)
-            try:
-                with closing(team.run(count, work, tasks)) as ended:
-                    yield from ended
-            finally:
-                team.stop()
+        with closing(Team(work, self.workers or cores(), self.timeout_s, quiet=self.quiet)) as team:
+            for number, answer in team.run(tasks):
+                yield tasks[number], answer
 
 
 @dataclass
-class _Doing:
-    """What a worker is at: a task by its number, or None while it starts, and until when it may take."""
+class _Assignment:
+    """The task of a worker by its number, None while it starts or waits for one, and when it must have ended."""
 
     number: int | None = None
-    until: float = float("inf")
+    deadline: float = _FOREVER
 
 
-@dataclass
-class _Team:
-    """Workers and what each is at; each has a line of its own, so that the death of one blocks no other."""
-
-    start: Callable[[], Worker]
-    timeout_s: float | None
-    _doing: dict[Worker, _Doing] = field(default_factory=dict[Worker, _Doing])
-    _failed_starts: int = 0
-
-    def run(self, count: int, work: Work[T, R], tasks: Sequence[T]) -> Generator[tuple[T, R]]:
-        left, deaths = deque(range(len(tasks))), [0] * len(tasks)
-        for _ in range(count):
-            self._hire()
-        while self._doing:
-            for worker in self._ready():
-                was = self._doing[worker]
-                answer = worker.answer()
-                if answer is not None:
-                    self._failed_starts = 0
-                    self._next(worker, tasks, left)
-                    if was.number is not None:
-                        yield tasks[was.number], _value(answer)
-                    continue
-                death = _Death(self._dismiss(worker), None if time.monotonic() < was.until else self.timeout_s)
-                if was.number is None:
-                    self._not_started()
-                    self._hire()
-                    continue
-                deaths[was.number] += 1
-                again = death.late_s is None and deaths[was.number] < ATTEMPTS
-                if again:
-                    left.append(was.number)
-                if left:
-                    self._hire()
-                if not again:
-                    yield tasks[was.number], work.give_up(tasks[was.number], str(death))
-
-    def _hire(self) -> None:
-        self._doing[self.start()] = _Doing()
-
-    def _dismiss(self, worker: Worker) -> int:
-        del self._doing[worker]
-        return worker.stop()
-
-    def _ready(self) -> list[Worker]:
-        """Wait, and return the workers that have answered, died, or taken too long."""
-        first = min(what.until for what in self._doing.values())
-        patience = None if first == float("inf") else max(0.0, first - time.monotonic())
-        lines = set(wait([worker.line for worker in self._doing], patience))
-        now = time.monotonic()
-        return [worker for worker, what in self._doing.items() if worker.line in lines or now >= what.until]
-
-    def _next(self, worker: Worker, tasks: Sequence[T], left: deque[int]) -> None:
-        if not left:
-            self._dismiss(worker)
-            return
-        number = left.popleft()
-        until = float("inf") if self.timeout_s is None else time.monotonic() + self.timeout_s
-        self._doing[worker] = _Doing(number, until)
-        worker.give(tasks[number])
-
-    def _not_started(self) -> None:
-        self._failed_starts += 1
-        if self._failed_starts >= _STARTS:
-            raise FitError(_NO_START)
-
-    def stop(self) -> None:
-        """Let what runs end for a moment, then end every worker."""
-        try:
-            until = time.monotonic() + GRACE_S
-            running = {worker.line for worker, what in self._doing.items() if what.number is not None}
-            while running and (patience := until - time.monotonic()) > 0:
-                running.difference_update(wait(running, patience))
-        finally:
-            while self._doing:
-                self._dismiss(next(iter(self._doing)))
-
-
-class Child:
-    """One worker that is given tasks one at a time, and started again when it dies.
+class Team:
+    """Worker processes that are started when needed and stay for further tasks; each has a pipe of its own.
 
     Args:
-        work: what it does.
+        work: what they do.
+        size: largest number of workers.
         timeout_s: a task that takes longer is given up; None for no limit.
+        quiet: whether the first worker does not report that code is compiled.
+
+    Raises:
+        FitError: no process can be started.
     """
 
-    def __init__(self, work: Work[Any, Any], timeout_s: float | None) -> None:
-        self._work, self._timeout_s = work, timeout_s
-        self._worker: Worker | None = None
-        self._life = ExitStack()
-        self._line = self._life.enter_context(life_line())
+    def __init__(self, work: Work[Any, Any], size: int, timeout_s: float | None, *, quiet: bool = True) -> None:
+        self._work, self._size, self._timeout_s = work, size, timeout_s
+        self._assignments: dict[Worker, _Assignment] = {}
+        self._idle: list[Worker] = []
+        self._failed_starts = 0
+        start_loading(tell=not quiet)
+        wait_until_loaded()
+        self._stack = ExitStack()
+        self._life = self._stack.enter_context(life_line())
 
-    def do(self, task: Any) -> Any:
-        """Return what comes of a task.
+    def run(self, tasks: Sequence[Any]) -> Generator[tuple[int, Any]]:
+        """Yield the number of each task and its answer.
 
         Raises:
             FitError: no process can be started.
-            ShapespaceError: that `work` raised.
+            ShapespaceError: raised by the work.
         """
-        for attempt in range(1, ATTEMPTS + 1):
-            worker = self._started()
-            worker.give(task)
-            late = not worker.line.poll(self._timeout_s)
-            answer = worker.answer()
-            if answer is not None:
-                return _value(answer)
-            self._worker = None
-            death = _Death(worker.stop(), self._timeout_s if late else None)
-            if late or attempt == ATTEMPTS:
-                return self._work.give_up(task, str(death))
-        raise AssertionError
+        waiting, deaths, left = deque(range(len(tasks))), [0] * len(tasks), len(tasks)
+        while left:
+            while waiting and self._idle:
+                self._assign(self._idle.pop(), waiting.popleft(), tasks)
+            while len(self._assignments) + len(self._idle) < min(self._size, left):
+                self._assignments[Worker(_serve, (self._work,), self._life)] = _Assignment()
+            for worker in self._ready():
+                assignment = self._assignments.pop(worker)
+                number, answer = assignment.number, worker.answer()
+                if answer is not None:
+                    self._failed_starts = 0
+                    self._idle.append(worker)
+                    if waiting:
+                        self._assign(self._idle.pop(), waiting.popleft(), tasks)
+                    if number is not None:
+                        left -= 1
+                        yield number, _value(answer)
+                    continue
+                late_s = None if time.monotonic() < assignment.deadline else self._timeout_s
+                death = _Death(worker.stop(), late_s)
+                if number is None:
+                    self._failed_starts += 1
+                    if self._failed_starts >= _STARTS:
+                        raise FitError(_NO_START)
+                    continue
+                deaths[number] += 1
+                if late_s is None and deaths[number] < ATTEMPTS:
+                    waiting.append(number)
+                    continue
+                left -= 1
+                yield number, self._work.give_up(tasks[number], str(death))
 
-    def stop(self) -> None:
-        """End the worker."""
-        if self._worker is not None:
-            self._worker.stop()
-        self._life.close()
-
-    def _started(self) -> Worker:
-        for _ in range(_STARTS):
-            if self._worker is not None:
-                return self._worker
-            start_loading(tell=False)
-            wait_until_loaded()
-            worker = Worker(_serve, (self._work,), self._line)
-            worker.line.poll(None)
-            if worker.answer() is None:
+    def close(self) -> None:
+        """Give running tasks a moment to end, then end every worker."""
+        try:
+            deadline = time.monotonic() + GRACE_S
+            running = {worker.line for worker, one in self._assignments.items() if one.number is not None}
+            while running and (left_s := deadline - time.monotonic()) > 0:
+                running.difference_update(wait(running, left_s))
+        finally:
+            for worker in (*self._assignments, *self._idle):
                 worker.stop()
-            else:
-                self._worker = worker
-        if self._worker is None:
-            raise FitError(_NO_START)
-        return self._worker
+            self._assignments.clear()
+            self._idle.clear()
+            self._stack.close()
+
+    def _assign(self, worker: Worker, number: int, tasks: Sequence[Any]) -> None:
+        deadline = _FOREVER if self._timeout_s is None else time.monotonic() + self._timeout_s
+        self._assignments[worker] = _Assignment(number, deadline)
+        worker.give(tasks[number])
+
+    def _ready(self) -> list[Worker]:
+        """Wait, and return the workers that have answered, died, or taken too long."""
+        first = min(one.deadline for one in self._assignments.values())
+        timeout_s = None if first == _FOREVER else max(0.0, first - time.monotonic())
+        lines = set(wait([worker.line for worker in self._assignments], timeout_s))
+        now = time.monotonic()
+        return [worker for worker, one in self._assignments.items() if worker.line in lines or now >= one.deadline]
 
 
 @dataclass(frozen=True)
 class _Death:
-    """Why a worker did not answer: its exit code, or the time that it was given."""
+    """Why a worker did not answer: its exit code, or the time limit of its task."""
 
     code: int
     late_s: float | None
@@ -260,12 +211,14 @@ class _Death:
     def __str__(self) -> str:
         if self.late_s is not None:
             return f"it took more than the {self.late_s:g} s of --timeout"
-        how = f"by signal {-self.code}" if self.code < 0 else f"with exit code {self.code}"
-        return f"its worker ended {how}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
+        cause = f"by signal {-self.code}" if self.code < 0 else f"with exit code {self.code}"
+        return (
+            f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
+        )
 
 
 def _serve(line: Connection, work: Work[Any, Any]) -> None:
-    """Do tasks that come by `line` until it ends: what a worker does."""
+    """Do the tasks that arrive on `line` until it ends; runs in the worker process."""
     threadpool_limits(1)
     line.send(())
     while True:

@@ -1,4 +1,4 @@
-"""What is done with one scan of a batch: its fit, its files, and what of an earlier run still holds."""
+"""One scan of a batch: its fit, its result files, and whether the result of an earlier run is still valid."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from shapespace.io.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
 from shapespace.io.files import sha256_of_file, write_text, write_together
 from shapespace.io.landmarks import read_landmarks
 from shapespace.io.limits import LARGEST_MESH_FILE_BYTES
+from shapespace.io.memory_cache import LatestValue
 from shapespace.io.meshes import read_mesh
 from shapespace.io.remote import fetched, is_address, name_of, version_of
 from shapespace.model.shape_model import ShapeModel
@@ -60,8 +61,8 @@ class Job:
     address: str = ""
 
     @property
-    def called(self) -> str:
-        """What sentences call the scan: its address or path."""
+    def label(self) -> str:
+        """The scan in messages: its address or path."""
         return self.address or str(self.scan)
 
     @contextlib.contextmanager
@@ -102,34 +103,8 @@ def fit_file(
     stages: bool = False,
     on_state: Callable[[IcpState], None] | None = None,
 ) -> FitRecord:
-    """Fit one scan from its file, write its results into `folder`, and return its record.
-
-    A scan that cannot be fitted gives a record with status `failed`. Stopped at any moment, the record that is there
-    is of the surfaces that are there.
-
-    Raises:
-        FileError: the results cannot be written.
-    """
-    model_source = Source.at(model_file, model.content_hash, folder)
-    scan_source = job.source(folder)
-    marks_source: Source | None = None
-    try:
-        with job.readable() as file:
-            scan_source = job.read_source(file, folder)
-            scan = read_mesh(file)
-        landmarks: Mapping[str, FloatArray] | None = None
-        if job.landmarks is not None:
-            marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
-            landmarks = read_landmarks(job.landmarks)
-        result = fit_scan(model, scan, config, landmarks=landmarks, on_state=on_state)
-    except (MemoryError, ShapespaceError) as error:
-        short = f"{job.called}: not enough memory to fit it; crop it (--crop), or thin it first, as by MeshLab."
-        reason = short if isinstance(error, MemoryError) else naming(job.called, str(error))
-        failed = failed_record(scan_source, model_source, reason, config.as_dict(), job.metadata)
-        return _write_failed(failed, job, folder)
-    record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
-    publish(result, record, job.name, folder, stages=stages)
-    return record
+    """Fit one scan from its file, write its results into `folder`, and return its record, as `FitWork.do`."""
+    return FitWork.of(model, model_file, folder, on_state).do(FitTask(job, config, stages, resume=False))
 
 
 def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, stages: bool) -> None:
@@ -184,14 +159,14 @@ class _Files:
         return [*left, self.stages] if stages else left
 
 
-def naming(called: Path | str, sentence: str) -> str:
+def naming(place: Path | str, sentence: str) -> str:
     """Return `sentence` about a mesh with its path or address in it, not just its file's name."""
-    if str(called) in sentence:
+    if str(place) in sentence:
         return sentence
-    name = name_of(called) if isinstance(called, str) and is_address(called) else Path(called).name
+    name = name_of(place) if isinstance(place, str) and is_address(place) else Path(place).name
     if sentence.startswith(f"{name}: "):
-        return f"{called}{sentence.removeprefix(name)}"
-    return f"{called}: {sentence[:1].lower()}{sentence[1:]}"
+        return f"{place}{sentence.removeprefix(name)}"
+    return f"{place}: {sentence[:1].lower()}{sentence[1:]}"
 
 
 @dataclass(frozen=True)
@@ -223,7 +198,11 @@ class FitWork:
     on_state: Callable[[IcpState], None] | None = None
 
     def do(self, task: FitTask) -> FitRecord:
-        """Return the record of the fit of one scan, done now, or before a worker was lost.
+        """Fit one scan from its file, write its results, and return its record.
+
+        A scan that cannot be fitted gives a record with status `failed`. Interrupted at any moment, the record in the
+        folder belongs to the surfaces in the folder. A valid result, such as that of a worker which was lost later, is
+        returned as it is.
 
         Raises:
             FileError: the model cannot be read, or the results not written.
@@ -232,10 +211,26 @@ class FitWork:
             task, earlier = resumed(task, self.model_hash, self.folder, self.run)
             if earlier is not None:
                 return earlier
-        return fit_file(
-            task.job, self._model(), self.model_file, self.folder, task.config,
-            stages=task.stages, on_state=self.on_state,
-        )  # fmt: skip
+        job, model = task.job, _model.get(self.model_hash, self._load)
+        model_source = Source.at(self.model_file, self.model_hash, self.folder)
+        scan_source, marks_source = job.source(self.folder), None
+        try:
+            with job.readable() as file:
+                scan_source = job.read_source(file, self.folder)
+                scan = read_mesh(file)
+            landmarks: Mapping[str, FloatArray] | None = None
+            if job.landmarks is not None:
+                marks_source = Source(job.landmarks.name, sha256_of_file(job.landmarks))
+                landmarks = read_landmarks(job.landmarks)
+            result = fit_scan(model, scan, task.config, landmarks=landmarks, on_state=self.on_state)
+        except (MemoryError, ShapespaceError) as error:
+            no_memory = f"{job.label}: not enough memory to fit it; crop it (--crop), or reduce it first."
+            reason = no_memory if isinstance(error, MemoryError) else naming(job.label, str(error))
+            failed = failed_record(scan_source, model_source, reason, task.config.as_dict(), job.metadata)
+            return _write_failed(failed, job, self.folder)
+        record = fit_record(result, scan_source, model_source, marks_source, job.metadata)
+        publish(result, record, job.name, self.folder, stages=task.stages)
+        return record
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
         """Write and return the record of a scan whose workers were lost."""
@@ -244,35 +239,26 @@ class FitWork:
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
                 scan = Source.hashed(task.job.scan, self.folder)
-        told = f"{task.job.called}: {reason}."
-        record = failed_record(scan, model, told, task.config.as_dict(), task.job.metadata)
+        record = failed_record(scan, model, f"{task.job.label}: {reason}.", task.config.as_dict(), task.job.metadata)
         return _write_failed(structs.replace(record, given_up=self.run), task.job, self.folder)
 
     @staticmethod
     def of(
         model: ShapeModel, model_file: Path, folder: Path, on_state: Callable[[IcpState], None] | None = None
     ) -> FitWork:
-        """Return the work of a new run, with the model kept for fits in this process."""
-        work = FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex, on_state)
-        work.remember(model)
-        return work
+        """Return the work of a new run; fits in this process use `model` and do not read its file."""
+        _model.set(model.content_hash, model)
+        return FitWork(model_file, model.content_hash, folder, uuid.uuid4().hex, on_state)
 
-    def remember(self, model: ShapeModel) -> None:
-        """Keep the model for fits in this process, which then do not read it again."""
-        _models.clear()
-        _models[self.model_hash] = model
-
-    def _model(self) -> ShapeModel:
-        if self.model_hash not in _models:
-            model = ShapeModel.load(self.model_file)
-            if model.content_hash != self.model_hash:
-                raise FileError(f"{self.model_file} is not the model that this run began with; start it again.")
-            self.remember(model)
-        return _models[self.model_hash]
+    def _load(self) -> ShapeModel:
+        model = ShapeModel.load(self.model_file)
+        if model.content_hash != self.model_hash:
+            raise FileError(f"{self.model_file} is not the model that this run began with; start it again.")
+        return model
 
 
-_models: dict[str, ShapeModel] = {}
-"""The model of this process, by its content hash."""
+_model = LatestValue[ShapeModel]()
+"""The model of the batch that this process works on, by its content hash."""
 
 
 def has_surface(job: Job, folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""A folder of results: which record is of which scan, what new results are called, and the table of all of them."""
+"""A folder of results: names of the results of scans, and the table of all records."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shapespace.store.results import results_at
 COEFFICIENTS = "coefficients.csv"
 RECORD = ".fit.json"
 _LONGEST_NAME = 200
-_OF_SCANS = ("scan", "scan_name", "path", "scan_hash")
+_SCAN_COLUMNS = ("scan", "scan_name", "path", "scan_hash")
 
 
 def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str, FitRecord]]:
@@ -70,9 +70,9 @@ def names_for(
     """
     taken: dict[str, _Scan] = {}
     hashes: dict[str, str] = {}
-    for name, told in _sources_in(folder) if folder is not None else ():
-        if isinstance(told, dict):
-            source = cast(dict[str, Any], told)
+    for name, content in _sources_in(folder) if folder is not None else ():
+        if isinstance(content, dict):
+            source = cast(dict[str, Any], content)
             taken[name] = _Scan.of(source)
             hashes[name] = str(source.get("hash", ""))
     own = {scan: name for name, scan in reversed(taken.items())}
@@ -88,30 +88,30 @@ def names_for(
         (key, scan), *others = group.items()
         stem = _stem(scan)
         if not others and (stem.casefold() not in used or _is_same(scan, taken.get(stem), hashes.get(stem), folder)):
-            found = {key: stem}
+            new = {key: stem}
         else:
-            found = _told_apart(group, used)
-        names |= found
-        used |= {name.casefold() for name in found.values()}
+            new = _distinct_names(group, used)
+        names |= new
+        used |= {name.casefold() for name in new.values()}
     return [names[keys[scan]] for scan in scans]
 
 
 def _sources_in(folder: Path) -> Iterator[tuple[str, object]]:
-    """Yield NAME of each result in `folder`, of a store too, and what its record says of the scan."""
+    """Yield NAME of each result in `folder`, of a store too, and the scan in its record."""
     if (results := results_at(folder)) is not None:
-        for rows in results.iter_rows(_OF_SCANS):
-            for name, called, path, content_hash in zip(*(rows[column] for column in _OF_SCANS), strict=True):
-                yield name, {"name": called, "path": path, "hash": content_hash}
+        for rows in results.iter_rows(_SCAN_COLUMNS):
+            for name, scan_name, path, content_hash in zip(*(rows[column] for column in _SCAN_COLUMNS), strict=True):
+                yield name, {"name": scan_name, "path": path, "hash": content_hash}
     else:
         for file in sorted(folder.glob(f"*{RECORD}")):
             with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
                 check_file(file, LARGEST_BYTES, FIT_AGAIN)
-                told = msgspec.json.decode(file.read_bytes(), type=_OfScan).scan
-                yield file.name.removesuffix(RECORD), {"name": told.name, "path": told.path, "hash": told.hash}
+                scan = msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
+                yield file.name.removesuffix(RECORD), {"name": scan.name, "path": scan.path, "hash": scan.hash}
 
 
-class _OfScan(msgspec.Struct, frozen=True):
-    """What is read of a record to know of which scan it is: the rest is passed over, twenty times as fast."""
+class _ScanOnly(msgspec.Struct, frozen=True):
+    """The scan of a record; the rest is not decoded, which is twenty times as fast."""
 
     scan: File = File()
 
@@ -140,7 +140,7 @@ def _is_same(scan: Path, of_record: _Scan | None, content_hash: str | None, fold
         return False
 
 
-def _told_apart(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]:
+def _distinct_names(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, str]:
     folders = {key: scan.parent.resolve().parts[1:] for key, scan in group.items()}
     ends = {key: stem_of(scan) or scan.name for key, scan in group.items()}
     if len({(folders[key], end) for key, end in ends.items()}) < len(group):

@@ -1,14 +1,14 @@
-"""Tasks on a Dask cluster: a few chunks in flight, workers that are lost made up for, and only answers sent back."""
+"""Execution on a Dask cluster: few chunks in flight, tasks of lost workers repeated, and only answers sent back."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from shapespace.batch.executors import Child
+from shapespace.batch.executors import Team
 from shapespace.batch.progress import tell_after
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.version import __version__
@@ -22,15 +22,16 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 CHUNKS_A_WORKER = 50
-"""Chunks that each worker sees in a run: many enough that all end together."""
+"""Chunks for each worker in a run: enough that all workers end at about the same time."""
 LARGEST_CHUNK = 50
-"""Tasks in a chunk at most: few enough that little is lost with a worker."""
+"""Largest number of tasks in a chunk: few enough that little is lost with a worker."""
 AHEAD = 2
-"""Chunks that wait at each worker beside the one that it does."""
+"""Chunks that wait at each worker beside the running one."""
 FINDS_S = 30.0
+"""Time for the scheduler to answer."""
 WORKERS_S = 600.0
-"""A queue may take so long to start the first worker."""
-TELLS_S = 10.0
+"""Time for a queue to start the first worker."""
+REPORT_S = 10.0
 """Seconds without a worker after which a line on standard error says what the command waits for."""
 _MOST_NAMED = 5
 _LOST = "its workers ended again and again, most likely for lack of memory; thin it"
@@ -49,8 +50,11 @@ class OnDask:
     cluster: str | Client = ""
     timeout_s: float | None = None
 
-    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> Generator[tuple[T, R]]:
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
         """As `Executor.run`."""
+        return closing(self._answers(work, tasks))
+
+    def _answers(self, work: Work[T, R], tasks: Sequence[T]) -> Generator[tuple[T, R]]:
         if not tasks:
             return
         with ExitStack() as stack:
@@ -68,16 +72,18 @@ class OnDask:
             return self.cluster
         try:
             if not self.cluster:
-                made: Any = LocalCluster
+                start_cluster: Any = LocalCluster
                 return stack.enter_context(
-                    Client(stack.enter_context(made(threads_per_worker=1, dashboard_address="127.0.0.1:0")))
+                    Client(stack.enter_context(start_cluster(threads_per_worker=1, dashboard_address="127.0.0.1:0")))
                 )
             if self.cluster.endswith(".json"):
                 return stack.enter_context(Client(scheduler_file=self.cluster, timeout=FINDS_S))
             return stack.enter_context(Client(self.cluster, timeout=FINDS_S))
         except (OSError, TimeoutError, ValueError) as error:
-            where = f"at {self.cluster}" if self.cluster else "on this machine"
-            raise InputError(f"There is no Dask scheduler {where} that answers; start it, or mend --dask.") from error
+            location = f"at {self.cluster}" if self.cluster else "on this machine"
+            raise InputError(
+                f"There is no Dask scheduler {location} that answers; start it, or mend --dask."
+            ) from error
 
 
 class _Run:
@@ -97,7 +103,7 @@ class _Run:
         workers = self._workers()
         self._check_versions()
         size = max(1, min(LARGEST_CHUNK, len(self._tasks) // (workers * CHUNKS_A_WORKER)))
-        chunks = [range(at, min(at + size, len(self._tasks))) for at in range(0, len(self._tasks), size)]
+        chunks = [range(start, min(start + size, len(self._tasks))) for start in range(0, len(self._tasks), size)]
         try:
             yield from self._each(chunks, (1 + AHEAD) * workers)
             suspects, self._suspects = self._suspects, []
@@ -149,7 +155,7 @@ class _Run:
             f"{WORKERS_S:g} s. Start workers with: dask worker {self._client.scheduler.address} --nthreads 1"
         )
         try:
-            with tell_after(TELLS_S, sentence):
+            with tell_after(REPORT_S, sentence):
                 self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
             raise FitError(
@@ -163,9 +169,9 @@ class _Run:
         Raises:
             FitError: there are such workers.
         """
-        found: Mapping[str, object] = self._client.run(_version_reader(), on_error="return")
+        versions: Mapping[str, object] = self._client.run(_version_reader(), on_error="return")
         by_version: dict[str, list[str]] = {}
-        for address, version in sorted(found.items()):
+        for address, version in sorted(versions.items()):
             by_version.setdefault(str(version), []).append(address)
         by_version.pop(__version__, None)
         if by_version:
@@ -181,10 +187,10 @@ def _version_reader() -> Callable[[], str]:
 
     def version_here() -> str:
         try:
-            from shapespace.version import __version__ as found
+            from shapespace.version import __version__ as version
         except ImportError:
             return "no shapespace"
-        return found
+        return version
 
     return version_here
 
@@ -214,12 +220,13 @@ def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None, 
             f"The command uses shapespace {version}, but the Dask worker {get_worker().address} has {__version__}; "
             "install the same version on both and restart the worker."
         )
-    if getattr(_here, "work", None) != (work, timeout_s):
-        if (earlier := getattr(_here, "child", None)) is not None:
-            earlier.stop()
-        _here.work, _here.child = (work, timeout_s), Child(work, timeout_s)
-    return [_here.child.do(task) for task in tasks]
+    if getattr(_thread, "work", None) != (work, timeout_s):
+        if (earlier := getattr(_thread, "team", None)) is not None:
+            earlier.close()
+        _thread.work, _thread.team = (work, timeout_s), Team(work, 1, timeout_s)
+    answers = dict(_thread.team.run(tasks))
+    return [answers[number] for number in range(len(tasks))]
 
 
-_here = threading.local()
-"""Of each thread of a worker: its child, and what that does."""
+_thread = threading.local()
+"""The process below each thread of a worker, as a team of one, and its work."""

@@ -1,4 +1,4 @@
-"""The folds and random shapes of a measurement of quality, wherever they run."""
+"""Model quality by an executor: its folds and random shapes as tasks."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from shapespace.errors import FitError
 from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder, temporary_folder
+from shapespace.io.memory_cache import LatestValue
 from shapespace.model.quality import Part, QualitySettings, Shapes
 from shapespace.types import FloatArray, Mesh
 
 _AGAIN = "run the command again"
 _FEW_VERTICES = 200_000
-"""Of all shapes together: these are measured sooner than workers start."""
+"""Of all shapes together: below it, a measurement takes less time than workers to start."""
 
 
 @dataclass(frozen=True)
-class QualityElsewhere:
-    """Does the parts of a measurement by an executor.
+class QualityRunner:
+    """Runs the parts of a measurement by an executor.
 
     Args:
-        where: the parts are done.
-        folder: that all workers see, for a file with the shapes while they are measured; made if absent.
-        quiet: whether workers say that code is compiled.
+        execution: where they run; a small measurement runs in this process unless something else is asked for.
+        folder: that all workers see, for a file with the shapes during the measurement; made if absent.
+        quiet: whether workers do not report that code is compiled.
     """
 
     execution: ExecutionConfig
@@ -40,30 +41,27 @@ class QualityElsewhere:
     quiet: bool
 
     def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterator[tuple[Part, FloatArray]]:
-        """Yield what came of each of `parts` as it ends.
+        """Yield each of `parts` with its errors, in any order.
 
         Raises:
             FileError: the shapes cannot be written.
-            FitError: there are no workers, or a part was given up.
+            FitError: no workers are left, or a part was given up.
         """
-        few = sum(len(mesh.vertices) for mesh in shapes.meshes) < _FEW_VERTICES
-        here = few and self.execution.kind == "local" and not self.execution.jobs
-        executor = None if here else self.execution.executor(len(parts), quiet=self.quiet)
+        small = sum(len(mesh.vertices) for mesh in shapes.meshes) < _FEW_VERTICES
+        serial = small and self.execution.kind == "local" and not self.execution.jobs
+        executor = Serial() if serial else self.execution.executor(len(parts), quiet=self.quiet)
         with contextlib.ExitStack() as stack:
-            if executor is None:
-                work = QualityWork(Path())
-            else:
-                make_folder(self.folder)
-                temporary = stack.enter_context(temporary_folder(self.folder))
+            work = QualityWork(Path())
+            if not isinstance(executor, Serial):
+                temporary = stack.enter_context(temporary_folder(make_folder(self.folder)))
                 work = QualityWork(temporary / "shapes.npz")
                 work.save(shapes)
-            work.remember(shapes)
+            _shapes.set(work.file, shapes)
             stack.callback(_shapes.clear)
-            done = stack.enter_context(contextlib.closing((executor or Serial()).run(work, parts)))
-            for part, (found, reason) in done:
-                if found is None:
+            for part, (errors, reason) in stack.enter_context(executor.run(work, parts)):
+                if errors is None:
                     raise FitError(f"A part of the measurement could not be done: {reason}; run it with fewer --jobs.")
-                yield part, found
+                yield part, errors
 
 
 @dataclass(frozen=True)
@@ -80,20 +78,13 @@ class QualityWork:
         """Return the errors of one part.
 
         Raises:
-            InputError: scans that are not those of the surfaces.
+            InputError: the scans do not belong to the surfaces.
         """
-        if self.file not in _shapes:
-            self.remember(self._load())
-        return _shapes[self.file].do(part), ""
+        return _shapes.get(self.file, self._load).do(part), ""
 
     def give_up(self, _part: Part, reason: str) -> tuple[FloatArray | None, str]:
-        """Return why there are none."""
+        """Return no errors and the reason."""
         return None, reason
-
-    def remember(self, shapes: Shapes) -> None:
-        """Keep the shapes for parts in this process."""
-        _shapes.clear()
-        _shapes[self.file] = shapes
 
     def save(self, shapes: Shapes) -> None:
         """Write the shapes for other processes.
@@ -113,15 +104,15 @@ class QualityWork:
 
     def _load(self) -> Shapes:
         arrays = read_arrays(self.file, _AGAIN)
-        told = {key.partition(".")[2]: array for key, array in arrays.items() if key.startswith("setting.")}
-        settings = {key: _value(key, array) for key, array in told.items()}
+        stored = {key.partition(".")[2]: array for key, array in arrays.items() if key.startswith("setting.")}
+        settings = {key: _value(key, array) for key, array in stored.items()}
         absent = {key: None for key in ("folds", "modes", "control_points") if key not in settings}
         meshes, scans = _meshes(arrays, "mesh"), _meshes(arrays, "scan")
         return Shapes(meshes, scans or None, QualitySettings(**cast(Any, {**settings, **absent})))
 
 
-_shapes: dict[Path, Shapes] = {}
-"""The shapes of this process, by their file."""
+_shapes = LatestValue[Shapes]()
+"""The shapes that this process measures, by their file."""
 
 
 def _value(key: str, array: npt.NDArray[Any]) -> object:

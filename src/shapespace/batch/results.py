@@ -89,9 +89,9 @@ class Source:
             FileError: it cannot be read.
         """
         content_hash = sha256_of_file(file)
-        there = file.stat()
+        stat = file.stat()
         source = Source.at(file, content_hash, folder)
-        return replace(source, size_bytes=there.st_size, modified_ns=there.st_mtime_ns)
+        return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
 
     def to_file(self) -> File:
         """Return the source as a part of a record."""

@@ -1,8 +1,7 @@
-"""The tasks of a round of correspondence wherever they run, each kept on disk as soon as it is done."""
+"""Correspondence by an executor: the tasks of a round, whose results are stored as soon as they are computed."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from shapespace.io.archives import read_arrays
 from shapespace.io.arrays import write_arrays
 from shapespace.io.files import make_folder
 from shapespace.io.hdf5 import content_hash
+from shapespace.io.memory_cache import LatestValue
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity, SurfaceLandmarks
 from shapespace.version import __version__
@@ -31,14 +31,14 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class KeptRounds:
-    """Does the tasks of a round somewhere; what is done is kept in `folder`, and a like task finds it there.
+class RoundRunner:
+    """Runs the tasks of a round by an executor; results are stored in `folder`, and equal tasks reuse them.
 
     Args:
-        folder: for what is kept; made if absent.
-        where: the tasks are done.
-        quiet: whether workers say that code is compiled.
-        on_done: told of each task that ends.
+        folder: of the stored results; made if absent.
+        execution: where tasks run.
+        quiet: whether workers do not report that code is compiled.
+        on_done: called after each task.
     """
 
     folder: Path
@@ -50,34 +50,34 @@ class KeptRounds:
         """Yield what came of each task as it ends.
 
         Raises:
-            FileError: what is done cannot be written.
-            FitError: there are no workers, or none any more.
+            FileError: a result cannot be written.
+            FitError: no workers are left, or none can start.
         """
         make_folder(self.folder)
         shared = [_shared_hash(context, pose_model) for pose_model in context.pose_models]
-        left: list[_KeptTask] = []
+        remaining: list[_FileTask] = []
         for task in tasks:
-            kept = _KeptTask.of(task, self.folder / f"{_key(task, shared[task.pose_model])}.npz")
-            placed = _read(kept.file, task.index)
+            file_task = _FileTask.of(task, self.folder / f"{_key(task, shared[task.pose_model])}.npz")
+            placed = _read(file_task.file, task.index)
             if placed is None:
-                left.append(kept)
+                remaining.append(file_task)
             else:
                 self.on_done()
                 yield placed
-        if not left:
+        if not remaining:
             return
-        executor = self.execution.executor(len(left), quiet=self.quiet)
+        executor = self.execution.executor(len(remaining), quiet=self.quiet)
         work = RoundWork(self.folder / f"{content_hash({}, {'shared': ' '.join(shared)})}.context.npz", context.seed)
-        work.remember(context)
-        if executor is not None:
+        _context.set(work.file, context)
+        if not isinstance(executor, Serial):
             work.save(context)
-        with contextlib.closing((executor or Serial()).run(work, left)) as ended:
-            for task, _ in ended:
+        with executor.run(work, remaining) as results:
+            for task, _ in results:
                 self.on_done()
                 yield _read_again(task)
 
 
-def _read_again(task: _KeptTask) -> ScanRegistration:
+def _read_again(task: _FileTask) -> ScanRegistration:
     placed = _read(task.file, task.index)
     if placed is None:
         raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
@@ -85,8 +85,8 @@ def _read_again(task: _KeptTask) -> ScanRegistration:
 
 
 @dataclass(frozen=True)
-class _KeptTask:
-    """A task as arrays, which reach any process, and the file for what comes of it."""
+class _FileTask:
+    """A task as arrays, which can be sent to any process, and the file of its result."""
 
     file: Path
     arrays: Arrays
@@ -95,8 +95,8 @@ class _KeptTask:
     settings: ElasticSettings
 
     @staticmethod
-    def of(task: RegistrationTask, file: Path) -> _KeptTask:
-        return _KeptTask(file, _task_arrays(task), task.index, task.pose_model, task.settings)
+    def of(task: RegistrationTask, file: Path) -> _FileTask:
+        return _FileTask(file, _task_arrays(task), task.index, task.pose_model, task.settings)
 
     def task(self) -> RegistrationTask:
         arrays = self.arrays
@@ -115,7 +115,7 @@ class _KeptTask:
 
 @dataclass(frozen=True)
 class RoundWork:
-    """Places scans in one round context, for an executor.
+    """Registers scans in one round context, for an executor.
 
     Args:
         file: of the round context, which each worker reads once.
@@ -125,27 +125,22 @@ class RoundWork:
     file: Path
     seed: int
 
-    def do(self, task: _KeptTask) -> None:
-        """Place a scan and keep what came of it in its file, unless it is there already.
+    def do(self, task: _FileTask) -> None:
+        """Register a scan and write the result, unless it is there already.
 
         Raises:
             FileError: it cannot be written.
         """
         if _read(task.file, task.index) is None:
-            _write(task.file, self._context().register(task.task()))
+            _write(task.file, _context.get(self.file, self._load).register(task.task()))
 
-    def give_up(self, task: _KeptTask, reason: str) -> None:
-        """Keep in its file what sets a scan aside whose workers were lost.
+    def give_up(self, task: _FileTask, reason: str) -> None:
+        """Write the result that excludes a scan whose workers were lost.
 
         Raises:
             FileError: it cannot be written.
         """
-        _write(task.file, self._context().failed(task.index, reason))
-
-    def remember(self, context: RoundContext) -> None:
-        """Keep the round context for tasks in this process."""
-        _contexts.clear()
-        _contexts[self.file] = context
+        _write(task.file, _context.get(self.file, self._load).failed(task.index, reason))
 
     def save(self, context: RoundContext) -> None:
         """Write the round context for other processes, if an earlier run has not.
@@ -158,13 +153,8 @@ class RoundWork:
         models = {f"pose_model_{number}": one.model for number, one in enumerate(context.pose_models)}
         models |= {} if context.guide is None else {"guide": context.guide}
         parts = {"context": _context_arrays(context)} | {name: _model_arrays(model) for name, model in models.items()}
-        arrays = {f"{part}.{name}": array for part, told in parts.items() for name, array in told.items()}
+        arrays = {f"{part}.{name}": array for part, content in parts.items() for name, array in content.items()}
         write_arrays(self.file, arrays)
-
-    def _context(self) -> RoundContext:
-        if self.file not in _contexts:
-            self.remember(self._load())
-        return _contexts[self.file]
 
     def _load(self) -> RoundContext:
         parts: dict[str, Arrays] = {}
@@ -179,19 +169,19 @@ class RoundWork:
         return RoundContext(mesh, harmonics, pose_models, self.seed, None if guide is None else _model_of(guide))
 
 
-_contexts: dict[Path, RoundContext] = {}
-"""The round context of this process, by its file."""
+_context = LatestValue[RoundContext]()
+"""The round context that this process uses, by its file."""
 
 
 def _model_arrays(m: ShapeModel) -> Arrays:
     return {
         "mean": m.mean, "basis": m.basis, "stddev": m.stddev, "faces": np.array(m.faces),
-        "told": np.array([m.total_variance, m.n_training]),
+        "statistics": np.array([m.total_variance, m.n_training]),
     }  # fmt: skip
 
 
 def _model_of(arrays: Arrays) -> ShapeModel:
-    variance, samples = arrays["told"]
+    variance, samples = arrays["statistics"]
     return ShapeModel(
         arrays["mean"], arrays["basis"], arrays["stddev"], float(variance), int(samples), faces=arrays["faces"]
     )
@@ -253,30 +243,30 @@ def _key(task: RegistrationTask, shared: str) -> str:
 def _write(file: Path, placed: ScanRegistration) -> None:
     arrays: Arrays = {}
     for number, one in enumerate((placed, *placed.alternatives)):
-        told: Arrays = {
+        result: Arrays = {
             "vertices": one.vertices, "observed": one.observed, "covered": np.array(one.covered),
             "distance": np.array(one.distance), "cpu_s": np.array(one.cpu_s), "reason": np.array(one.reason),
             "mirror_ratio": np.array(one.mirror_ratio), "posed_by_landmarks": np.array(one.posed_by_landmarks),
             **_pose_arrays(one.T_scan_template),
         }  # fmt: skip
-        arrays |= {f"{name}_{number}": array for name, array in told.items()}
+        arrays |= {f"{name}_{number}": array for name, array in result.items()}
     write_arrays(file, arrays)
 
 
 def _read(file: Path, index: int) -> ScanRegistration | None:
-    """Return what was kept, or None where nothing is or it is damaged."""
+    """Return the stored result, or None if there is none or it is damaged."""
     try:
-        kept = read_arrays(file, "run again")
-        count = sum(name.startswith("vertices_") for name in kept)
-        first, *alternatives = [_kept_one(kept, number, index) for number in range(count)]
+        stored = read_arrays(file, "run again")
+        count = sum(name.startswith("vertices_") for name in stored)
+        first, *alternatives = [_read_one(stored, number, index) for number in range(count)]
     except (FileError, ValueError, KeyError):
         return None
     return replace(first, alternatives=tuple(alternatives))
 
 
-def _kept_one(kept: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> ScanRegistration:
+def _read_one(stored: Mapping[str, npt.NDArray[Any]], number: int, index: int) -> ScanRegistration:
     def of(name: str) -> npt.NDArray[Any]:
-        return kept[f"{name}_{number}"]
+        return stored[f"{name}_{number}"]
 
     T = Similarity(float(of("scale")), of("rotation"), of("translation"))
     mean, p95, p99, largest = (float(length) for length in of("distance"))

@@ -1,28 +1,23 @@
-"""Fit many scans: a bad one becomes a row with its reason, the others go on, and an interruption loses nothing."""
+"""Fit many scans: a scan that cannot be fitted becomes a failed record, and an interruption loses no finished fit."""
 
 from __future__ import annotations
 
-import time
+import warnings
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from msgspec import structs
-
 from shapespace.batch.executors import Executor, Serial
-from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, resumed
-from shapespace.batch.folder import RECORD, CoefficientTable, names_for
+from shapespace.batch.fit_work import FitTask, FitWork, Job
+from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
-from shapespace.batch.results import write_record
+from shapespace.batch.sinks import FolderSink, Sink
 from shapespace.fit.fit import FitConfig
 from shapespace.fit.state import IcpState
 from shapespace.io.files import make_folder
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord
-
-_SAVE_EVERY_S = 5.0
-_SAVES_APART = 20.0
 
 
 def make_jobs(
@@ -32,37 +27,117 @@ def make_jobs(
     addresses: Mapping[Path, str] | None = None,
 ) -> list[Job]:
     """Return one job a scan, named by `names_for` for results in `folder`; a scan given twice is one job twice."""
-    there = addresses or {}
-    names = names_for(scans, folder, there)
-    return [Job(name, scan, landmarks, address=there.get(scan, "")) for name, scan in zip(names, scans, strict=True)]
+    addresses = addresses or {}
+    names = names_for(scans, folder, addresses)
+    return [
+        Job(name, scan, landmarks, address=addresses.get(scan, "")) for name, scan in zip(names, scans, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run has to do.
+    """Numbers of fits in a run.
 
     Args:
-        kept: scans whose results of an earlier run still hold.
-        anew: scans that have results which do not.
+        valid: scans whose results of an earlier run are valid.
+        repeated: scans with results that are not valid any more.
         new: scans without results.
     """
 
-    kept: int
-    anew: int
+    valid: int
+    repeated: int
     new: int
 
     def sentences(self) -> Iterator[str]:
         """Yield what a user should know of it."""
-        every = self.kept + self.anew + self.new
-        if self.kept:
-            what = "scan has a result that still holds" if self.kept == 1 else "scans have results that still hold"
-            yield f"{self.kept} of {every} {what}, which is kept; --again fits anew."
-        if self.anew:
-            what = "scan is" if self.anew == 1 else "scans are"
+        total = self.valid + self.repeated + self.new
+        if self.valid:
+            what = "scan has a valid result, which is" if self.valid == 1 else "scans have valid results, which are"
+            yield f"{self.valid} of {total} {what} reused; --again fits again."
+        if self.repeated:
+            what = "scan is" if self.repeated == 1 else "scans are"
             yield (
-                f"{self.anew} of {every} {what} fitted anew: scan, model, settings, version or the files of the result "
+                f"{self.repeated} of {total} {what} fitted again: the scan, model, settings, version or result files "
                 "have changed since the last fit."
             )
+
+
+@dataclass(frozen=True)
+class BatchConfig:
+    """What the fits of a batch have in common.
+
+    Args:
+        model: the shape space.
+        model_file: where the model was read from, for the records and for workers.
+        fit: settings of each fit.
+        stages: also write the surfaces at each stage, for figures.
+        reuse: reuse earlier results that are valid for the same scan, model and settings. Where such a fit has to be
+            done again, for the stages say, it keeps the dense surface and the stages that it had.
+        first: names of jobs that are done before the others.
+    """
+
+    model: ShapeModel
+    model_file: Path
+    fit: FitConfig = field(default_factory=FitConfig)
+    stages: bool = False
+    reuse: bool = False
+    first: Collection[str] = ()
+
+
+def fit_many(
+    jobs: Sequence[Job],
+    config: BatchConfig,
+    executor: Executor,
+    sink: Sink,
+    *,
+    on_plan: Callable[[Plan], None] | None = None,
+    on_done: Callable[[Job, FitRecord], None] | None = None,
+    on_state: Callable[[IcpState], None] | None = None,
+) -> Counter[str]:
+    """Fit all `jobs` into `sink` and return the number of fits of each status; an interruption loses no finished fit.
+
+    Args:
+        jobs: the scans; those with the same name are fitted once.
+        config: what the fits have in common.
+        executor: see `batch.executors`.
+        sink: where results go, see `batch.sinks`; its folder is made if absent, and no other run may write into it.
+        on_plan: called once with the numbers of valid, repeated and new fits.
+        on_done: called with each job and its record; the record of a valid result in a store has no `reason`.
+        on_state: called with each state of the loop by the serial executor.
+
+    Raises:
+        FileError: the results cannot be written, or another run writes into the folder.
+        FitError: no workers are left, or none can start.
+    """
+    folder, counts = make_folder(sink.folder), Counter[str]()
+    unique = {job.name: job for job in jobs}
+    with only_writer(folder):
+        sink.open(tuple(unique), config.model, reuse=config.reuse)
+        tasks: list[FitTask] = []
+        for job in unique.values():
+            task, record = sink.find_valid(FitTask(job, config.fit, config.stages, config.reuse))
+            if record is None:
+                tasks.append(task)
+                continue
+            counts[record.status] += 1
+            if on_done is not None:
+                on_done(job, record)
+        tasks.sort(key=lambda task: task.job.name not in config.first)
+        if on_plan is not None:
+            repeated = sum(sink.has_result(task.job) for task in tasks)
+            on_plan(Plan(counts.total(), repeated, len(tasks) - repeated))
+        work = FitWork.of(config.model, config.model_file, folder, on_state if isinstance(executor, Serial) else None)
+        sink.start([task.job.name for task in tasks])
+        try:
+            with executor.run(work, tasks) as results:
+                for task, record in results:
+                    counts[record.status] += 1
+                    sink.add(task.job.name, record)
+                    if on_done is not None:
+                        on_done(task.job, record)
+        finally:
+            sink.close()
+    return counts
 
 
 def fit_files(
@@ -75,90 +150,9 @@ def fit_files(
     executor: Executor | None = None,
     resume: bool = False,
     stages: bool = False,
-    first: Collection[str] = (),
-    on_plan: Callable[[Plan], None] | None = None,
-    on_done: Callable[[Job, FitRecord], None] | None = None,
-    on_state: Callable[[IcpState], None] | None = None,
 ) -> list[FitRecord]:
-    """Fit all `jobs` and keep coefficients.csv in `folder` current, also when interrupted; return the records.
-
-    The table holds all records in the folder: those of earlier runs too, as long as they are there. No other run may
-    write into the folder meanwhile.
-
-    Args:
-        jobs: the scans.
-        model: the shape space.
-        model_file: where the model was read from, for the records and for workers.
-        folder: where results go; made if absent.
-        config: settings of all fits.
-        executor: see `batch.executors`; None fits one after the other here.
-        resume: keep results that are there already for the same scan, model and settings. Where such a fit has to be
-            done again, for the stages say, it has the dense surface and the stages that it had.
-        stages: also write the surfaces at each stage, for figures.
-        first: names of jobs that are done before the others.
-        on_plan: called once with what is to be done.
-        on_done: called with each job and its record.
-        on_state: called with each state of the loop when fits run here.
-
-    Raises:
-        FileError: the results cannot be written, or another run writes into the folder.
-        FitError: there are no workers, or none any more.
-    """
-    make_folder(folder)
-    with only_writer(folder):
-        kept = _Kept(CoefficientTable(folder, [job.name for job in jobs], model.n_modes), on_done)
-        work = FitWork.of(model, model_file, folder, on_state if executor is None else None)
-        tasks: list[FitTask] = []
-        for job in {job.name: job for job in jobs}.values():
-            task, earlier = FitTask(job, config, stages, resume), None
-            if resume:
-                task, earlier = resumed(task, model.content_hash, folder)
-            if earlier is not None:
-                try:
-                    kept.add(job, _with_metadata(earlier, job, folder))
-                    continue
-                except ValueError:  # damaged
-                    task = FitTask(job, config, stages, resume=False)
-            tasks.append(task)
-        tasks.sort(key=lambda task: task.job.name not in first)
-        kept.table.catch_up([task.job.name for task in tasks])
-        if on_plan is not None:
-            before = sum(has_surface(task.job, folder) for task in tasks)
-            on_plan(Plan(len(kept.records), before, len(tasks) - before))
-        try:
-            with closing((executor or Serial()).run(work, tasks)) as ended:
-                for task, record in ended:
-                    kept.add(task.job, record)
-        finally:
-            kept.table.catch_up([task.job.name for task in tasks if task.job.name not in kept.records])
-            kept.table.save()
-    return [kept.records[job.name] for job in jobs]
-
-
-def _with_metadata(record: FitRecord, job: Job, folder: Path) -> FitRecord:
-    if not job.metadata or record.metadata == job.metadata:
-        return record
-    record = structs.replace(record, metadata=dict(job.metadata))
-    write_record(folder / f"{job.name}{RECORD}", record)
-    return record
-
-
-class _Kept:
-    """The records of jobs that ended, and the table of them, which is saved now and then."""
-
-    def __init__(self, table: CoefficientTable, on_done: Callable[[Job, FitRecord], None] | None) -> None:
-        self.table = table
-        self.records: dict[str, FitRecord] = {}
-        self._on_done = on_done
-        self._next_save = time.monotonic() + _SAVE_EVERY_S
-
-    def add(self, job: Job, record: FitRecord) -> None:
-        # In this order, so that what an interruption keeps out of the table is caught up with.
-        self.table.add(job.name, record)
-        self.records[job.name] = record
-        if self._on_done is not None:
-            self._on_done(job, record)
-        if (now := time.monotonic()) > self._next_save:
-            self.table.save()
-            # A table of very many rows takes a while itself.
-            self._next_save = time.monotonic() + max(_SAVE_EVERY_S, _SAVES_APART * (time.monotonic() - now))
+    """Fit all `jobs` into a folder. Deprecated: use `fit_many` with a `FolderSink`."""
+    warnings.warn("fit_files is deprecated; use fit_many with a FolderSink.", DeprecationWarning, stacklevel=2)
+    sink = FolderSink(folder)
+    fit_many(jobs, BatchConfig(model, model_file, config, stages, resume), executor or Serial(), sink)
+    return [sink.records[job.name] for job in jobs]

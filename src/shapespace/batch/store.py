@@ -47,7 +47,7 @@ _ROW_GROUP = 250
 
 @dataclass(frozen=True)
 class Compacted:
-    """What came of moving results into a store.
+    """Result of moving single results into a store.
 
     Args:
         moved: names that are in a shard now.
@@ -140,8 +140,8 @@ class Store:
     def compact(self, names: Iterable[str] | None = None, *, rows: int = ROWS) -> Compacted:
         """Move finished single results into new shards.
 
-        A result that cannot be moved as it is, such as one without its surface, stays and is told of. A fit that was
-        in a shard already is replaced there.
+        A result that cannot be moved as it is, such as one without its surface, stays, with the reason in `left`. A fit
+        that was in a shard already is replaced there.
 
         Args:
             names: of the results; None for all single ones.
@@ -163,13 +163,13 @@ class Store:
             groups: dict[str, list[_Result]] = {}
             for name in wanted[first : first + rows]:
                 try:
-                    found = self._read(name, singles[name])
+                    result = self._read(name, singles[name])
                 except ShapespaceError as error:
                     out.left[name] = str(error)
                 except (ValueError, OverflowError):
                     out.left[name] = f"The record of {name} is damaged; fit the scan again."
                 else:
-                    groups.setdefault(found.topology, []).append(found)
+                    groups.setdefault(result.topology, []).append(result)
             # Fits without a surface go with those that have one.
             if len(groups) > 1 and (bare := groups.pop("", None)):
                 next(iter(groups.values())).extend(bare)
@@ -191,7 +191,7 @@ class Store:
         for ending in (*ENDINGS.values(), *landmarks, ENDING):
             remove_file(self.folder / f"{name}{ending}")
 
-    def _read(self, name: str, there: frozenset[str]) -> _Result:
+    def _read(self, name: str, parts: frozenset[str]) -> _Result:
         """Return a single result, or raise what keeps it from being moved."""
         if not is_plain_name(name):
             raise ShapespaceError(f"{name[:80]!r} is no name that a store can hold; rename the scan.")
@@ -199,9 +199,9 @@ class Store:
         text = path.read_bytes().decode("utf-8")
         record = FitRecord.from_json(json.loads(text), str(path))
         fitted = record.is_fitted
-        if fitted and "fitted" not in there:
+        if fitted and "fitted" not in parts:
             raise ShapespaceError(f"{path} has no surface beside it; fit the scan again.")
-        kinds = tuple(kind for kind in ENDINGS if fitted and kind in there)
+        kinds = tuple(kind for kind in ENDINGS if fitted and kind in parts)
         row = store_row(name, record) | {kind: kind in kinds for kind in FLAGS}
         topologies = {_topology(self._surface(name, kind)) for kind in KINDS if kind in kinds}
         if len(topologies) > 1:
@@ -214,19 +214,19 @@ class Store:
     def _move(self, group: Sequence[_Result], stored: Container[str]) -> None:
         manifest = read_manifest(self.folder) or Manifest()
         mark = hashlib.sha256("\n".join(result.text for result in group).encode()).hexdigest()[:12]
-        called = f"{len(manifest.shards):05d}-{mark}"
-        surfaces = self._write_surfaces(called, [result for result in group if "fitted" in result.kinds])
-        at = {name: k for k, name in enumerate(result.name for result in group if "fitted" in result.kinds)}
-        rows = [result.row | {ROW: at.get(result.name, -1), RECORD: result.text} for result in group]
+        stem = f"{len(manifest.shards):05d}-{mark}"
+        surfaces = self._write_surfaces(stem, [result for result in group if "fitted" in result.kinds])
+        position = {name: k for k, name in enumerate(result.name for result in group if "fitted" in result.kinds)}
+        rows = [result.row | {ROW: position.get(result.name, -1), RECORD: result.text} for result in group]
         new = ShardEntry(
-            table=self._write_table(called, rows, self._columns_of(manifest)),
+            table=self._write_table(stem, rows, self._columns_of(manifest)),
             surfaces=surfaces,
-            stages=self._write_stages(called, [result.name for result in group if "stages" in result.kinds]),
-            **_told(rows),
+            stages=self._write_stages(stem, [result.name for result in group if "stages" in result.kinds]),
+            **_summary(rows),
         )
         older = {result.name for result in group if result.name in stored}
-        kept = [self._without(shard, older) if older else shard for shard in manifest.shards]
-        shards = (*(shard for shard in kept if shard is not None), new)
+        remaining = [self._without(shard, older) if older else shard for shard in manifest.shards]
+        shards = (*(shard for shard in remaining if shard is not None), new)
         self._write_manifest(Manifest(shards=shards))
         for result in group:
             self._remove_singles(result.name)
@@ -250,8 +250,8 @@ class Store:
         if not rows:
             return None
         mark = hashlib.sha256("\n".join(row["scan"] for row in rows).encode()).hexdigest()[:12]
-        called = f"{Path(entry.table.file).name[:5]}-{mark}"
-        return replaced(entry, table=self._write_table(called, rows, columns), **_told(rows))
+        stem = f"{Path(entry.table.file).name[:5]}-{mark}"
+        return replaced(entry, table=self._write_table(stem, rows, columns), **_summary(rows))
 
     def _columns_of(self, manifest: Manifest) -> Iterable[str]:
         """Return the columns of the last shard that can be read: who reads all tables needs the same in each."""
@@ -260,7 +260,7 @@ class Store:
                 return Shard(self.folder, entry).column_names()
         return ()
 
-    def _write_table(self, called: str, rows: Sequence[Mapping[str, Any]], also: Iterable[str]) -> StoredFile:
+    def _write_table(self, stem: str, rows: Sequence[Mapping[str, Any]], also: Iterable[str]) -> StoredFile:
         pa = arrow()
         kinds: dict[str, Any] = {"text": pa.string(), "count": pa.int64(), "flag": pa.bool_(), "number": pa.float64()}
         modes = max(row.get("modes") or 0 for row in rows)
@@ -278,9 +278,9 @@ class Store:
                 write_statistics=["scan"], write_page_checksum=True,
             )  # fmt: skip
 
-        return self._written(TABLE, called, write)
+        return self._written(TABLE, stem, write)
 
-    def _write_surfaces(self, called: str, group: Sequence[_Result]) -> StoredFile | None:
+    def _write_surfaces(self, stem: str, group: Sequence[_Result]) -> StoredFile | None:
         if not group:
             return None
         import zarr
@@ -316,9 +316,9 @@ class Store:
                                 colours[k] = surface.colours
                     array(f"{kind}_origin", origins.shape, "<f8", origins.shape)[:] = origins
 
-        return self._written(SURFACES, called, write)
+        return self._written(SURFACES, stem, write)
 
-    def _write_stages(self, called: str, names: Sequence[str]) -> StoredFile | None:
+    def _write_stages(self, stem: str, names: Sequence[str]) -> StoredFile | None:
         if not names:
             return None
 
@@ -327,10 +327,10 @@ class Store:
                 for name in names:
                     archive.write(self.folder / f"{name}{ENDINGS['stages']}", f"{name}{ENDINGS['stages']}")
 
-        return self._written(STAGES, called, write)
+        return self._written(STAGES, stem, write)
 
-    def _written(self, part: str, called: str, write: Any) -> StoredFile:
-        path = make_folder(self.folder / part) / f"{called}{PARTS[part]}"
+    def _written(self, part: str, stem: str, write: Any) -> StoredFile:
+        path = make_folder(self.folder / part) / f"{stem}{PARTS[part]}"
         with atomic_path(path) as temporary:
             write(temporary)
             _to_disk(temporary)
@@ -372,7 +372,7 @@ def _to_disk(path: Path) -> None:
         raise write_error(path, error) from error
 
 
-def _told(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = [str(row["scan"]) for row in rows]
     counts = dict(sorted(Counter(str(row["status"]) for row in rows).items()))
     return {"rows": len(rows), "counts": counts, "first": min(names), "last": max(names)}

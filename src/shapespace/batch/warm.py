@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from shapespace.batch.said import is_first_to_say
+from shapespace.batch.messages import is_first
 from shapespace.compiled import on_compiling
 from shapespace.errors import ShapespaceError
 from shapespace.fit.fit import FitConfig, fit_scan
@@ -23,8 +23,8 @@ COMPILING = "shapespace: compiling, once on this machine; this takes a while ...
 
 
 def tell_compiling() -> None:
-    """Say on standard error why the user waits, unless another process of the same command has said so."""
-    if is_first_to_say():
+    """Print on standard error that code is being compiled, unless another process of the command has done so."""
+    if is_first():
         print(COMPILING, file=sys.stderr, flush=True)
 
 
@@ -50,7 +50,7 @@ def _hill(side: int, seed: int) -> Mesh:
     u, v = np.meshgrid(*2 * [np.linspace(-1, 1, side)], indexing="ij")
     a, b, c = np.random.default_rng(seed).normal(1, 0.2, 3)
     z = 50 * a * np.exp(-4 * ((u - 0.3) ** 2 + v**2)) + 20 * b * np.exp(-9 * (u**2 + (v - 0.5) ** 2)) + 5 * c * u * v
-    at = np.arange(side * side).reshape(side, side)
-    p, q, r, s = (corner.ravel() for corner in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    index = np.arange(side * side).reshape(side, side)
+    p, q, r, s = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
     faces = np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, s], axis=1)]).astype(np.int32)
     return Mesh(np.stack([50 * u, 50 * v, z], axis=2).reshape(-1, 3), faces)

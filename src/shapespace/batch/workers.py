@@ -1,4 +1,4 @@
-"""Processes that fit: one server loads the code once, and each worker is a copy of it that ends with its parent.
+"""Worker processes: one server loads the code once, and each worker is a copy of it that ends with its parent.
 
 This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
 """
@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, cast
 
-from shapespace.batch import said
+from shapespace.batch import messages
 from shapespace.errors import FitError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def start_loading(*, tell: bool) -> None:
     Args:
         tell: whether a line on standard error may say that the code is being compiled.
     """
-    mark = said.shared() if tell else said.alone()
+    mark = messages.share_mark() if tell else messages.remove_mark()
     if not COPIED:
         from shapespace.batch.warm import warm_up
 
@@ -53,7 +53,7 @@ def start_loading(*, tell: bool) -> None:
     from multiprocessing import forkserver  # not on Windows
 
     # One worker is one core: threads of BLAS would spread it over all.
-    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", said.SAID: mark}
+    wanted = dict.fromkeys(_BLAS_THREADS, "1") | {WARM_UP: "tell" if tell else "quiet", messages.MARK: mark}
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
@@ -90,12 +90,12 @@ def _nothing() -> None:
 
 
 class Worker:
-    """A process that is given one task after the other by a line of its own.
+    """A process that receives one task after the other through a pipe of its own.
 
     Args:
-        serve: what it does, given its end of the line and `arguments`; it sends one word when it is ready.
+        serve: the function it runs, called with its end of the pipe and `arguments`; it sends `()` when it is ready.
         arguments: of `serve`.
-        life: of `life_line`; the process ends with it, whatever it is at.
+        life: of `life_line`; the process ends with it, whatever it does.
 
     Raises:
         FitError: no process can be started.
@@ -113,12 +113,12 @@ class Worker:
             theirs.close()
 
     def give(self, task: object) -> None:
-        """Send a task; a worker that died meanwhile is found out by `answer`."""
+        """Send a task; if the worker has died meanwhile, `answer` returns None."""
         with contextlib.suppress(OSError):
             self.line.send(task)
 
     def answer(self) -> Any:
-        """Return the tuple that it sent, an empty one when it is ready, or None where none has come or will come."""
+        """Return the tuple that it sent, `()` when it is ready, or None if none has arrived or can arrive."""
         try:
             return self.line.recv() if self.line.poll() else None
         except (EOFError, OSError):
@@ -148,13 +148,13 @@ def life_line() -> Generator[Connection]:
 @contextlib.contextmanager
 def _children_allowed() -> Generator[None]:
     """Let workers of Dask, which are daemons, have children too: the life line ends those with them."""
-    told: dict[str, Any] = cast(Any, multiprocessing.current_process())._config
-    daemon = told.pop("daemon", None)
+    config: dict[str, Any] = cast(Any, multiprocessing.current_process())._config
+    daemon = config.pop("daemon", None)
     try:
         yield
     finally:
         if daemon is not None:
-            told["daemon"] = daemon
+            config["daemon"] = daemon
 
 
 def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:

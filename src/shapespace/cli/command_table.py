@@ -685,4 +685,12 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Prints what was kept, changed and left out.",),
     ),
+    Command(
+        "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",), run.cache,
+        (basic("--clear", help="remove all entries; fits compute them again"),),
+        (
+            "The cache holds residual modes of the models that were fitted. SHAPESPACE_CACHE names another folder; "
+            "SHAPESPACE_KEEP=no turns the cache off.",
+        ),
+    ),
 )  # fmt: skip

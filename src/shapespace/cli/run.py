@@ -325,13 +325,13 @@ def fit(arguments: argparse.Namespace) -> int:
     method = method_named(arguments.method, **search)
     config = FitConfig(**given(arguments, FitConfig, method=method, region=_region(arguments.region)))
     settings = BatchSettings(
-        config,
-        arguments.landmarks,
-        _execution_config(arguments),
-        arguments.again,
-        arguments.stages,
-        arguments.recursive,
-        arguments.store,
+        config=config,
+        landmarks=arguments.landmarks,
+        execution=_execution_config(arguments),
+        again=arguments.again,
+        stages=arguments.stages,
+        recursive=arguments.recursive,
+        store=arguments.store,
     )
     counts, records = fit_scans(
         arguments.model, arguments.scans, arguments.output, settings, quiet=arguments.quiet, say=warn
@@ -483,6 +483,23 @@ def export(arguments: argparse.Namespace) -> int:
         if arguments.table is not None:
             show(f"The table is {arguments.table}")
     return 0 if not failed else 1 if written else 2
+
+
+def cache(arguments: argparse.Namespace) -> int:
+    """Folder and size of the cache on disk; empties it."""
+    from shapespace.io import disk_cache
+
+    if arguments.clear:
+        disk_cache.clear()
+    folder, entries = disk_cache.entries_folder(), disk_cache.entries()
+    size = sum(file.stat().st_size for file in entries)
+    if arguments.json:
+        show_json({"folder": None if folder is None else str(folder), "entries": len(entries), "bytes": size})
+    elif folder is None:
+        show("The cache is off (SHAPESPACE_KEEP).")
+    else:
+        show(f"{folder}: {len(entries)} entries, {size / 1e6:.1f} MB")
+    return 0
 
 
 def convert(arguments: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.results import Source
-from shapespace.batch.rounds import KeptRounds
+from shapespace.batch.rounds import RoundRunner
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.correspondence.first_template import first_template
@@ -239,10 +239,10 @@ class _Rounds:
         self._number += 1
         with progress(len(tasks), f"round {self._number}: registering", "scan", quiet=self._quiet) as bar:
 
-            def one_more() -> None:
+            def count() -> None:
                 bar.update()
 
-            return list(KeptRounds(self._folder, self._execution_config, self._quiet, one_more)(context, tasks))
+            return list(RoundRunner(self._folder, self._execution_config, self._quiet, count)(context, tasks))
 
 
 @dataclass(frozen=True)

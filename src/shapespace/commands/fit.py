@@ -12,11 +12,12 @@ import numpy as np
 from tqdm import tqdm
 
 from shapespace.batch.execution import ExecutionConfig
+from shapespace.batch.executors import Serial
 from shapespace.batch.fit_work import Job
 from shapespace.batch.folder import RECORD
-from shapespace.batch.into_store import FROM, fit_into_store
 from shapespace.batch.progress import progress, telling_of_compiling
-from shapespace.batch.run import Plan, fit_files, make_jobs
+from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
+from shapespace.batch.sinks import STORE_FROM, FolderSink, StoreSink
 from shapespace.commands.inputs import Given, given_scans, with_ids
 from shapespace.commands.landmark_files import LandmarkFiles
 from shapespace.errors import InputError, ShapespaceError
@@ -34,6 +35,7 @@ from shapespace.store.manifest import read_manifest
 FULL_CHECK_BYTES = 2**28
 """Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
 _LISTED = 10
+_STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _SURFACES = (".fitted.ply", ".dense.ply")
 
 
@@ -49,7 +51,7 @@ class BatchSettings:
         again: fit also scans whose results still hold.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.
-        store: keep results in a store, as is done from `FROM` scans on, and where there is one.
+        store: keep results in a store, as is done from `STORE_FROM` scans on, and where there is one.
     """
 
     config: FitConfig = field(default_factory=FitConfig)
@@ -96,33 +98,22 @@ def fit_scans(
     many.tell(say)
     if len(work) < len(given):
         say(f"Scans given more than once are fitted once: {len(work)} of {len(given)}.")
-    counts: dict[str, int] = dict.fromkeys(("converged", "max_iterations", "doubtful", "failed"), 0)
-    stored = settings.store or len(work) >= FROM or read_manifest(folder) is not None
+    stored = settings.store or len(work) >= STORE_FROM or read_manifest(folder) is not None
     if stored and not settings.store:
         say(f"Results are kept in a store ({folder}); shapespace export gives single files back.")
     first = find_suspects(work, quiet=quiet)
+    config = BatchConfig(model, model_path, settings.config, settings.stages, not settings.again, first)
     executor = settings.execution.executor(len(work), quiet=quiet)
+    sink = StoreSink(folder) if stored else FolderSink(folder)
     with (
         progress(len(work), "fitting", "scan", quiet=quiet) as bar,
-        telling_of_compiling(quiet=quiet or executor is not None),
+        telling_of_compiling(quiet=quiet or not isinstance(executor, Serial)),
     ):
         watch = _Watch(bar, say)
-        if stored:
-            found = fit_into_store(
-                work, model, model_path, folder, settings.config, executor=executor, again=settings.again,
-                stages=settings.stages, first=first, on_plan=watch.plan, on_done=watch.done,
-            )  # fmt: skip
+        counts = fit_many(work, config, executor, sink, on_plan=watch.plan, on_done=watch.done, on_state=watch.state)
+        if len(work) > 1 or stored:
             watch.say_removed()
-            return counts | found, {}
-        records = fit_files(
-            work, model, model_path, folder, settings.config, executor=executor, resume=not settings.again,
-            stages=settings.stages, first=first, on_plan=watch.plan, on_done=watch.done, on_state=watch.state,
-        )  # fmt: skip
-        if len(work) > 1:
-            watch.say_removed()
-    for record in records:
-        counts[record.status] += 1
-    return counts, {job.name: record for job, record in zip(work, records, strict=True)}
+    return dict.fromkeys(_STATUSES, 0) | counts, {job.name: sink.records[job.name] for job in work if sink.records}
 
 
 @dataclass(frozen=True)
@@ -160,7 +151,7 @@ class _Watch:
         self.bar.clear()
         # The reason of a failure names the file already.
         failed = record.status == "failed"
-        self.say(record.reason if failed else f"{job.called}: {record.status}: {record.reason}")
+        self.say(record.reason if failed else f"{job.label}: {record.status}: {record.reason}")
 
 
 def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:

@@ -100,8 +100,8 @@ def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
     ]
     seen: dict[str, Job] = {}
     for job in named:
-        if seen.setdefault(job.name.casefold(), job).called != job.called:
-            raise InputError(f"{seen[job.name.casefold()].called} and {job.called} would both be {job.name}; give ids.")
+        if seen.setdefault(job.name.casefold(), job).label != job.label:
+            raise InputError(f"{seen[job.name.casefold()].label} and {job.label} would both be {job.name}; give ids.")
     return named
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import naming
 from shapespace.batch.progress import progress, steps, waiting
-from shapespace.batch.quality_work import QualityElsewhere
+from shapespace.batch.quality_work import QualityRunner
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
@@ -93,7 +93,7 @@ def quality(
     notes: list[str] = []
     found = _targets(targets, options, notes, quiet=quiet)
     make_folder(output)
-    run = QualityElsewhere(execution, output, quiet)
+    run = QualityRunner(execution, output, quiet)
     measured = [_measure(target, options, run, quiet=quiet) for target in found]
     parts = [_as_quality(t, m, options) for t, m in zip(found, measured, strict=True)]
     notes += [_missing(t, m) for t, m in zip(found, measured, strict=True) if m.missing_share or m.left_out_vertices]

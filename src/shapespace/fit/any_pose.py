@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,6 +19,7 @@ from shapespace.fit.rigid_search import NearGrid, edge_of, rigid_search
 from shapespace.fit.shape_search import ShapePoints, shape_search
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.surface import rms_size, vertex_normals
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
@@ -138,7 +138,7 @@ def _score(pose: Pose) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _ModelSide:
-    """What the search needs of a model; kept while the model lives."""
+    """Precomputed data of a model for the search."""
 
     size: float
     spacing: float
@@ -149,6 +149,7 @@ class _ModelSide:
     axes: FloatArray
 
     @staticmethod
+    @cached_with_owner()
     def of(model: ShapeModel) -> _ModelSide:
         mean = np.array(model.mean_vertices)
         size = rms_size(mean)
@@ -182,9 +183,6 @@ class _ModelSide:
         return next(iter(self.shapes.values())).points
 
 
-_MODEL_SIDES: WeakKeyDictionary[ShapeModel, _ModelSide] = WeakKeyDictionary()
-
-
 @dataclass(frozen=True, eq=False)
 class _Sides:
     """A model and a scan to be brought together."""
@@ -197,9 +195,7 @@ class _Sides:
 
     @staticmethod
     def of(model: ShapeModel, scan_mm: FloatArray, with_scale: bool, seed: int) -> _Sides:
-        side = _MODEL_SIDES.get(model)
-        if side is None:
-            side = _MODEL_SIDES[model] = _ModelSide.of(model)
+        side = _ModelSide.of(model)
         scan_mm = np.array(scan_mm)
         cell = _SCAN_CELL * side.size
         scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_evenly(scan_mm, cell, side.size))])

@@ -9,12 +9,11 @@ of `any_pose` comes first; only where the reflected scan fits about as well, or 
 from __future__ import annotations
 
 import math
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.fit.robust import robust_icp
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import RobustSettings
@@ -23,6 +22,7 @@ from shapespace.fit.state import Fitted, last_of
 from shapespace.geometry.closest import build_engine
 from shapespace.geometry.mirror import find_mirror
 from shapespace.geometry.surface import rms_size
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -38,9 +38,8 @@ _PATCHES = 100.0
 _CAP, _POINTS, _VERTICES = 0.05, 2_000, 1_000
 """Cap of the distances as a share of the size, and number of points of the scan and vertices of the model."""
 
-_asymmetric: WeakKeyDictionary[ShapeModel, bool] = WeakKeyDictionary()
 
-
+@cached_with_owner()
 def is_asymmetric(model: ShapeModel) -> bool:
     """Return whether the mean is so far from its own mirror image that the modes do not absorb a reflection.
 
@@ -48,11 +47,8 @@ def is_asymmetric(model: ShapeModel) -> bool:
     """
     if model.faces is None:
         return False
-    if model not in _asymmetric:
-        spread = math.sqrt(float((model.stddev**2).sum()) / model.n_vertices) / rms_size(model.mean_vertices)
-        off = find_mirror(model.mesh()).off_share
-        _asymmetric[model] = off > max(_LEAST_ASYMMETRY, _LEAST_OF_SPREAD * spread)
-    return _asymmetric[model]
+    spread = math.sqrt(float((model.stddev**2).sum()) / model.n_vertices) / rms_size(model.mean_vertices)
+    return find_mirror(model.mesh()).off_share > max(_LEAST_ASYMMETRY, _LEAST_OF_SPREAD * spread)
 
 
 def mirrored_log_odds(
@@ -121,5 +117,5 @@ def _cost(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> float:
         target.engine.query(vertices).distance,
     )
     rms = sum(float(np.sqrt((np.minimum(way, cap) ** 2).mean())) for way in ways) / scale
-    prior_cost = float((fitted.b**2 / new_shapes(model)[: len(fitted.b)]).sum())
+    prior_cost = float((fitted.b**2 / variance_of_new_shapes(model)[: len(fitted.b)]).sum())
     return _PATCHES * math.log(max(rms, 1e-12)) + 0.5 * prior_cost

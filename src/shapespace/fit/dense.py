@@ -14,7 +14,6 @@ normals takes up the details. Where nothing is seen both fade, and the surface s
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +28,7 @@ from shapespace.fit.settings import DenseSettings
 from shapespace.fit.weights import spread
 from shapespace.geometry.laplacian import half_cotangents, owned_areas
 from shapespace.geometry.surface import face_vectors, rms_size
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -227,15 +227,10 @@ class _Laplacian:
     area: FloatArray
 
 
-_LAPLACIANS: weakref.WeakKeyDictionary[ShapeModel, _Laplacian] = weakref.WeakKeyDictionary()
-
-
 def _field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
     """Return the field with that standard deviation and range on the mean of `model`."""
     t = prepare(model).topology
-    if model not in _LAPLACIANS:
-        _LAPLACIANS[model] = _laplacian(model.mean_vertices, t)
-    laplacian = _LAPLACIANS[model]
+    laplacian = _mean_laplacian(model)
     kappa = np.sqrt(8.0) / range_mm
     tau = 1.0 / (np.sqrt(4.0 * np.pi) * kappa * amplitude_mm)
     off = tau * laplacian.off_diagonal
@@ -244,6 +239,11 @@ def _field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
     rows = np.repeat(np.arange(len(diagonal)), np.diff(t.ring_start))
     stiffness = diagonal**2 * inverse + np.bincount(rows, off**2 * inverse[t.ring], len(diagonal))
     return Field(t, off, diagonal, inverse, stiffness)
+
+
+@cached_with_owner()
+def _mean_laplacian(model: ShapeModel) -> _Laplacian:
+    return _laplacian(model.mean_vertices, prepare(model).topology)
 
 
 def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:

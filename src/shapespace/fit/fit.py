@@ -200,7 +200,16 @@ def fit_scan(
                 replace(limits, modes=None, part=True),
                 None if on_state is None else held.telling(on_state),
             )
-        driven = _drive(own, placed, config, limits, on_state)
+        recorder = _Recorder(placed, on_state)
+        states = config.fitting.states(own, placed.target, placed.start, limits)
+        try:
+            while True:
+                recorder.add(next(states))
+        except StopIteration as end:
+            driven = recorder.driven(end.value)
+        except InputError as error:
+            advice = "give landmarks (--landmarks), or crop the scan (--crop)"
+            raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
         clock.append(time.perf_counter())
         stages = _measure(own, placed, driven, config)
         clock.append(time.perf_counter())
@@ -295,6 +304,38 @@ class _Driven:
     fitted: Fitted
 
 
+class _Recorder:
+    """Collects the states of a method."""
+
+    def __init__(self, placed: _Placed, on_state: OnState | None) -> None:
+        self._placed, self._on_state = placed, on_state
+        self._history: list[IcpState] = []
+        self._ended: dict[int, IcpState] = {}
+        self._phase_2_from = time.perf_counter()
+
+    def add(self, state: IcpState) -> None:
+        """Append a state.
+
+        Raises:
+            FitError: the model has shrunk to a point.
+        """
+        if state.phase == 2 and 2 not in self._ended:
+            self._phase_2_from = time.perf_counter()
+        self._history.append(state)
+        self._ended[state.phase] = state
+        if self._on_state is not None:
+            self._on_state(state)
+        if state.T_scan_model.scale < _VANISHED * self._placed.start.T_scan_model.scale:
+            raise FitError(
+                f"{self._placed.scan.name}: the model shrank to a point, as the plain method does when a large part of "
+                "the scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
+            )
+
+    def driven(self, fitted: Fitted) -> _Driven:
+        """Return the states together with the end of the fit."""
+        return _Driven(self._history, self._ended, self._phase_2_from, fitted)
+
+
 def _place(
     whole: ShapeModel,
     model: ShapeModel,
@@ -325,38 +366,6 @@ def _place(
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
     said += [*scan.notes, *(f"{finding.what} {finding.action}".strip() for finding in findings)]
     return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, said)
-
-
-def _drive(model: ShapeModel, placed: _Placed, config: FitConfig, limits: Limits, on_state: OnState | None) -> _Driven:
-    """Run the method to its end.
-
-    Raises:
-        FitError: it diverged, or shrank to a point.
-    """
-    history: list[IcpState] = []
-    ended: dict[int, IcpState] = {}
-    phase_2_from, name = time.perf_counter(), placed.scan.name
-    states = config.fitting.states(model, placed.target, placed.start, limits)
-    try:
-        while True:
-            state = next(states)
-            if state.phase == 2 and 2 not in ended:
-                phase_2_from = time.perf_counter()
-            history.append(state)
-            ended[state.phase] = state
-            if on_state is not None:
-                on_state(state)
-            if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
-                raise FitError(
-                    f"{name}: the model shrank to a point, as the plain method does when a large part of the "
-                    "scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
-                )
-    except StopIteration as end:
-        return _Driven(history, ended, phase_2_from, end.value)
-    except InputError as error:
-        raise FitError(
-            f"{name}: the fit diverged ({error}); give landmarks (--landmarks), or crop the scan (--crop)."
-        ) from error
 
 
 def _measure(

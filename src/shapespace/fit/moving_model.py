@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from shapespace.fit.kernels import Float32Array, less_sag, meet_into, normals_in
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.similarity import small_poses
 from shapespace.geometry.surface import boundary_vertices
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
@@ -83,26 +83,20 @@ class PreparedModel:
     pose_in_span: FloatArray
 
 
-_PREPARED: weakref.WeakKeyDictionary[ShapeModel, PreparedModel] = weakref.WeakKeyDictionary()
-
-
+@cached_with_owner()
 def prepare(model: ShapeModel) -> PreparedModel:
-    """Return `model` ready for the robust fit; it is prepared once and then kept as long as the model lives.
+    """Return `model` with precomputed data for the robust fit, computed once for each model.
 
     Raises:
         InputError: it has no triangles, so it has no normals.
     """
-    if model not in _PREPARED:
-        if model.faces is None:
-            raise InputError(
-                "The robust method needs a model with triangles; this one has none, so use --method paper."
-            )
-        modes = np.ascontiguousarray(model.vertex_basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
-        pose = small_poses(model.mean_vertices)
-        topology = Topology.of(model.mesh())
-        tree = KdTree(model.mean_vertices[topology.used])
-        _PREPARED[model] = PreparedModel(model, topology, tree, modes, pose, model.vertex_basis.T @ pose)
-    return _PREPARED[model]
+    if model.faces is None:
+        raise InputError("The robust method needs a model with triangles; this one has none, so use --method paper.")
+    modes = np.ascontiguousarray(model.vertex_basis.reshape(model.n_vertices, 3, -1), dtype=np.float32)
+    pose = small_poses(model.mean_vertices)
+    topology = Topology.of(model.mesh())
+    tree = KdTree(model.mean_vertices[topology.used])
+    return PreparedModel(model, topology, tree, modes, pose, model.vertex_basis.T @ pose)
 
 
 @dataclass(frozen=True, eq=False)

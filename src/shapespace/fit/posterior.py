@@ -10,7 +10,6 @@ Equation numbers are those of docs/robust.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -21,6 +20,7 @@ from shapespace.fit.matching import Weights
 from shapespace.fit.moving_model import ModelSurface
 from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.geometry.surface import rms_size
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, SurfaceLandmarks
@@ -30,7 +30,6 @@ _NOISE_TEMPERATURE = 1.7
 _PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
 
-_new_shapes: WeakKeyDictionary[ShapeModel, FloatArray] = WeakKeyDictionary()
 """Of each model in use: it takes longer to find than the rest of the posterior."""
 
 
@@ -87,7 +86,7 @@ def posterior(
         allowed_share: of the vertices whose match is no border and faces as the model does.
     """
     K, n = model.n_modes, POSE + len(prior.stddev)
-    variance = np.concatenate([new_shapes(model), prior.stddev[K:] ** 2])
+    variance = np.concatenate([variance_of_new_shapes(model), prior.stddev[K:] ** 2])
     H = equations.H / sigma_mm**2
     if equations.holds_scale:
         H[SCALE], H[:, SCALE] = 0.0, 0.0
@@ -127,13 +126,7 @@ def covariance_of_landmarks(known: Posterior, surface: ModelSurface, landmarks: 
     return rows @ known.covariance @ rows.transpose(0, 2, 1)
 
 
-def new_shapes(model: ShapeModel) -> FloatArray:
-    """Return `variance_of_new_shapes`, found once and kept as long as the model lives."""
-    if model not in _new_shapes:
-        _new_shapes[model] = variance_of_new_shapes(model)
-    return _new_shapes[model]
-
-
+@cached_with_owner()
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
 

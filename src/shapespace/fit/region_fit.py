@@ -58,12 +58,12 @@ class RegionFit:
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
         """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""
-        from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
+        from shapespace.fit.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
         whole, part, k = self.whole, self.part, modes
         b = part.to_b(fitted.b, whole)
         known = np.diag(fitted.b_stddev**2) if fitted.b_covariance is None else fitted.b_covariance
-        variance = new_shapes(whole) if fitted.b_covariance is not None else whole.stddev**2
+        variance = variance_of_new_shapes(whole) if fitted.b_covariance is not None else whole.stddev**2
         covariance = part.to_covariance(known, whole, variance)
         after = np.clip(covariance.diagonal(), 0.0, variance)
         vertices = fitted.T_scan_model.apply(whole.reconstruct(b))

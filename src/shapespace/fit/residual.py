@@ -9,22 +9,18 @@ own, so that b keeps its meaning.
 
 from __future__ import annotations
 
-import hashlib
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from shapespace.fit.kernels import Float32Array
 from shapespace.fit.moving_model import prepare
 from shapespace.fit.settings import ResidualSettings
-from shapespace.geometry import mirror as mirror_search
 from shapespace.geometry.mirror import find_mirror
 from shapespace.geometry.surface import rms_size
-from shapespace.io.disk_cache import keep, recall
-from shapespace.model import local_modes
+from shapespace.io import disk_cache
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.local_modes import (
     MOST_PRODUCTS,
     largest_eigenpairs,
@@ -34,8 +30,9 @@ from shapespace.model.local_modes import (
 )
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
-from shapespace.version import __version__
 
+_ALGORITHM_VERSION = 1
+"""Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
 _LEAST_VALUE = 1e-8
 _SYMMETRIC_SHARE = 0.01
 """A mean whose mirror image lies within this share of its size is taken for symmetric."""
@@ -54,30 +51,20 @@ class ResidualModes:
     stddev: FloatArray
 
 
-_MADE: weakref.WeakKeyDictionary[ShapeModel, dict[ResidualSettings, ResidualModes]] = weakref.WeakKeyDictionary()
-
-
+@cached_with_owner()
 def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    """Return the strongest modes outside the span of `model`, made once and kept as long as the model lives.
+    """Return the strongest modes outside the span of `model`, computed once for each model and settings.
 
-    Those of a model that stands in a file are kept between runs too.
+    Those of a model that was read from a file, or saved to one, are cached on disk too.
     """
-    made = _MADE.setdefault(model, {})
-    if settings not in made:
-        made[settings] = _kept(model, settings) if model.in_file else _make(model, settings)
-    return made[settings]
-
-
-def _kept(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
-    # Whatever could change the modes is in the name, and so is the recipe itself.
-    recipe = b"".join(Path(file).read_bytes() for file in (__file__, local_modes.__file__, mirror_search.__file__))
-    made_of = f"{model.content_hash} {settings} {__version__} ".encode() + recipe
-    name = f"residual-{hashlib.sha256(made_of).hexdigest()}"
-    arrays = recall(name)
+    if not model.in_file:
+        return _make(model, settings)
+    key = disk_cache.key("residual", _ALGORITHM_VERSION, model.content_hash, settings)
+    arrays = disk_cache.recall(key)
     if arrays is not None and {"modes", "stddev_mm"} <= arrays.keys():
         return ResidualModes(arrays["modes"], arrays["stddev_mm"])
     made = _make(model, settings)
-    keep(name, {"modes": made.modes, "stddev_mm": made.stddev})
+    disk_cache.keep(key, {"modes": made.modes, "stddev_mm": made.stddev})
     return made
 
 

@@ -30,7 +30,13 @@ from shapespace.fit.final_matches import FinalMatches
 from shapespace.fit.marks import LandmarkConstraint, worth
 from shapespace.fit.matching import Gathered, Matcher, Matches, MatchHint, Weights
 from shapespace.fit.moving_model import LinearShape, ModelSurface, PreparedModel, prepare
-from shapespace.fit.posterior import Posterior, covariance_of_landmarks, lack_of_new_shapes, new_shapes, posterior
+from shapespace.fit.posterior import (
+    Posterior,
+    covariance_of_landmarks,
+    lack_of_new_shapes,
+    posterior,
+    variance_of_new_shapes,
+)
 from shapespace.fit.residual import residual_modes
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.settings import Level, RobustSettings
@@ -258,8 +264,9 @@ class Problem:
         if len(iterate.b) == modes == own:
             return iterate.estimate
         return in_span(
-            self.prepared, iterate.surface.vertices, iterate.estimate, np.sqrt(new_shapes(self.prepared.model)),
-            surface_mm, modes, with_scale=not self.prior.holds_scale,
+            self.prepared, iterate.surface.vertices, iterate.estimate,
+            np.sqrt(variance_of_new_shapes(self.prepared.model)), surface_mm, modes,
+            with_scale=not self.prior.holds_scale,
         )  # fmt: skip
 
     def mismatch_mm(self, matches: Matches) -> float:
@@ -313,7 +320,14 @@ def robust_icp(
     """
     scale = start.T_scan_model.scale
     problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
-    course, tree = yield from _coarse_to_fine(problem, start, max_iterations)
+    iterate = problem.iterate(Estimate(start.T_scan_model, np.zeros(model.n_modes)))
+    matcher = problem.matcher(settings.levels[0])
+    first = problem.match(
+        matcher, iterate, matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
+    )
+    state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
+    course = Course(iterate, state, matcher, first.matches.hint)
+    course, tree = yield from _coarse_to_fine(problem, course, start, max_iterations)
     weighted = problem.match(course.matcher, course.iterate, course.hint)
     unexplained_mm2 = problem.unexplained_variance(weighted)  # R17
     least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)  # R17a
@@ -326,16 +340,11 @@ def robust_icp(
 
 
 def _coarse_to_fine(
-    problem: Problem, start: Start, max_iterations: int
+    problem: Problem, course: Course, start: Start, max_iterations: int
 ) -> Generator[IcpState, None, tuple[Course, KdTree]]:
     """Fit on all levels with the model's modes; return where that led, and a tree of the vertices for hints."""
-    prepared, levels = problem.prepared, problem.settings.levels
-    iterate = problem.iterate(Estimate(start.T_scan_model, np.zeros(prepared.model.n_modes)))
-    tree, tree_fits, matcher = prepared.tree, False, problem.matcher(levels[0])
-    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree)
-    first = problem.match(matcher, iterate, hint)
-    start_state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
-    course = Course(iterate, start_state, matcher, first.matches.hint)
+    prepared, levels, winding = problem.prepared, problem.settings.levels, course.hint.winding
+    tree, tree_fits = prepared.tree, False
     for level in levels:
         begins = level.modes != 0 and course.state.phase == 1
         if begins:
@@ -346,7 +355,7 @@ def _coarse_to_fine(
         if level.modes is None and not tree_fits:
             tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
         matcher = problem.matcher(level)
-        hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, first.matches.winding)
+        hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, winding)
         steps = problem.descent(matcher, iterate, hint, level)
         course = yield from _states(steps, replace(course, matcher=matcher, hint=hint), level, max_iterations)
         if begins and len(start.b) and course.state.iteration < max_iterations:

@@ -32,10 +32,10 @@ def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
 
 def find_contradictions(ended: Ended) -> list[Reason]:
     """Return how pose, coefficients and surface contradict each other; empty where they agree."""
-    from shapespace.fit.posterior import new_shapes  # compiled, and loads SciPy
+    from shapespace.fit.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
     model, fitted, found = ended.model, ended.fitted, list[Reason]()
-    z = np.abs(fitted.b) / np.sqrt(new_shapes(model)[: len(fitted.b)])
+    z = np.abs(fitted.b) / np.sqrt(variance_of_new_shapes(model)[: len(fitted.b)])
     worst = int(z.argmax())
     if z[worst] > _FARTHEST_Z:
         found.append(Reason(ReasonCode.MODE_IMPLAUSIBLE, {"mode": worst + 1, "z": float(z[worst])}))

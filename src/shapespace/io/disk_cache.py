@@ -1,7 +1,8 @@
-"""Arrays that a later run would otherwise make again, kept in the user's cache folder up to a bound.
+"""The cache on disk: arrays that later runs would compute again, in the user's cache folder up to a bound.
 
-Each file is written whole under a name that says what it was made of: a SHA-256 in hexadecimal, and after it the `.npz`
-that it is of. What is damaged, or cannot be read or written, counts as not there: whoever asks makes it again.
+`key` names an entry by all that it depends on. A file holds the SHA-256 of an `.npz` in hexadecimal, then the `.npz`.
+An entry that is damaged, or cannot be read or written, counts as missing: the caller computes it again. `clear` removes
+all entries, as `shapespace cache --clear` does; those in memory are in `memory_cache`.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from platformdirs import user_cache_path
 
 from shapespace.errors import FileError
 from shapespace.io.archives import arrays_in
-from shapespace.io.files import atomic_path
+from shapespace.io.files import atomic_path, remove_file
+from shapespace.version import __version__
 
 MOST_BYTES = 500_000_000
 """The files used last stay below this together."""
-_FOLDER = "kept"
+_FOLDER, _ENDING = "kept", ".kept"
 _DIGEST_BYTES = 64
 _OFF = ("no", "off", "0")
 
@@ -34,11 +36,45 @@ def cache_folder() -> Path:
     return Path(named) if named else user_cache_path("shapespace")
 
 
-def _file(name: str) -> Path | None:
+def entries_folder() -> Path | None:
+    """Return the folder of the entries, which `SHAPESPACE_KEEP` may name; None where that switches the cache off."""
     word = os.environ.get("SHAPESPACE_KEEP", "")
     if word.lower() in _OFF:
         return None
-    return (Path(word) if word else cache_folder() / _FOLDER) / f"{name}.kept"
+    return Path(word) if word else cache_folder() / _FOLDER
+
+
+def key(kind: str, version: int, *dependencies: object) -> str:
+    """Return the name of an entry.
+
+    Args:
+        kind: of the arrays, such as "residual".
+        version: of the algorithm that computes them, raised whenever its results change.
+        dependencies: all other inputs: the content hash of a model, settings. The version of shapespace is added.
+    """
+    text = "\n".join((str(version), __version__, *map(str, dependencies)))
+    return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def entries() -> list[Path]:
+    """Return the files of all entries."""
+    folder = entries_folder()
+    return [] if folder is None or not folder.is_dir() else sorted(folder.glob(f"*{_ENDING}"))
+
+
+def clear() -> None:
+    """Remove all entries.
+
+    Raises:
+        FileError: a file cannot be removed.
+    """
+    for file in entries():
+        remove_file(file)
+
+
+def _file(name: str) -> Path | None:
+    folder = entries_folder()
+    return None if folder is None else folder / f"{name}{_ENDING}"
 
 
 def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:

@@ -8,21 +8,19 @@ has a say in the fit, and what comes of it is told in the coefficients of the wh
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.geometry.surface import without_vertices
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray
 
 _FAINTEST = 1e-7
 """Share of the first standard deviation below which a mode of the part is rounding."""
-_KEPT = 4
-
-_parts: WeakKeyDictionary[ShapeModel, dict[str | tuple[int, ...], Part]] = WeakKeyDictionary()
-"""Of each model in use: the fits of a batch share one part, and what is prepared for it."""
+_MAX_PARTS = 4
+"""Largest number of parts of one model in the cache; the fits of a batch share one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +44,7 @@ class Part:
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        parts = _parts.setdefault(whole, {})
-        if region not in parts:
-            while len(parts) >= _KEPT:
-                parts.pop(next(iter(parts)))
-            parts[region] = _part(whole, region)
-        return parts[region]
+        return _part(whole, region)
 
     def to_b(self, b: FloatArray, whole: ShapeModel) -> FloatArray:
         """Return the coefficients (K,) mm of the whole that `b` (k,) mm of the part stands for."""
@@ -71,6 +64,7 @@ class Part:
         return to @ b_covariance @ to.T + stddev[:, None] * unseen * stddev
 
 
+@cached_with_owner(limit=_MAX_PARTS)
 def _part(whole: ShapeModel, region: str | tuple[int, ...]) -> Part:
     if isinstance(region, str):
         if region not in whole.regions:

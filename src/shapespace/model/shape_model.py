@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -51,7 +50,8 @@ _PROJECTION_ITERATIONS = 200
 _PROJECTION_TOLERANCE = 1e-10
 _SHARE_TOLERANCE = 1e-12
 _TOLD = 300
-_FILES: weakref.WeakKeyDictionary[ShapeModel, Path] = weakref.WeakKeyDictionary()
+_FILE = "_file"
+"""Attribute that is no field: neither copies nor states of a model have it."""
 _PLACES = "landmark_places"
 """In the state of a model: landmarks between vertices, as plain arrays."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
@@ -451,12 +451,12 @@ class ShapeModel:
     @property
     def in_file(self) -> bool:
         """Whether it was read from a file or saved to one: later runs will need what was made of it again."""
-        return self in _FILES
+        return self.file is not None
 
     @property
     def file(self) -> Path | None:
         """The file that it was read from or saved to last, in shapespace's own format; None where there is none."""
-        return _FILES.get(self)
+        return vars(self).get(_FILE)
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (P6).
@@ -557,7 +557,7 @@ class ShapeModel:
             FileError: the folder cannot be written, or the disk is full.
         """
         model_file.save(self.fields(), Path(path))
-        _FILES[self] = Path(path).absolute()
+        vars(self)[_FILE] = Path(path).absolute()
 
     @classmethod
     def load(cls, path: Path | str) -> ShapeModel:
@@ -582,7 +582,7 @@ class ShapeModel:
             raise ModelFileError(
                 f"{path} is a shapespace model whose parts do not belong together: {message}"
             ) from error
-        _FILES[model] = Path(path).absolute()
+        vars(model)[_FILE] = Path(path).absolute()
         return model
 
     @classmethod

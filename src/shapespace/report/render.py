@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.errors import InputError
 from shapespace.geometry.surface import vertex_normals
+from shapespace.io.memory_cache import cached_with_owner
 from shapespace.report.colours import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, Colour
 from shapespace.report.raster import averaged, interpolated, lit, nearest_balls, nearest_triangles, put_nearer
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
@@ -378,21 +378,18 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
 
 _CLOSING = 0.8
 _NEIGHBOURS = 10
-_clouds: WeakKeyDictionary[Mesh, tuple[float, FloatArray | None]] = WeakKeyDictionary()
 
 
+@cached_with_owner()
 def _cloud_surface(mesh: Mesh) -> tuple[float, FloatArray | None]:
     """Return the spacing of points in mm, and unit normals (V, 3) of either sign; None for too few points."""
-    if mesh not in _clouds:
-        points = mesh.vertices
-        if len(points) <= _NEIGHBOURS:
-            _clouds[mesh] = (1.0, None)
-        else:
-            away, near = cast(tuple[FloatArray, npt.NDArray[np.int64]], cKDTree(points).query(points, k=_NEIGHBOURS))
-            offset = points[near] - points[near].mean(axis=1, keepdims=True)
-            normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
-            _clouds[mesh] = (float(np.median(away[:, 4])), np.asarray(normals))
-    return _clouds[mesh]
+    points = mesh.vertices
+    if len(points) <= _NEIGHBOURS:
+        return 1.0, None
+    away, near = cast(tuple[FloatArray, npt.NDArray[np.int64]], cKDTree(points).query(points, k=_NEIGHBOURS))
+    offset = points[near] - points[near].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+    return float(np.median(away[:, 4])), np.asarray(normals)
 
 
 def point_spacing(mesh: Mesh) -> float:

@@ -17,7 +17,7 @@ from scipy.stats import f as f_distribution
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import named
 from shapespace.errors import CorrespondenceError, InputError
-from shapespace.fit.posterior import new_shapes
+from shapespace.fit.posterior import variance_of_new_shapes
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.geometry.surface import vertex_normals
 from shapespace.reprs import listed_briefly
@@ -440,7 +440,7 @@ class _Seen:
         if np.abs((into**2).sum(axis=1) - (rows**2).sum(axis=1)).max() > 1e-6:
             return None
         scale = centroid_size(cohort.reference) / centroid_size(fitted.model.mean_vertices)
-        prior = np.maximum(new_shapes(fitted.model)[:modes], (fitted.b_stddev**2).max(axis=0))
+        prior = np.maximum(variance_of_new_shapes(fitted.model)[:modes], (fitted.b_stddev**2).max(axis=0))
         told = np.clip(1 - fitted.b_stddev**2 / prior, _LEAST_TOLD, 1.0)
         return _Seen(fitted.b, told, fitted.b_stddev**2, prior, into * scale)
 

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from shapespace.batch.execution import ExecutionConfig
 from shapespace.batch.fit_work import Job
 from shapespace.batch.progress import progress
-from shapespace.batch.run import fit_files, make_jobs
+from shapespace.batch.run import BatchConfig, fit_many, make_jobs
+from shapespace.batch.sinks import FolderSink
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
 from shapespace.errors import InputError
-from shapespace.fit.fit import FitConfig
 from shapespace.io.files import make_folder, write_text
 from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
@@ -79,10 +79,9 @@ def run_own_study(
             bar.update()
 
         jobs = make_jobs([entry.path for entry in labelled.scans])
-        records = fit_files(
-            jobs, model, model_file, make_folder(folder / "fits"), FitConfig(),
-            executor=execution.executor(len(jobs), quiet=quiet), resume=True, on_done=fitted,
-        )  # fmt: skip
+        sink, executor = FolderSink(folder / "fits"), execution.executor(len(jobs), quiet=quiet)
+        fit_many(jobs, BatchConfig(model, model_file, reuse=True), executor, sink, on_done=fitted)
+    records = [sink.records[job.name] for job in jobs]
     fits = OwnFits.of(labelled.scans, records, model, additive)
     settings = {"model": model_file.name, "folds": fits.most_folds(folds), "seed": seed}
     content = _document(fits, labelled.summary(), settings)

@@ -1,4 +1,4 @@
-"""What is said once by a command of several processes: that code is being compiled."""
+"""Messages that the processes of a command print only once together: that code is being compiled."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import shutil
 import tempfile
 from pathlib import Path
 
-SAID = "SHAPESPACE_SAID"
-"""Set for the server of the workers alone: a folder that whoever says it first makes."""
+MARK = "SHAPESPACE_MESSAGE_MARK"
+"""Environment variable of the server of the workers alone: a folder that the first process to print creates."""
 
 
 class _Mark:
-    path: str = os.environ.get(SAID, "")
+    path: str = os.environ.get(MARK, "")
 
 
-def shared() -> str:
+def share_mark() -> str:
     """Return the mark that this process shares with the server that it starts."""
     if not _Mark.path:
         folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        _Mark.path = str(folder / "said")
+        _Mark.path = str(folder / "printed")
     return _Mark.path
 
 
-def alone() -> str:
-    """Let this process say what it says whatever others say; return that it has no mark."""
+def remove_mark() -> str:
+    """Let this process print whatever others print; return that it has no mark."""
     _Mark.path = ""
     return ""
 
 
-def is_first_to_say() -> bool:
-    """Return whether neither this process nor one that it shares a mark with has said it."""
+def is_first() -> bool:
+    """Return whether this process is the first to print, of those that share its mark; the next call returns False."""
     if not _Mark.path:
         return True
     try:

@@ -1,4 +1,4 @@
-"""That code is compiled is said once by a command, whichever of its processes meets it first."""
+"""That code is compiled is printed once by a command, whichever of its processes compiles first."""
 
 import os
 import subprocess
@@ -7,32 +7,32 @@ from pathlib import Path
 
 import pytest
 
-from shapespace.batch import said
+from shapespace.batch import messages
 from shapespace.batch.warm import COMPILING, tell_compiling
 
 
-def told_by_another(mark: Path) -> str:
+def printed_by_another(mark: Path) -> str:
     code = "from shapespace.batch.warm import tell_compiling; tell_compiling(); tell_compiling()"
-    env = {**os.environ, said.SAID: str(mark)}
+    env = {**os.environ, messages.MARK: str(mark)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=env, check=True)
     return done.stderr
 
 
 @pytest.mark.parametrize("first", ["server", "command"])
-def test_the_command_and_its_server_say_it_once(
+def test_the_command_and_its_server_print_it_once(
     first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mark = tmp_path / "said"
-    monkeypatch.setattr(said._Mark, "path", str(mark))
-    other = told_by_another(mark) if first == "server" else ""
+    mark = tmp_path / "printed"
+    monkeypatch.setattr(messages._Mark, "path", str(mark))
+    other = printed_by_another(mark) if first == "server" else ""
     tell_compiling()
-    other += told_by_another(mark) if first == "command" else ""
+    other += printed_by_another(mark) if first == "command" else ""
     assert (other + capsys.readouterr().err).count(COMPILING) == 1
 
 
-def test_without_a_server_it_is_always_said(
+def test_without_a_server_it_is_always_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(said._Mark, "path", "")
+    monkeypatch.setattr(messages._Mark, "path", "")
     tell_compiling()
     assert capsys.readouterr().err == COMPILING + "\n"

@@ -1,0 +1,222 @@
+"""Where the results of a batch of fits go: single files in a folder, or a store.
+
+A sink finds the results of earlier runs that are still valid, takes each record as it comes, and leaves a complete
+folder however the run ends. `fit_many` holds the lock of the folder while the sink is in use.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+from msgspec import structs
+
+from shapespace.batch.fit_work import FitTask, Job, has_surface, is_same_scan, resumed
+from shapespace.batch.folder import RECORD, CoefficientTable
+from shapespace.batch.results import fit_identity, write_record
+from shapespace.batch.store import Store
+from shapespace.errors import FileError
+from shapespace.io.files import sha256_of_file
+from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import File, FitRecord
+from shapespace.store.results import Results
+
+STORE_FROM = 10_000
+"""Number of scans from which on a store is the default."""
+ROWS = 1000
+"""Number of fits that are moved into a store at a time."""
+_SAVE_INTERVAL_S = 5.0
+_SAVE_COST_RATIO = 20.0
+"""The next save of the table is at least this many times as far away as the last one took."""
+_SCAN = {
+    "path": "path",
+    "hash": "scan_hash",
+    "size_bytes": "scan_size_bytes",
+    "modified_ns": "scan_modified_ns",
+    "remote_version": "scan_version",
+}
+"""Fields of a record's scan -> columns of a store."""
+_COLUMNS = ("scan", "id", "status", "stages", *_SCAN.values())
+
+
+class Sink(Protocol):
+    """Takes the results of a batch of fits; used once."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder that the fits write their files to."""
+        ...
+
+    @property
+    def records(self) -> Mapping[str, FitRecord]:
+        """The records of this run by the names of the jobs, also of valid earlier results, where the sink has them."""
+        ...
+
+    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
+        """Read what is there.
+
+        Args:
+            names: of the jobs of this run.
+            model: that is fitted.
+            reuse: whether valid earlier results are reused.
+        """
+        ...
+
+    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
+        """Return the task that remains, and the record of a valid earlier result, or None."""
+        ...
+
+    def has_result(self, job: Job) -> bool:
+        """Return whether there is a surface of an earlier fit of the scan."""
+        ...
+
+    def start(self, names: Sequence[str]) -> None:
+        """Prepare for the jobs `names`, which are fitted now."""
+        ...
+
+    def add(self, name: str, record: FitRecord) -> None:
+        """Take the record of a job; its files are written."""
+        ...
+
+    def close(self) -> None:
+        """Leave the folder complete, also with results that were written and not added, after an interruption."""
+        ...
+
+
+@dataclass
+class FolderSink:
+    """Single files, and coefficients.csv with the records of all runs, those of this run last.
+
+    Args:
+        folder: of the results.
+    """
+
+    folder: Path
+    records: dict[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
+
+    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
+        """As `Sink.open`."""
+        self._reuse, self._model_hash, self._started = reuse, model.content_hash, tuple[str, ...]()
+        self._table = CoefficientTable(self.folder, names, model.n_modes)
+        self._next_save = time.monotonic() + _SAVE_INTERVAL_S
+
+    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
+        """As `Sink.find_valid`."""
+        if not self._reuse:
+            return task, None
+        remaining, record = resumed(task, self._model_hash, self.folder)
+        if record is None:
+            return remaining, None
+        try:
+            self.add(task.job.name, self._with_metadata(record, task.job))
+        except ValueError:  # damaged
+            return replace(task, resume=False), None
+        return task, self.records[task.job.name]
+
+    def has_result(self, job: Job) -> bool:
+        """As `Sink.has_result`."""
+        return has_surface(job, self.folder)
+
+    def start(self, names: Sequence[str]) -> None:
+        """As `Sink.start`."""
+        self._started = tuple(names)
+        self._table.catch_up(names)
+
+    def add(self, name: str, record: FitRecord) -> None:
+        """As `Sink.add`; the table is saved at intervals."""
+        self._table.add(name, record)
+        self.records[name] = record
+        if (now := time.monotonic()) > self._next_save:
+            self._table.save()
+            self._next_save = time.monotonic() + max(_SAVE_INTERVAL_S, _SAVE_COST_RATIO * (time.monotonic() - now))
+
+    def close(self) -> None:
+        """As `Sink.close`."""
+        self._table.catch_up([name for name in self._started if name not in self.records])
+        self._table.save()
+
+    def _with_metadata(self, record: FitRecord, job: Job) -> FitRecord:
+        if not job.metadata or record.metadata == job.metadata:
+            return record
+        record = structs.replace(record, metadata=dict(job.metadata))
+        write_record(self.folder / f"{job.name}{RECORD}", record)
+        return record
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A fit in a store: of its record id, status and scan alone."""
+
+    record: FitRecord
+    stages: bool
+
+
+@dataclass
+class StoreSink:
+    """A store, into which finished results are moved `ROWS` at a time; no records are held in memory.
+
+    Args:
+        folder: of the store.
+    """
+
+    folder: Path
+    records: Mapping[str, FitRecord] = field(default_factory=dict[str, FitRecord], init=False)
+
+    def open(self, names: Sequence[str], model: ShapeModel, *, reuse: bool) -> None:
+        """As `Sink.open`.
+
+        Raises:
+            ShapespaceError: the extra `store` is not installed.
+        """
+        self._model_hash, self._finished = model.content_hash, list[str]()
+        self._store = Store(self.folder)
+        self._store.compact()
+        self._stored = dict(self._read_stored()) if reuse else {}
+
+    def find_valid(self, task: FitTask) -> tuple[FitTask, FitRecord | None]:
+        """As `Sink.find_valid`."""
+        stored = self._stored.get(task.job.name)
+        valid = stored is not None and self._is_valid(stored, task)
+        return task, stored.record if valid and stored is not None else None
+
+    def has_result(self, job: Job) -> bool:
+        """As `Sink.has_result`."""
+        stored = self._stored.get(job.name)
+        return stored is not None and stored.record.is_fitted
+
+    def start(self, names: Sequence[str]) -> None:
+        """As `Sink.start`: free the memory of what was stored."""
+        self._stored.clear()
+
+    def add(self, name: str, record: FitRecord) -> None:
+        """As `Sink.add`."""
+        self._finished.append(name)
+        if len(self._finished) >= ROWS:
+            self._store.compact(self._finished)
+            self._finished.clear()
+
+    def close(self) -> None:
+        """As `Sink.close`."""
+        self._store.compact()
+
+    def _read_stored(self) -> Iterator[tuple[str, _Stored]]:
+        for rows in Results(self.folder).iter_rows(_COLUMNS):
+            for name, identity, status, stages, *scan in zip(*(rows[column] for column in _COLUMNS), strict=True):
+                known = {key: value for key, value in zip(_SCAN, scan, strict=True) if value is not None}
+                yield name, _Stored(FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
+
+    def _is_valid(self, stored: _Stored, task: FitTask) -> bool:
+        """Return whether a stored fit has what the task asks for, or more: a dense surface, or stages."""
+        if not stored.record.is_fitted or not stored.record.id or (task.stages and not stored.stages):
+            return False
+        config, job = task.config, task.job
+        configs = [config] if config.dense else [config, replace(config, dense=True)]
+        try:
+            marks, scan_hash = sha256_of_file(job.landmarks) if job.landmarks else "", stored.record.scan.hash
+            identities = {fit_identity(scan_hash, self._model_hash, one.as_dict(), marks) for one in configs}
+            return stored.record.id in identities and is_same_scan(stored.record.scan, job, self.folder)
+        except FileError:
+            return False  # the fit reports it
