@@ -28,16 +28,16 @@ import numpy as np
 from reliability import Femora
 
 from shapespace.batch.execution import ExecutionConfig
-from shapespace.batch.rounds import RoundRunner
-from shapespace.correspondence.result import Correspondence
-from shapespace.correspondence.rounds import correspond, run_here
+from shapespace.batch.parallel_rounds import RoundRunner
+from shapespace.correspondence.correspondence_result import Correspondence
+from shapespace.correspondence.groupwise import correspond, run_here
 from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, LANDMARK_VERTICES, load_ict
 from shapespace.datasets.simulated_scan import Cut, Hole, random_similarity, simulate_scan
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.surface import vertex_normals
-from shapespace.io.meshes import read_mesh
+from shapespace.geometry.normals import vertex_normals
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 FACE_MM = 95.0

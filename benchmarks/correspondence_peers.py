@@ -36,8 +36,8 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.meshes import read_mesh, write_mesh
-from shapespace.model.quality import Curve, ModelQuality, QualitySettings, measure_quality
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.model.model_quality import Curve, ModelQuality, QualitySettings, measure_quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 

@@ -25,7 +25,7 @@ from shapespace.batch.executors import Executor, Local
 from shapespace.batch.on_dask import OnDask
 from shapespace.batch.run import BatchConfig, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 
 
 def resident_mb() -> float:

@@ -6,7 +6,7 @@ narrow or too wide. The three splits share no shape, no model and no seed: the c
 learnt on "dev", its intervals set on "calibration", and "test" judges them.
 
     python benchmarks/reliability.py --fits 240            # of each split; goes on where it was cut short
-    python benchmarks/reliability.py --tune                # prints the constants of fit/failure_model.py
+    python benchmarks/reliability.py --tune                # prints the constants of fit/diagnostics/failure_model.py
     python benchmarks/reliability.py --report docs/images  # tables and the figure, of the split "test"
 """
 
@@ -37,9 +37,9 @@ from shapespace.datasets.faces import load_faces
 from shapespace.datasets.ict import EXPRESSIONS, load_ict
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit import failure_model
-from shapespace.fit.evidence import FitEvidence
-from shapespace.geometry.surface import face_areas, rms_size
+from shapespace.fit.diagnostics import failure_model
+from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
@@ -327,7 +327,7 @@ def failed(record: Mapping[str, Any]) -> bool:
 
 
 def tune(found: list[dict[str, Any]]) -> str:
-    """Return the constants of `shapespace.fit.failure_model`.
+    """Return the constants of `shapespace.fit.diagnostics.failure_model`.
 
     Weights: a regression of the logarithm of the error on "dev", by Huber's loss with a small ridge on standardised
     inputs and no weight below zero. Offset and interval: quantiles of what that leaves on "calibration". The

@@ -33,9 +33,9 @@ from shapespace import FitConfig, fit_scan
 from shapespace.datasets.ict import EXPRESSIONS
 from shapespace.datasets.simulated_scan import Collar, Hair, retriangulate, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.evidence import FitEvidence
-from shapespace.fit.failure_model import SCORE_TERMS
-from shapespace.geometry.surface import face_areas
+from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.fit.diagnostics.failure_model import SCORE_TERMS
+from shapespace.geometry.normals import face_areas
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 
 FITS = 500

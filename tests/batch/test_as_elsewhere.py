@@ -13,9 +13,9 @@ from shapespace.batch import workers
 from shapespace.batch.executors import Local, Serial
 from shapespace.batch.run import BatchConfig, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink
-from shapespace.io.meshes import write_mesh
-from shapespace.report.saved import Folder, find_fits
-from shapespace.report.saved import raw_scan as saved_scan
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.report.inputs.saved_fits import Folder, find_fits
+from shapespace.report.inputs.saved_fits import raw_scan as saved_scan
 from synthetic_shapes import blob_model, raw_scan
 
 SRC = Path(__file__).resolve().parents[2] / "src" / "shapespace"

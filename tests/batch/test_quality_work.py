@@ -12,7 +12,7 @@ from shapespace.batch.execution import EXECUTORS, ExecutionConfig
 from shapespace.batch.executors import Serial
 from shapespace.batch.quality_work import QualityRunner, QualityWork
 from shapespace.errors import FitError
-from shapespace.model.quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, Part, QualitySettings, Shapes, measure_quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 

@@ -10,8 +10,7 @@ import pytest
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from shapespace.batch.folder import names_for
-from shapespace.batch.results import (
+from shapespace.batch.fit_records import (
     Source,
     coefficient_row,
     failed_record,
@@ -22,10 +21,11 @@ from shapespace.batch.results import (
     write_record,
     write_stages,
 )
+from shapespace.batch.result_folder import names_for
 from shapespace.errors import FileError, FileFormatError
-from shapespace.fit.fit import FitConfig, fit_scan
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
-from shapespace.io.meshes import read_mesh
+from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.schemas import File
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity

@@ -17,10 +17,10 @@ from shapespace.batch.on_dask import OnDask
 from shapespace.batch.run import BatchConfig, Plan, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink
 from shapespace.errors import FileError
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.state import IcpState
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import atomic_path
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord
 from synthetic_shapes import blob_model, raw_scan, similarity
@@ -365,7 +365,7 @@ def test_a_folder_that_goes_away_is_one_sentence(model: ShapeModel, scans: list[
 def test_half_written_files_of_killed_runs_go(model: ShapeModel, scans: list[Path], tmp_path: Path) -> None:
     code = f"""
 import os, pathlib
-from shapespace.fit.state import IcpState
+from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import atomic_path
 with atomic_path(pathlib.Path({str(tmp_path)!r}) / "scan0.fitted.ply") as path:
     path.write_bytes(b"half")

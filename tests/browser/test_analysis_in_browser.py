@@ -8,7 +8,7 @@ from pages import DESKTOP, PHONE
 from pictures import change, drawn_share
 
 from shapespace.report.analyses.analysis_report import AnalysisReport
-from shapespace.report.html import write_report
+from shapespace.report.pages.write_html import write_report
 from shapespace.schemas import Counts as CountsOf
 from shapespace.schemas import HistogramPart, MorphPart, SurfaceMapPart
 from synthetic_shapes import blob, sphere

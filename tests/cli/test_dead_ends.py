@@ -11,7 +11,7 @@ import pytest
 import shapespace
 from conftest import Run, World
 from shapespace.cli.command_table import COMMANDS
-from shapespace.io.meshes import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 

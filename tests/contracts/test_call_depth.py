@@ -8,8 +8,8 @@ import pytest
 
 import shapespace
 from shapespace.cli import main
-from shapespace.fit.robust import Problem
-from shapespace.io.meshes import write_mesh
+from shapespace.fit.robust.robust_icp import Problem
+from shapespace.io.meshes.mesh_io import write_mesh
 from synthetic_shapes import blob_model, raw_scan
 
 MAX_FRAMES = 8

@@ -10,17 +10,17 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.first_template import first_template
+from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
-from shapespace.correspondence.landmarks import ScanLandmarks, consensus_landmarks, stray_landmarks
-from shapespace.correspondence.mirror import MirrorMap
+from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks, stray_landmarks
+from shapespace.correspondence.mirror_image import MirrorMap
 from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.rounds import correspond
 from shapespace.correspondence.settings import CorrespondSettings
 from shapespace.correspondence.template import PoseModel, choose_template
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.landmarks import place_landmarks
+from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 from synthetic_shapes import blob, sphere, training_meshes

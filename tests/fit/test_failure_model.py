@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
-from shapespace.fit.evidence import FitEvidence
-from shapespace.fit.failure_model import (
+from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.fit.diagnostics.failure_model import (
     ERROR_TERMS,
     SCORE_TERMS,
     estimate_error,
     failure_score,
     find_failure_reasons,
 )
-from shapespace.fit.fit import FitConfig, fit_scan
-from shapespace.fit.posterior import lack_of_new_shapes
-from shapespace.fit.reason_text import text_of
-from shapespace.fit.reasons import ReasonCode
+from shapespace.fit.diagnostics.reason_text import text_of
+from shapespace.fit.diagnostics.reasons import ReasonCode
+from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.result import FitResult
+from shapespace.fit.robust.posterior import lack_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, training_meshes

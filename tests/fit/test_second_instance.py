@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import simulate_scan
-from shapespace.fit.fit import fit_scan
-from shapespace.fit.reasons import ReasonCode
+from shapespace.fit.diagnostics.reasons import ReasonCode
+from shapespace.fit.fit_scan import fit_scan
 from shapespace.fit.result import FitResult
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, sphere

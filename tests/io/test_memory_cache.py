@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from shapespace.fit.moving_model import prepare
+from shapespace.fit.robust.prepared_model import prepare
 from shapespace.io import memory_cache
 from shapespace.io.memory_cache import LatestValue, cached_with_owner
 from synthetic_shapes import blob_model

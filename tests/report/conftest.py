@@ -13,9 +13,9 @@ from report_page import edit
 from shapespace.batch.executors import Serial
 from shapespace.batch.run import BatchConfig, fit_many, make_jobs
 from shapespace.batch.sinks import FolderSink
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import write_mesh
-from shapespace.io.tables import write_rows
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.io.tables.table_io import write_rows
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan, training_meshes
 

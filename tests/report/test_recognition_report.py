@@ -15,7 +15,7 @@ from report_page import Page
 
 from shapespace.errors import FileFormatError, InputError
 from shapespace.report import figures
-from shapespace.report.html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
 
 EVIL = "</script><script>alert(1)</script>"
 CLASSES = ["anger", "smile", EVIL]

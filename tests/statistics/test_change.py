@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
+from shapespace.geometry.normals import face_vectors, vertex_areas, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.geometry.surface import face_vectors, vertex_areas, vertex_normals
-from shapespace.report.analyses.results import analysis_report
+from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
 from shapespace.statistics.change import ChangeResult, change
 from shapespace.statistics.change_align import align_by, align_robustly

@@ -13,10 +13,10 @@ import pytest
 from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
-from shapespace.geometry.surface import vertex_normals
+from shapespace.geometry.normals import vertex_normals
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.analyses.compare import compare_warnings
-from shapespace.report.analyses.results import analysis_report
+from shapespace.report.analyses.compare_report import compare_warnings
+from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.schemas import PARTS, Analysis, TextPart, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare import CompareConfig, SquaresType, compare

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.report.analyses.results import analysis_report
+from shapespace.report.analyses.result_tables import analysis_report
 from shapespace.report.analyses.shape_data import shape_notes, shape_settings
 from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.change import change

@@ -14,8 +14,8 @@ from shapespace.cohort.cohort import Cohort, Fitted
 from shapespace.cohort.table import Table, numbers_as_text
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.analyses.methods import scheme_text
-from shapespace.report.analyses.regression import prediction_report, regression_report
+from shapespace.report.analyses.methods_section import scheme_text
+from shapespace.report.analyses.regression_report import prediction_report, regression_report
 from shapespace.schemas import read_part
 from shapespace.statistics.linear_regressors import Regularisation, TrainingDecomposition, folds_of
 from shapespace.statistics.predictor import Predictor, cv_plus, refuse_known

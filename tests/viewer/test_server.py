@@ -28,14 +28,14 @@ from viewer_world import (
 
 from shapespace.batch.fit_work import Job, fit_file
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.fit.fit import FitConfig
-from shapespace.io.meshes import read_mesh
-from shapespace.io.ply import read_ply
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.ply import read_ply
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import Upload, fit_upload
 from shapespace.viewer.model_view import ModelView, without_folders
-from shapespace.viewer.scans import Limits
 from shapespace.viewer.serve import listen, page_address, serve
+from shapespace.viewer.uploaded_scans import Limits
 
 __all__ = ["model", "scan_file", "start"]
 
@@ -157,7 +157,7 @@ def test_a_body_larger_than_announced_or_without_a_size_is_bounded(start: Start)
 
 
 def test_the_queue_is_bounded_and_a_fit_can_be_stopped(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.viewer.scans.cores", lambda: 1)
+    monkeypatch.setattr("shapespace.viewer.uploaded_scans.cores", lambda: 1)
     viewer = start(worker=waits, unfinished=2)
     user = viewer.user()
     first, second = (upload(user, b"x").json()["id"] for _ in range(2))
@@ -176,7 +176,7 @@ def test_the_queue_is_bounded_and_a_fit_can_be_stopped(start: Start, monkeypatch
 def test_the_oldest_fitted_scan_is_removed_and_a_waiting_one_at_once(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shapespace.viewer.scans.cores", lambda: 1)
+    monkeypatch.setattr("shapespace.viewer.uploaded_scans.cores", lambda: 1)
     viewer = start(worker=agrees, kept=2)
     user = viewer.user()
     keys = []

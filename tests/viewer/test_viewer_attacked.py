@@ -14,7 +14,7 @@ from viewer_world import Start, agrees, model, sentence, start, until, upload
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer import serve as serve_module
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.scans import Limits, Scans
+from shapespace.viewer.uploaded_scans import Limits, Scans
 
 __all__ = ["model", "start"]
 

@@ -20,13 +20,13 @@ from hypothesis import strategies as st
 from viewer_world import VERTICES, enter, served
 
 from same_blobs import write_same
-from shapespace.viewer import scans as scans_module
+from shapespace.viewer import uploaded_scans as scans_module
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.scans import Limits, Scans
 from shapespace.viewer.server import make_app
-from shapespace.viewer.surfaces import Surfaces
 from shapespace.viewer.surfaces_server import make_surfaces_app
+from shapespace.viewer.uploaded_scans import Limits, Scans
 from synthetic_shapes import blob_model
 
 BY_HAND = int(os.environ.get("SHAPESPACE_FUZZ", "0"))

@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 
 from shapespace.batch.workers import start_loading
-from shapespace.io.meshes import write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import Upload, Worker, fit_upload
 from shapespace.viewer.guard import Access
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.scans import Limits, Scans
 from shapespace.viewer.serve import make_server
 from shapespace.viewer.server import make_app
+from shapespace.viewer.uploaded_scans import Limits, Scans
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 VERTICES = 400

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_work import FitTask, FitWork, Job
-from shapespace.batch.folder import names_for
 from shapespace.batch.lock import only_writer
+from shapespace.batch.result_folder import names_for
 from shapespace.batch.sinks import FolderSink, Sink
-from shapespace.fit.fit import FitConfig
-from shapespace.fit.state import IcpState
+from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import IcpState
 from shapespace.io.files import make_folder
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import FitRecord

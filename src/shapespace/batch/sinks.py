@@ -14,9 +14,9 @@ from typing import Protocol
 
 from msgspec import structs
 
+from shapespace.batch.fit_records import fit_identity, write_record
 from shapespace.batch.fit_work import FitTask, Job, has_surface, is_same_scan, resumed
-from shapespace.batch.folder import RECORD, CoefficientTable
-from shapespace.batch.results import fit_identity, write_record
+from shapespace.batch.result_folder import RECORD, CoefficientTable
 from shapespace.batch.store import Store
 from shapespace.errors import FileError
 from shapespace.io.files import sha256_of_file

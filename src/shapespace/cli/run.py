@@ -248,7 +248,7 @@ def build(arguments: argparse.Namespace) -> int:
 def quality(arguments: argparse.Namespace) -> int:
     """How good a shape space is."""
     from shapespace.commands.quality import QualityOptions, quality
-    from shapespace.model.quality import QualitySettings
+    from shapespace.model.model_quality import QualitySettings
     from shapespace.schemas import to_json
 
     settings = QualitySettings(**given(arguments, QualitySettings))
@@ -318,8 +318,8 @@ def fit(arguments: argparse.Namespace) -> int:
         # While this process loads its own code; half of the time that many scans take to start.
         start_loading(tell=not arguments.quiet)
     from shapespace.commands.fit import BatchSettings, fit_scans
-    from shapespace.fit.fit import FitConfig
-    from shapespace.fit.methods import method_named
+    from shapespace.fit.fit_scan import FitConfig
+    from shapespace.fit.method_choices import method_named
 
     search = {} if arguments.search == "auto" else {"search": arguments.search}
     method = method_named(arguments.method, **search)
@@ -350,7 +350,7 @@ def fit(arguments: argparse.Namespace) -> int:
 def _region(region: str | None) -> str | tuple[int, ...] | None:
     if region is None or not Path(region).is_file():
         return region
-    from shapespace.io.regions import read_region
+    from shapespace.io.meshes.region_files import read_region
 
     return read_region(region)
 
@@ -557,7 +557,7 @@ def _print_correspondence(summary: CorrespondenceRecord, records: Sequence[Corre
 
 
 def _print_fit(name: str, record: FitRecord) -> None:
-    from shapespace.io.meshes import stem_of
+    from shapespace.io.meshes.mesh_io import stem_of
 
     file = record.scan.name
     # A scan that shares its file's name with others goes by the name of its results.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.correspondence.landmarks import contradicts_most, without_stray_landmarks
-from shapespace.correspondence.scans import copies
+from shapespace.correspondence.landmark_guide import contradicts_most, without_stray_landmarks
+from shapespace.correspondence.scan_set import copies
 from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondSettings
 from shapespace.correspondence.template import check_template, choose_template, clean_scan, resample
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import repair
-from shapespace.geometry.surface import rms_size
+from shapespace.geometry.normals import rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.colours import carried_colours
-from shapespace.fit.evidence import FitEvidence
-from shapespace.fit.odd_scans import Chirality, chirality_of
-from shapespace.fit.reason_text import sentence_of
-from shapespace.fit.reasons import Reason
-from shapespace.fit.regions import MATCHED, SHOWN
-from shapespace.fit.state import IcpState
+from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.fit.diagnostics.odd_scans import Chirality, chirality_of
+from shapespace.fit.diagnostics.reason_text import sentence_of
+from shapespace.fit.diagnostics.reasons import Reason
+from shapespace.fit.fit_colours import carried_colours
+from shapespace.fit.iteration_state import IcpState
+from shapespace.fit.vertex_regions import MATCHED, SHOWN
 from shapespace.geometry.closest import ClosestPoints
 from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
 from shapespace.lazy import OpenViewer, lazy_import

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.surface import without_vertices
+from shapespace.geometry.normals import without_vertices
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray

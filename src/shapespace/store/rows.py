@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.io.tables import CHECKSUM
+from shapespace.io.tables.table_io import CHECKSUM
 from shapespace.schemas import Distances, FitRecord, Pose
 
 _DIRECTIONS = ("model_to_scan", "scan_to_model")

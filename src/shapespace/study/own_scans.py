@@ -25,7 +25,7 @@ from shapespace.model.additive import AdditiveModel, load_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise import evaluate
 from shapespace.recognise.classifiers import CLASSIFIERS
-from shapespace.report.html import require_report_extra, write_report
+from shapespace.report.pages.write_html import require_report_extra, write_report
 from shapespace.schemas import FitRecord, Part, TextPart
 from shapespace.study import parts
 from shapespace.types import BoolArray, FloatArray

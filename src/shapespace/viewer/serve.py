@@ -76,12 +76,12 @@ def serve(
     if not has_surfaces:
         # While this process imports its own code.
         start_loading(tell=not quiet)
+    from shapespace.viewer.corresponding_surfaces import Surfaces
     from shapespace.viewer.guard import LOOPBACK, Access
     from shapespace.viewer.model_view import ModelView
-    from shapespace.viewer.scans import FOLDER_PREFIX, Limits, Scans
     from shapespace.viewer.server import make_app
-    from shapespace.viewer.surfaces import Surfaces
     from shapespace.viewer.surfaces_server import make_surfaces_app
+    from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
     access, loopback = Access(), host in LOOPBACK
     with _stopped_by_signals(), ExitStack() as stack:

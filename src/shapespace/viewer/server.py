@@ -22,16 +22,16 @@ from starlette.types import ASGIApp
 
 from shapespace.errors import FileError
 from shapespace.io.files import read_bytes
-from shapespace.io.landmarks import write_landmarks
-from shapespace.io.meshes import MESH_ENDINGS, read_mesh, write_mesh
-from shapespace.report import colours
+from shapespace.io.landmarks.landmark_io import write_landmarks
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, read_mesh, write_mesh
+from shapespace.report.render import palette as colours
 from shapespace.types import Mesh
 from shapespace.version import __version__
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW
 from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.model_view import ModelView, shape_of
 from shapespace.viewer.responses import PAGES, application, asset, binary, json_response
-from shapespace.viewer.scans import MIN_LANDMARKS, Scans, UploadedScan
+from shapespace.viewer.uploaded_scans import MIN_LANDMARKS, Scans, UploadedScan
 
 EXPORTS = ("ply", "obj", "stl")
 _MAX_NAME = 120

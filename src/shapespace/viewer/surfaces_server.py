@@ -8,9 +8,9 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.responses import PAGES, application, asset, binary, json_response
-from shapespace.viewer.surfaces import Surfaces
 
 _MAX_QUERY = 2000
 

@@ -12,7 +12,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.batch.progress import steps
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.errors import InputError
-    from shapespace.report.analyses.asymmetry import asymmetry_report
+    from shapespace.report.analyses.asymmetry_report import asymmetry_report
     from shapespace.statistics.asymmetry import measure_asymmetry
     from shapespace.statistics.sides import read_pairs
 

@@ -10,7 +10,7 @@ from shapespace.cli.answers.common import cohort_of, finish
 def run(arguments: argparse.Namespace) -> int:
     """Compare the shapes of a cohort."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.compare import compare_report
+    from shapespace.report.analyses.compare_report import compare_report
     from shapespace.statistics.compare import CompareConfig, compare
 
     config = CompareConfig(

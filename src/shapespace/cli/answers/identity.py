@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def run_verify(arguments: argparse.Namespace) -> int:
     """Verify whether two scans are of one subject."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.verify import verify_report
+    from shapespace.report.analyses.verify_report import verify_report
     from shapespace.statistics.identity.verify import verify
 
     cohort, config = _cohort_and_config(arguments)
@@ -28,7 +28,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 def run_identify(arguments: argparse.Namespace) -> int:
     """Identify the subject of a scan among the enrolled ones."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.identify import identify_report
+    from shapespace.report.analyses.identify_report import identify_report
     from shapespace.statistics.identity.identify import identify
 
     cohort, config = _cohort_and_config(arguments)

@@ -13,7 +13,7 @@ def run(arguments: argparse.Namespace) -> int:
     from shapespace.cohort.cohort import SUBJECT
     from shapespace.cohort.read import CohortOptions, read_cohort
     from shapespace.io.files import make_folder
-    from shapespace.report.analyses.regression import prediction_report, regression_report
+    from shapespace.report.analyses.regression_report import prediction_report, regression_report
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import regress
 

@@ -10,7 +10,7 @@ from shapespace.cli.answers.common import cohort_of, finish
 def run(arguments: argparse.Namespace) -> int:
     """Score subjects against a reference."""
     from shapespace.batch.progress import steps
-    from shapespace.report.analyses.score import score_report
+    from shapespace.report.analyses.score_report import score_report
     from shapespace.statistics.score import ScoreConfig, score
 
     config = ScoreConfig(

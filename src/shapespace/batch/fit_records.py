@@ -1,0 +1,308 @@
+"""Result files of a fit: NAME.fit.json, NAME.fitted.ply, NAME.dense.ply, NAME.stages.npz, coefficients.csv."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from shapespace.errors import FileFormatError
+from shapespace.fit.result import FitResult
+from shapespace.fit.stages import stage_arrays
+from shapespace.geometry.distance import DistanceSummary, SurfaceDistances
+from shapespace.geometry.normals import face_areas, rms_size
+from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
+from shapespace.io.meshes.ply import ply_comment, write_ply
+from shapespace.io.tables.table_io import checked_table_text
+from shapespace.model.shape_model import ShapeModel
+from shapespace.schemas import (
+    FIT_AGAIN,
+    BothWays,
+    Distances,
+    File,
+    FitRecord,
+    FoundLandmark,
+    Iteration,
+    OverlapDistances,
+    Pose,
+    ReasonRecord,
+)
+from shapespace.store.results import json_at
+from shapespace.store.rows import META, coefficient_columns
+from shapespace.store.rows import coefficient_row as coefficient_row
+from shapespace.version import __version__
+
+_LARGEST_RECORD = 2**24
+
+
+@lru_cache(maxsize=1024)
+def _resolved_folder(folder: Path) -> Path:
+    return folder.resolve()
+
+
+def _resolved(file: Path) -> Path:
+    """Return the real path of `file`; that of its folder is cached, since it takes longest."""
+    return file.resolve() if file.is_symlink() else _resolved_folder(file.parent.absolute()) / file.name
+
+
+@dataclass(frozen=True)
+class Source:
+    """An input file of a fit.
+
+    Args:
+        name: name of the file.
+        content_hash: SHA-256 of its content; the content hash of a model.
+        path: its path, relative to the folder of the results where possible; empty if unknown.
+        size_bytes: its size, which with `modified_ns` identifies it without reading it; None if unknown.
+        modified_ns: time of its last change, ns since 1970; None if unknown.
+        remote_version: version of a scan at an address; else empty.
+    """
+
+    name: str
+    content_hash: str
+    path: str = ""
+    size_bytes: int | None = None
+    modified_ns: int | None = None
+    remote_version: str = ""
+
+    @staticmethod
+    def at(file: Path, content_hash: str, folder: Path) -> Source:
+        """Return the source `file` as results in `folder` refer to it."""
+        try:
+            path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
+        except (ValueError, OSError):  # another drive, or a folder that is gone
+            path = str(file)
+        return Source(file.name, content_hash, Path(path).as_posix())
+
+    @staticmethod
+    def hashed(file: Path, folder: Path) -> Source:
+        """Return the source `file` with its hash, size and time of change.
+
+        Raises:
+            FileError: it cannot be read.
+        """
+        content_hash = sha256_of_file(file)
+        stat = file.stat()
+        source = Source.at(file, content_hash, folder)
+        return replace(source, size_bytes=stat.st_size, modified_ns=stat.st_mtime_ns)
+
+    def to_file(self) -> File:
+        """Return the source as a part of a record."""
+        return File(
+            name=self.name, hash=self.content_hash, path=self.path, size_bytes=self.size_bytes,
+            modified_ns=self.modified_ns, remote_version=self.remote_version,
+        )  # fmt: skip
+
+
+def fit_identity(
+    scan_hash: str, model_hash: str, config: Mapping[str, Any], landmarks_hash: str = "", version: str = __version__
+) -> str:
+    """Return the SHA-256 of scan, model, landmarks, settings and version of a fit, not of their names."""
+    inputs = {"scan": scan_hash, "model": model_hash, "landmarks": landmarks_hash, "config": dict(config)}
+    return hashlib.sha256(json.dumps(inputs | {"version": version}, sort_keys=True).encode()).hexdigest()
+
+
+def fit_record(
+    result: FitResult,
+    scan: Source,
+    model: Source,
+    landmarks: Source | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> FitRecord:
+    """Return the record of a fit, the content of NAME.fit.json.
+
+    Args:
+        result: the fit.
+        scan: the scan.
+        model: the model.
+        landmarks: the file of landmarks from which the fit started; None without landmarks.
+        metadata: of the scan, by the columns of a list of scans.
+    """
+    T = result.T_scan_model
+    marks = landmarks.content_hash if landmarks else ""
+    size = measure_surface(result)
+    return FitRecord(
+        id=fit_identity(scan.content_hash, model.content_hash, _settings(result), marks),
+        scan=scan.to_file(),
+        model=model.to_file(),
+        landmarks=landmarks.to_file() if landmarks else None,
+        metadata=dict(metadata or {}),
+        status=result.status,
+        reason=result.reason,
+        reasons=tuple(ReasonRecord(code=reason.code.value, data=reason.data) for reason in result.reasons),
+        shown=_overlap(result, "final"),
+        shown_scan_mm=_overlap(result, "final", result.scan_mm_per_model_mm),
+        shown_dense=_overlap(result, "dense"),
+        shown_dense_scan_mm=_overlap(result, "dense", result.scan_mm_per_model_mm),
+        method=result.method,
+        config=dict(result.config),
+        start=result.start,
+        notes=tuple(result.notes),
+        T_scan_model=Pose(scale=T.scale, rotation=T.rotation.tolist(), translation=T.translation.tolist()),
+        mm_per_scan_unit=result.mm_per_scan_unit,
+        size_mm=size.rms_mm,
+        n_vertices=size.n_vertices,
+        centroid_size_mm=size.centroid_size_mm,
+        extents_mm=size.extents_mm,
+        area_mm2=size.area_mm2,
+        b=tuple(result.b.tolist()),
+        z=tuple(result.z.tolist()),
+        b_stddev=tuple(result.b_stddev.tolist()),
+        b_stddev_calibrated=result.calibrated,
+        shrinkage=tuple(result.shrinkage.tolist()),
+        evidence={} if result.evidence is None else result.evidence.to_dict(),
+        chirality=result.chirality,
+        found_landmarks=_found_landmarks(result),
+        distances_mm={name: _both_ways(stage.distances) for name, stage in result.stages.items()},
+        history=tuple(
+            Iteration(
+                phase=state.phase, iteration=state.iteration, rms_mm=state.rms_mm, motion_mm=state.motion_mm,
+                scale=state.T_scan_model.scale,
+            )
+            for state in result.history
+        ),
+        iterations=result.iterations,
+        seconds=dict(result.seconds),
+        version=__version__,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SurfaceSize:
+    """Size of a fitted surface in mm of the scan; the fields are explained in `FitRecord`."""
+
+    rms_mm: float
+    n_vertices: int
+    centroid_size_mm: float
+    extents_mm: tuple[float, float, float]
+    area_mm2: float | None
+
+
+def measure_surface(result: FitResult) -> SurfaceSize:
+    """Return the size of the fitted surface."""
+    surface = result.surface()
+    x = (surface.vertices - surface.vertices.mean(axis=0)) * result.mm_per_scan_unit
+    axes = np.linalg.svd(x, full_matrices=False)[2]
+    rms_mm = rms_size(surface.vertices) * result.mm_per_scan_unit
+    extents_mm: list[float] = np.sort(np.ptp(x @ axes.T, axis=0))[::-1].tolist()
+    area_mm2 = None if surface.faces is None else float(face_areas(surface).sum()) * result.mm_per_scan_unit**2
+    long, wide, deep = extents_mm
+    return SurfaceSize(rms_mm, len(x), rms_mm * float(np.sqrt(len(x))), (long, wide, deep), area_mm2)
+
+
+def _found_landmarks(result: FitResult) -> dict[str, FoundLandmark]:
+    """Return the model's landmarks on the fitted surface; empty where the model has none."""
+    stddev_mm = result.landmark_stddev_mm or {}
+    return {
+        name: FoundLandmark(at=point.tolist(), stddev_mm=stddev_mm[name].tolist() if name in stddev_mm else None)
+        for name, point in result.landmarks.items()
+    }
+
+
+def _settings(result: FitResult) -> dict[str, Any]:
+    """Return the settings as in `FitConfig.as_dict`."""
+    return {key: value for key, value in result.config.items() if key not in ("version", "scale_in_effect")}
+
+
+def _distances(summary: DistanceSummary) -> Distances:
+    return Distances(**asdict(summary))
+
+
+def _both_ways(distances: SurfaceDistances) -> BothWays:
+    return BothWays(
+        model_to_scan=_distances(distances.model_to_scan), scan_to_model=_distances(distances.scan_to_model)
+    )
+
+
+def _overlap(result: FitResult, stage: str, length: float = 1.0) -> OverlapDistances | None:
+    """Return the overlap distances at a stage, all lengths times `length`; None if the fit has no such stage."""
+    if stage not in result.stages:
+        return None
+    overlap = result.overlap_distances_at(stage).in_unit(length)
+    return OverlapDistances(
+        model_to_scan=_distances(overlap.model_to_scan),
+        scan_to_model=_distances(overlap.scan_to_model),
+        model_seen_share=overlap.model_seen_share,
+        scan_covered_share=overlap.scan_covered_share,
+    )
+
+
+def failed_record(
+    scan: Source, model: Source, reason: str, config: Mapping[str, Any], metadata: Mapping[str, str] | None = None
+) -> FitRecord:
+    """Return the record of a scan that could not be fitted."""
+    return FitRecord(
+        scan=scan.to_file(),
+        model=model.to_file(),
+        metadata=dict(metadata or {}),
+        status="failed",
+        reason=reason,
+        config=dict(config),
+        version=__version__,
+    )
+
+
+def write_record(path: Path, record: FitRecord) -> None:
+    """Write a record as JSON; numbers that are not finite become null.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+        FileFormatError: the record holds values that `read_record` would refuse.
+    """
+    content = record.to_json()
+    FitRecord.from_json(content, path.name)
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def read_record(path: Path) -> FitRecord:
+    """Return the record in a NAME.fit.json, or the one of a store that such a file would hold.
+
+    Raises:
+        FileError: it cannot be read.
+        FileFormatError: it is not the record of a fit.
+    """
+    content = json_at(path, FIT_AGAIN, _LARGEST_RECORD)
+    if not isinstance(content, dict) or cast(dict[str, Any], content).get("format") != FitRecord.FORMAT:
+        raise FileFormatError(f"{path} is not the record of a fit; give a .fit.json written by shapespace fit.")
+    return FitRecord.from_json(cast(object, content), str(path))
+
+
+def write_fitted_mesh(
+    path: Path, result: FitResult, model: ShapeModel, stage: str = "final", identity: str = ""
+) -> None:
+    """Write the surface at `stage` as PLY, in the model's vertex order and the scan's own frame and unit.
+
+    Its header contains `identity`, the `id` of the record.
+    """
+    comment = f"{FitRecord.FORMAT} {identity}" if identity else ""
+    write_bytes(path, write_ply(result.surface(model, stage), comment))
+
+
+def is_surface_of(path: Path, record: FitRecord) -> bool:
+    """Return whether the fitted surface in `path` belongs to the fit of `record`."""
+    return bool(record.id) and ply_comment(path) == f"{FitRecord.FORMAT} {record.id}"
+
+
+def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
+    """Write `stage_arrays` as NAME.stages.npz."""
+    with atomic_path(path) as temporary:
+        arrays: dict[str, Any] = dict(stage_arrays(result, model))  # savez has keywords of its own type
+        np.savez_compressed(temporary, **arrays)
+
+
+def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: int) -> None:
+    """Write the coefficient table, one row a scan, in the order given.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    known = list(dict.fromkeys(column for row in rows for column in row if column.startswith(META)))
+    columns = coefficient_columns(n_modes, known)
+    write_text(path, checked_table_text(columns, ([row.get(c) for c in columns] for row in rows)))

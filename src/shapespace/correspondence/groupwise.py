@@ -1,0 +1,448 @@
+"""Raw scans to surfaces in correspondence, in rounds.
+
+    round 1    the template is registered to each scan
+    round k    the mean of round k - 1 is the template, and each registration begins at the leave-one-out prediction
+
+A scan that cannot be registered is excluded with a reason, and is tried again in the next round. What the rounds know
+is a `RegistrationState`; each step is a function of the problem and a state that returns a new state. Equations Cn are
+those of docs/correspondence.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
+from shapespace.correspondence.first_template import FirstTemplate, first_template
+from shapespace.correspondence.guide import ShapePredictor, predict_leave_one_out
+from shapespace.correspondence.harmonics import Harmonics
+from shapespace.correspondence.landmark_guide import ScanLandmarks, consensus_landmarks
+from shapespace.correspondence.mirror_image import MirrorMap
+from shapespace.correspondence.place import RegistrationTask, RoundContext, ScanRegistration
+from shapespace.correspondence.scan_set import unit_ratios
+from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondSettings
+from shapespace.correspondence.template import PoseModel
+from shapespace.errors import InputError
+from shapespace.geometry.landmark_placement import place_landmarks
+from shapespace.geometry.procrustes import align_to_weighted_mean
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.interop import as_meshes
+from shapespace.model.missing import with_estimates
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
+
+ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
+"""Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
+_PARTS = 4
+_WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
+"""Scans that observe more than this share of the template determine the usual size; the least standard deviation of
+log sizes; and that of a scan's own log size for each share that is missing."""
+_MIRRORED = 0.85
+"""A scan whose mirror image lies nearer to the template, by this ratio, is mirrored: of 60 faces, femora and spleens
+that were not mirrored none had less than 0.88."""
+
+
+class Runner(Protocol):
+    """Does the tasks of a round, here or elsewhere, and yields them as they end."""
+
+    def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterable[ScanRegistration]:
+        """Yield the registration of each of `tasks`, in any order."""
+        ...
+
+
+def run_here(context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterable[ScanRegistration]:
+    """Do one task after the other in this process."""
+    return map(context.register, tasks)
+
+
+def correspond(
+    scans: Sequence[Mesh],
+    settings: CorrespondSettings | None = None,
+    *,
+    template: Mesh | None = None,
+    model: ShapeModel | None = None,
+    first: FirstTemplate | None = None,
+    run: Runner = run_here,
+) -> Correspondence:
+    """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
+
+    Args:
+        scans: of one kind of object; landmarks that they have are soft constraints, but for those far off the scan.
+        settings: how.
+        template: the surface of the first round, used as it is; None chooses a scan and meshes it evenly.
+        model: of such objects; its mean is the template, and the first round begins at its fit to each scan.
+        first: the result of `first_template` for these scans, where it was called already.
+        run: does the tasks of a round.
+
+    Raises:
+        InputError: fewer than two scans, scans that are all equal, or too few that can be registered.
+        MeshError: no scan can be a template, or the template is none.
+    """
+    scans = list(as_meshes(scans, "correspond"))
+    settings = settings or CorrespondSettings()
+    first = first or first_template(scans, template, settings, model)
+    problem = _Problem.of([scan.name for scan in scans], first, settings)
+    state = _initial_state(problem)
+    for _ in range(settings.rounds):
+        registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
+        state = _next_state(problem, state, registrations)
+        if state.rounds[-1].moved < settings.settled:  # C17
+            break
+    return _result(problem, state)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What no round changes.
+
+    Args:
+        names: of all scans, also of those that cannot be used.
+        first: the first template, and the scans that can be used.
+        settings: of the correspondence.
+        harmonics: of the first template, used on every later one.
+        mirror: of the first template; None if the object is not symmetric.
+    """
+
+    names: Sequence[str]
+    first: FirstTemplate
+    settings: CorrespondSettings
+    harmonics: Harmonics
+    mirror: MirrorMap | None
+
+    @staticmethod
+    def of(names: Sequence[str], first: FirstTemplate, settings: CorrespondSettings) -> _Problem:
+        harmonics = Harmonics.of(first.mesh, settings.first.harmonics)
+        mirror = MirrorMap.of(first.mesh, harmonics, settings.first, settings.seed) if settings.symmetric else None
+        return _Problem(names, first, settings, harmonics, mirror)
+
+    def landmarks(self, places: SurfaceLandmarks, i: int) -> ScanLandmarks | None:
+        """Return the landmarks of scan `i` that the template has at `places`."""
+        return ScanLandmarks.shared(places, self.first.repaired[i], self.settings.landmark_uncertainty)
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """What one round cost and changed.
+
+    Args:
+        moved: RMS movement of the vertices of all scans, share of the size.
+        scan_moved: the same of each registered scan, by its number.
+        cpu_s: of each scan that was tried.
+    """
+
+    moved: float
+    scan_moved: Mapping[int, float]
+    cpu_s: Mapping[int, float]
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationState:
+    """The state between two rounds.
+
+    Args:
+        template: the mean shape, of the size `SIZE`.
+        landmarks: the landmarks that scans have, on the template.
+        registrations: of the scans that are not excluded, by their number.
+        excluded: the reason for each other scan.
+        predictions: (V, 3) where the registration of a scan begins in the next round.
+        rounds: one record for each round so far.
+    """
+
+    template: Mesh
+    landmarks: SurfaceLandmarks
+    registrations: Mapping[int, ScanRegistration]
+    excluded: Mapping[int, str]
+    predictions: Mapping[int, FloatArray]
+    rounds: tuple[RoundRecord, ...]
+
+    def shapes(self, order: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the vertices (N, V, 3) of scans in the template's frame, and (N, V) 1.0 where they are observed."""
+        shapes = np.stack([self.registrations[i].vertices for i in order])
+        return shapes, np.stack([self.registrations[i].observed for i in order]).astype(np.float64)
+
+
+def _initial_state(problem: _Problem) -> RegistrationState:
+    mesh = problem.first.mesh
+    return RegistrationState(mesh, place_landmarks(mesh, mesh.landmarks), {}, dict(problem.first.broken), {}, ())
+
+
+# What a round does
+
+
+def _context(problem: _Problem, state: RegistrationState) -> RoundContext:
+    """Return what the tasks of the next round share."""
+    order, seed = sorted(state.registrations), problem.settings.seed
+    if len(order) < ENOUGH_TO_JUDGE:
+        guide = None if state.registrations else problem.first.guide
+        pose_model = PoseModel.of(state.template) if guide is None else PoseModel(guide)
+        return RoundContext(state.template, problem.harmonics, (pose_model,), seed, guide)
+    shapes, parts = state.shapes(order)[0], np.array([_part(i) for i in order])
+    pose_models = tuple(PoseModel.of(state.template, shapes[parts != part]) for part in range(_PARTS))
+    return RoundContext(state.template, problem.harmonics, pose_models, seed)
+
+
+def _part(i: int) -> int:
+    """Return the part of the scans that scan `i` belongs to; the pose model of a part is trained without it."""
+    return i % _PARTS
+
+
+def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
+    """Return the task of scan `i` in the next round; an excluded scan is searched for in all poses."""
+    known, settings = i in state.registrations, problem.settings
+    return RegistrationTask(
+        index=i,
+        scan=problem.first.repaired[i],
+        T_scan_template=_pose_with_usual_size(state, i) if known else None,
+        expected=state.predictions.get(i) if known else None,
+        settings=settings.next if known else settings.first,
+        pose_model=_part(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
+        landmarks=problem.landmarks(state.landmarks, i),
+    )
+
+
+def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
+    """Return the pose of a scan; if the scan is partial, with its size shrunk towards that of the whole scans.
+
+    A bone without its end fits a smaller whole bone, so its own size has a variance that grows with what is missing.
+    """
+    T, observed = state.registrations[i].T_scan_template, state.registrations[i].observed
+    order = sorted(state.registrations)
+    whole = np.array([state.registrations[j].observed.mean() > _WHOLE for j in order])
+    if observed.mean() > _WHOLE or whole.sum() < _ENOUGH_TO_PREDICT:
+        return T
+    log_sizes = np.log(unit_ratios([state.registrations[j].T_scan_template.scale for j in order])[0])
+    usual = float(np.median(log_sizes[whole]))
+    spread = max(float(np.std(log_sizes[whole])), _LEAST_SPREAD)
+    own = log_sizes[order.index(i)]
+    shrinkage = 1.0 / (1.0 + (_SIZE_UNSEEN * (1.0 - observed.mean()) / spread) ** 2)
+    ratio = float(np.exp((1.0 - shrinkage) * (usual - own)))  # C16
+    centre = T.apply(state.registrations[i].vertices[observed]).mean(axis=0)
+    return Similarity(ratio, np.eye(3), (1.0 - ratio) * centre) @ T
+
+
+def _next_state(
+    problem: _Problem, previous: RegistrationState, registrations: Iterable[ScanRegistration]
+) -> RegistrationState:
+    """Return the state after a round.
+
+    Raises:
+        InputError: fewer than two scans are registered.
+    """
+    ended = sorted(registrations, key=lambda registration: registration.index)
+    state = _accept(problem, previous, ended)
+    sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
+    state = _exclude_outliers(problem, state, sure)
+    state = _resolve_alternatives(problem, state)
+    state = _exclude_outliers(problem, state, list(state.registrations))
+    if len(state.registrations) < FEWEST:
+        reasons = "; ".join(f"{problem.names[i]}: {reason}" for i, reason in list(state.excluded.items())[:3])
+        raise InputError(
+            f"Only {len(state.registrations)} of {len(problem.names)} scans could be registered: {reasons}."
+        )
+    return _update_template(problem, previous, state, {one.index: one.cpu_s for one in ended})
+
+
+# Which registrations are used
+
+
+def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[ScanRegistration]) -> RegistrationState:
+    """Return the state with the registrations of a round that are valid, and reasons for the others."""
+    registrations: dict[int, ScanRegistration] = {}
+    excluded = dict(problem.first.broken)
+    for registration in ended:
+        i = registration.index
+        if reason := _exclusion_reason(problem.settings, registration, first=i not in previous.registrations):
+            excluded[i] = reason
+        else:
+            registrations[i] = registration
+    return replace(previous, registrations=registrations, excluded=excluded)
+
+
+def _exclusion_reason(settings: CorrespondSettings, registration: ScanRegistration, *, first: bool) -> str:
+    """Return why a registration is not used; empty if it is. `first`: its pose was searched for in this round."""
+    if registration.reason:
+        return registration.reason
+    if first and not settings.symmetric and registration.mirror_ratio < _MIRRORED:
+        return (
+            f"mirrored: its mirror image lies {registration.mirror_ratio:.2f} times as far from the template as "
+            "itself; turn it over, or do such scans on their own"
+        )
+    if registration.covered < settings.fewest_covered:
+        return (
+            f"surface not reached: the template covers {100 * registration.covered:.0f} % of it; another object, or "
+            f"one with much beside it{_wrong_names(registration)}"
+        )
+    if registration.observed.mean() < settings.fewest_seen:
+        return f"half missing: it shows {100 * registration.observed.mean():.0f} % of the template"
+    return ""
+
+
+def _wrong_names(registration: ScanRegistration) -> str:
+    """Return the other explanation for a scan whose pose is that of its landmarks."""
+    return "; or its landmarks, which determine its pose, have wrong names" if registration.posed_by_landmarks else ""
+
+
+def _exclude_outliers(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
+    """Exclude the scans in `order` that are far from their leave-one-out prediction."""
+    if len(order) < ENOUGH_TO_JUDGE:
+        return state
+    settings = problem.settings
+    shapes, observed = state.shapes(order)
+    shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
+    predicted = predict_leave_one_out(shapes, observed, settings.noise_share)
+    squares = ((shapes - predicted) ** 2).sum(axis=2)
+    rms = np.sqrt((observed * squares).sum(axis=1) / np.maximum(observed.sum(axis=1), 1))  # C14
+    median = float(np.median(rms))
+    outliers = {
+        i: f"another object, or wrongly placed: {distance / median:.1f} times as far as usual from its leave-one-out "
+        f"prediction{_wrong_names(state.registrations[i])}"
+        for i, distance in zip(order, rms, strict=True)
+        if distance > settings.outlier_threshold * median  # C14
+    }
+    registrations = {i: one for i, one in state.registrations.items() if i not in outliers}
+    return replace(state, registrations=registrations, excluded={**state.excluded, **outliers})
+
+
+def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> RegistrationState:
+    """Where several poses are about as likely, use the one whose shape the scans of sure pose predict best."""
+    sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
+    if len(sure) < _ENOUGH_TO_PREDICT:
+        return state
+    shapes, observed = state.shapes(sure)
+    shapes, _ = align_to_weighted_mean(shapes, observed, state.template.vertices)
+    predictor = ShapePredictor.of(shapes, problem.settings.noise_share)
+
+    def best(registration: ScanRegistration) -> ScanRegistration:
+        if not registration.alternatives:
+            return registration
+        return min(
+            (registration, *registration.alternatives),
+            key=lambda one: predictor.distance(one.vertices, one.observed.astype(np.float64)),  # C15
+        )
+
+    return replace(state, registrations={i: best(one) for i, one in state.registrations.items()})
+
+
+# The mean of a round
+
+
+def _update_template(
+    problem: _Problem, previous: RegistrationState, state: RegistrationState, cpu_s: Mapping[int, float]
+) -> RegistrationState:
+    """Make the mean of the round the template, and predict each scan from the others."""
+    order = sorted(state.registrations)
+    shapes, images, observed, mean = _aligned_shapes(problem, state, order)
+    registrations: dict[int, ScanRegistration] = {}
+    squares: dict[int, float] = {}
+    for i, shape in zip(order, shapes, strict=True):
+        registration = state.registrations[i]
+        T = registration.T_scan_template @ fit_similarity(shape, registration.vertices)
+        registrations[i] = replace(registration, vertices=shape, T_scan_template=T)
+        known = i in previous.registrations
+        before = previous.registrations[i].vertices if known else previous.template.vertices
+        squares[i] = float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
+    predictions = state.predictions
+    if problem.settings.guided and len(order) >= _ENOUGH_TO_PREDICT:
+        predicted = predict_leave_one_out(shapes, observed, problem.settings.noise_share, images)
+        predictions = dict(zip(order, predicted, strict=True))
+    template = Mesh(mean, state.template.faces, name=state.template.name)
+    record = RoundRecord(
+        moved=float(np.sqrt(np.mean(list(squares.values())))) / SIZE,  # C17
+        scan_moved={i: float(np.sqrt(square)) / SIZE for i, square in squares.items()},
+        cpu_s=cpu_s,
+    )
+    return RegistrationState(
+        template=template,
+        landmarks=_landmarks_on(template, problem, registrations),
+        registrations=registrations,
+        excluded=state.excluded,
+        predictions=predictions,
+        rounds=(*state.rounds, record),
+    )
+
+
+def _aligned_shapes(
+    problem: _Problem, state: RegistrationState, order: Sequence[int]
+) -> tuple[FloatArray, FloatArray | None, FloatArray, FloatArray]:
+    """Return the aligned shapes (N, V, 3), their mirror images or None, (N, V) what is observed, and the mean (V, 3).
+
+    The mean of a symmetric object is that of the shapes and their mirror images.
+    """
+    shapes, observed = state.shapes(order)
+    shapes, mean = align_to_weighted_mean(shapes, observed, state.template.vertices)
+    if problem.mirror is None:
+        return shapes, None, observed, mean
+    images = np.stack([problem.mirror.image(shape) for shape in shapes])
+    weights = np.concatenate([observed, problem.mirror.observed(observed)])
+    both, mean = align_to_weighted_mean(np.concatenate([shapes, images]), weights, mean)
+    shapes, images = np.split(both, 2)
+    return shapes, images, observed, mean
+
+
+def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int, ScanRegistration]) -> SurfaceLandmarks:
+    """Return where the landmarks of the registered scans are on the template."""
+
+    def in_template_frame(i: int) -> dict[str, FloatArray]:
+        T_template_scan = registrations[i].T_scan_template.inverse()
+        return {name: T_template_scan.apply(point) for name, point in problem.first.repaired[i].landmarks.items()}
+
+    return consensus_landmarks(template, [(one.vertices, in_template_frame(i)) for i, one in registrations.items()])
+
+
+# The result
+
+
+def _result(problem: _Problem, state: RegistrationState) -> Correspondence:
+    complete = _complete_shapes(problem, state)
+    scans = [_scan_result(problem, state, i, complete.get(i)) for i in range(len(problem.names))]
+    points = state.landmarks.positions(state.template.vertices)
+    template = state.template.with_vertices(state.template.vertices, points)
+    landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
+    moved = tuple(record.moved for record in state.rounds)
+    return Correspondence(template, tuple(scans), problem.first.origin, moved, landmarks)
+
+
+def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, FloatArray]:
+    """Return the vertices (V, 3) of each registered scan, in the template's frame, with estimates where not observed.
+
+    An estimate is the conditional mean by probabilistic PCA of all registered scans (C27). A vertex that fewer than
+    `FEWEST` scans observe, and any vertex of too few scans for a model, stays where the registration has put it.
+    """
+    order = sorted(state.registrations)
+    shapes, weights = state.shapes(order)
+    observed = weights > 0
+    learnt = observed.sum(axis=0) >= FEWEST
+    if not observed[:, learnt].all() and len(order) >= _ENOUGH_TO_PREDICT:
+        masked = np.where(observed[:, learnt, None], shapes[:, learnt], np.nan)
+        shapes[:, learnt] = with_estimates(masked, [problem.names[i] for i in order])
+    return dict(zip(order, shapes, strict=True))
+
+
+def _scan_result(problem: _Problem, state: RegistrationState, i: int, complete: FloatArray | None) -> Corresponding:
+    """Return the result of scan `i`; `complete` are its vertices (V, 3) in the template's frame, None if excluded."""
+    moved = tuple(record.scan_moved[i] for record in state.rounds if i in record.scan_moved)
+    cpu_s = tuple(record.cpu_s[i] for record in state.rounds if i in record.cpu_s)
+    if complete is None:
+        return Corresponding(problem.names[i], state.excluded[i], moved=moved, seconds=cpu_s)
+    registration = state.registrations[i]
+    T = registration.T_scan_template
+    vertices = T.apply(complete)
+    landmarks = problem.landmarks(state.landmarks, i)
+    mean, p95, p99, largest = (T.scale * length for length in registration.distance)
+    return Corresponding(
+        name=problem.names[i],
+        reason="",
+        vertices=vertices,
+        T_scan_template=T,
+        seen=float(registration.observed.mean()),
+        covered=registration.covered,
+        distance=(mean, p95, p99, largest),
+        moved=moved,
+        seconds=cpu_s,
+        landmarks=np.nan if landmarks is None else landmarks.rms_distance(vertices),
+        observed=registration.observed,
+    )

@@ -1,0 +1,129 @@
+"""What an iteration knows, and when to stop: shared by both phases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from shapespace.errors import InputError
+from shapespace.fit.diagnostics.evidence import FitEvidence, MatchEvidence
+from shapespace.reprs import short_repr
+from shapespace.types import FloatArray, IntArray, Similarity
+
+
+@dataclass(frozen=True, eq=False)
+class IcpState:
+    """The state after one iteration, in the scan's mm frame.
+
+    Args:
+        phase: 1 or 2.
+        iteration: from 0, the start, counted by phase.
+        T_scan_model: similarity from the model's frame to the scan's mm frame.
+        b: (K,) coefficients, mm; zero throughout phase 1.
+        rms_mm: RMS distance of the model's vertices that the method looks at, in both methods whether they count or
+            not, from their closest scan points, mm of the model's frame.
+        motion_mm: largest movement of a model vertex in this iteration, mm of the model's frame.
+        stopped: None while running, else why: `rate`, or `cap`.
+    """
+
+    phase: int
+    iteration: int
+    T_scan_model: Similarity
+    b: FloatArray
+    rms_mm: float
+    motion_mm: float
+    stopped: str | None = None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Where a method ended, in the scan's mm frame.
+
+    Args:
+        T_scan_model: from the model's frame to the scan's mm frame.
+        b: (K,) coefficients, mm.
+        b_stddev: (K,) their standard deviation, mm.
+        shrinkage: (K,) in [0, 1]: 1 where the scan determines the coefficient, 0 where only the prior does.
+        T_scan_fitted: pose of the surface that was fitted, before its projection onto the model's modes.
+        vertices_scan_mm: (V, 3) that surface in the scan's mm frame; it may leave the span of the model,
+        outside_mm: by this (RMS), mm of the model's frame.
+        regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
+        evidence: diagnostics from which the status is computed; None of a method without any.
+        b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
+        notes: sentences on problems of the scan.
+        landmark_covariance: (L, 3, 3) of where the model's landmarks lie in that frame, mm^2, in the model's order,
+            where the method finds it.
+    """
+
+    T_scan_model: Similarity
+    b: FloatArray
+    b_stddev: FloatArray
+    shrinkage: FloatArray
+    T_scan_fitted: Similarity
+    vertices_scan_mm: FloatArray
+    outside_mm: float
+    regions: Callable[[], IntArray] = field(repr=False)
+    evidence: FitEvidence | None = None
+    b_covariance: FloatArray | None = None
+    notes: Sequence[str] = ()
+    landmark_covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFitted(Fitted):
+    """Where the robust method ended, with the diagnostics of its last iterate."""
+
+    match_evidence: MatchEvidence = field(kw_only=True)
+
+
+_F = TypeVar("_F", bound=Fitted)
+
+
+def last_of(states: Generator[IcpState, None, _F]) -> _F:
+    """Run a fit to its end, and return its result."""
+    while True:
+        try:
+            next(states)
+        except StopIteration as end:
+            return end.value
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """The paper's rule on the rate of change of the RMS (step 4), with a cap.
+
+    Args:
+        rate: stop when |e_k - e_(k-1)| is at most this share of e_(k-1).
+        motion_mm: and no vertex moves more than this; the RMS alone is blind to sliding (erratum to step 4).
+            Infinity gives the rule as printed.
+        max_iterations: cap of each phase.
+
+    Raises:
+        InputError: a rate or a motion that is not positive, or no iterations.
+    """
+
+    rate: float = 1e-4
+    motion_mm: float = float("inf")
+    max_iterations: int = 200
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and self.motion_mm > 0 and self.max_iterations >= 1):
+            raise InputError("A stopping rule needs a positive rate and motion and at least one iteration.")
+
+    def why(self, rms_mm: Sequence[float], motion_mm: float) -> str | None:
+        """Return `rate` or `cap` when the history of `rms_mm` says stop, else None."""
+        if len(rms_mm) >= 2:
+            change = abs(rms_mm[-1] - rms_mm[-2])
+            if change <= self.rate * max(rms_mm[-2], 1e-12) and motion_mm <= self.motion_mm:
+                return "rate"
+        return "cap" if len(rms_mm) > self.max_iterations else None
+
+
+def largest_motion(moved: FloatArray) -> float:
+    """Return the length of the longest of `moved` (V, 3)."""
+    return float(np.sqrt(np.einsum("ij,ij->i", moved, moved).max()))

@@ -1,0 +1,85 @@
+"""The robust fit as a method: its settings, and what is doubted and said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import asdict, dataclass, replace
+from typing import ClassVar
+
+from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
+from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons
+from shapespace.fit.diagnostics.odd_scans import chirality_of, find_odd_scan_reasons
+from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
+from shapespace.fit.iteration_state import Fitted, IcpState
+from shapespace.fit.method import Ended, Limits
+from shapespace.fit.robust.robust_settings import RobustSettings
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.fit.search.initialisation import Start
+from shapespace.model.shape_model import ShapeModel
+
+
+@dataclass(frozen=True)
+class Robust(RobustSettings):
+    """Pose and shape at once, from both directions, robustly, with the prior (docs/robust.md).
+
+    Its settings are those of `RobustSettings`.
+    """
+
+    name: ClassVar[str] = "robust"
+    calibrated: ClassVar[bool] = True
+    goes_on_densely: ClassVar[bool] = True
+
+    def states(
+        self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
+    ) -> Generator[IcpState, None, Fitted]:
+        """Yield the states of phase 1 with the pose alone, then of phase 2 with pose and shape together."""
+        from shapespace.fit.robust.robust_icp import robust_icp
+        from shapespace.fit.search.chirality import mirrored_log_odds
+        from shapespace.fit.search.second_instance import find_displaced, find_layers, find_second_instance  # compiled
+
+        fitted = yield from robust_icp(
+            model,
+            scan,
+            start,
+            self,
+            with_scale=limits.with_scale,
+            modes=limits.modes,
+            max_iterations=limits.max_iterations,
+        )
+        measured = ScanEvidence(
+            **asdict(fitted.match_evidence),
+            training_shapes=float(model.n_training),
+            start_score_mm=start.score_mm,
+            start_runner_up_score_mm=start.runner_up_score_mm,
+            **asdict(find_layers(model, scan, fitted)),
+            **asdict(find_displaced(model, scan, fitted)),
+        )
+        evidence = FitEvidence(**asdict(measured), **asdict(estimate_error(measured)))
+        notes = list(fitted.notes)
+        second = find_second_instance(model, scan, fitted, self, with_scale=limits.with_scale)
+        if second is not None:
+            evidence = replace(evidence, second_instance_mm=second.away_mm, second_instance_gap_mm=second.gap_mm)
+            notes.append(second.note)
+        if not limits.part:
+            log_odds = mirrored_log_odds(model, scan, fitted, self, with_scale=limits.with_scale)
+            evidence = replace(evidence, mirrored_log_odds=log_odds)
+            if log_odds is not None and chirality_of(log_odds) == "undecidable":
+                notes.append(
+                    "Whether the scan is mirrored is undecidable: its mirror image fits the model about as well."
+                )
+        return replace(fitted, evidence=evidence, notes=notes)
+
+    def doubts(self, ended: Ended) -> list[Reason]:
+        """Return reasons in the evidence to doubt the fit: an odd scan, then a probable failure."""
+        evidence = ended.fitted.evidence
+        assert evidence is not None
+        return [*find_odd_scan_reasons(evidence), *find_failure_reasons(evidence)]
+
+    def reason(self, ended: Ended) -> Reason:
+        """Return that the fit converged, with its robust residual standard deviation."""
+        evidence = ended.fitted.evidence
+        assert evidence is not None
+        return Reason(
+            ReasonCode.CONVERGED,
+            {"spread_mm": evidence.spread_mm, "model_matched_share": evidence.model_matched_share},
+        )

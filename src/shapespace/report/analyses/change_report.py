@@ -1,0 +1,599 @@
+"""Report of changes between visits: sentences, maps, tables, and the mean change as a morph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.table import named
+from shapespace.geometry.distortion import factor_to_draw, flip_factor
+from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Rows
+from shapespace.report.analyses.methods_section import (
+    dispersion_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
+from shapespace.schemas import (
+    CurvePart,
+    MorphPart,
+    Part,
+    Series,
+    SurfaceMapPart,
+    TableColumn,
+    TablePart,
+    TextPart,
+)
+from shapespace.statistics.change_result import (
+    ChangeResult,
+    GroupDifferenceTests,
+    MeanChangeTests,
+    SubjectChange,
+    change_or_rate,
+    interval_of_mean,
+)
+from shapespace.statistics.map_tests import LEVEL, MapTest
+from shapespace.statistics.observation_weights import blank_where
+from shapespace.types import FloatArray, Mesh
+
+ARRAYS, MAPS = "change.npz", "subjects.npz"
+MOST_MAPS = 6
+"""Subjects whose maps the report draws."""
+MOST_ROWS, MOST_CURVES = 50, 12
+_LEVEL = LEVEL
+_MM3_PER_ML = 1000.0
+_LEAST_ML_MM3 = 100.0
+"""Volumes below this limit (mm³) are written in mm³, others in ml; 0.1 ml needs more than two decimals."""
+_FEW = 10
+_SOURCES = {
+    "rescans": "Standard deviations are those of rescans.",
+    "fits": "Standard deviations are those that the fits state of their coefficients, carried through modes and "
+    "alignment, and widened where the stable part spreads more; what the model cannot make is not in them.",
+    "stable": "Standard deviations are the spread over the stable part, one for the whole surface; of volumes nothing "
+    "is known.",
+}
+
+
+def change_report(change: ChangeResult) -> AnalysisReport:
+    """Return the report, tables, arrays and meshes of what changed."""
+    config = change.config
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "before": change.before,
+        "after": change.after,
+        "faces": np.asarray(change.cohort.faces),
+        "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
+    }
+    parts: list[Part] = []
+    if change.mean_change is not None:
+        parts += _mean_change_parts(change, change.mean_change, arrays)
+    if change.group_difference is not None:
+        parts += _group_difference_parts(change, change.group_difference, arrays)
+    parts += _noise_parts(change, arrays)
+    parts += _subject_parts(change, arrays)
+    parts += _time_series(change)
+    parts.append(
+        SurfaceMapPart(
+            title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
+            unit="share of subjects", signed=False, limit=1.0,
+            note=f"Asked for: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
+            "scans of a subject were brought to each other rigidly by these vertices.",
+        )
+    )  # fmt: skip
+    stable = config.stable
+    report = AnalysisReport(
+        "change",
+        "What changed?",
+        tuple(_summary(change)),
+        (*parts, *methods_parts(change.methods)),
+        tables=_tables(change),
+        arrays={ARRAYS: arrays, MAPS: _maps(change)},
+        meshes={
+            "before.ply": Mesh(change.before, change.cohort.faces, name="before"),
+            "after.ply": Mesh(change.after, change.cohort.faces, name="after"),
+        },
+        notes=(*change.cohort.notes, *_notes(change)),
+        settings={
+            "subject": config.subject,
+            "time": config.time,
+            "order": config.order,
+            "stable": str(stable) if isinstance(stable, str) or not isinstance(stable, Sequence) else list(stable),
+            "group": config.group,
+            "rate": config.rate,
+            "permutations": config.permutations,
+            "seed": config.seed,
+            "unequal_variances": config.unequal_variances,
+            "uncertainty": change.uncertainty,
+        },
+        model_hashes=model_hashes(change.cohort),
+        methods=change.methods,
+    )
+    return add_shape_data(report, change.cohort)
+
+
+def _summary(change: ChangeResult) -> list[str]:
+    subjects = change.subjects
+    rms = float(np.median([subject.rms_mm for subject in subjects]))
+    share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
+    subjects_text = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
+    sentences = [
+        f"{subjects_text} changed by {rms:.2f} mm (RMS along the "
+        f"normals{'' if len(subjects) == 1 else ', median'}), and on "
+        f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
+    ]
+    if change.mean_change is not None:
+        volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3[0] for one in subjects])
+        low, high = interval_of_mean(volumes)
+        unit = _VolumeUnit.of(volumes.mean(), low, high)
+        sentences.append(_test_sentence(change, change.mean_change.surface, "the mean change", "none"))
+        verb = "The volume changed by" if change.is_closed else "The open surface swept"
+        sentences.append(
+            f"{verb} {unit.text(volumes.mean())} {unit.name}{_per_time(change)} on average (95 %: {unit.text(low)} to "
+            f"{unit.text(high)}), "
+            f"{_p_text(float(change.mean_change.volumes.p[0]))}."
+        )
+    if change.group_difference is not None:
+        first, second = change.group_difference.groups
+        sentences.append(
+            _test_sentence(change, change.group_difference.surface, f"the change of {second}", f"that of {first}")
+        )
+        difference = float(change.group_difference.volumes.effect[0])
+        unit = _VolumeUnit.of(difference)
+        sentences.append(
+            f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per_time(change)} "
+            f"more than that of {first}, {_p_text(float(change.group_difference.volumes.p[0]))}."
+        )
+        unequal = change.config.unequal_variances
+        sentences += [
+            dispersion_sentence(one, unequal, "mm")
+            for one in change.methods.dispersions
+            if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
+        ]
+    if change.repeatability is None:
+        sentences.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
+    else:
+        repeatability, smallest = change.repeatability, change.repeatability.smallest_mm
+        least = float(repeatability.volumes_smallest_mm3[0])
+        unit = _VolumeUnit.of(least)
+        sentences.append(
+            f"By {repeatability.scans} scans of {repeatability.visits} "
+            f"{'visit' if repeatability.visits == 1 else 'visits'} with rescans, the "
+            f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
+            f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
+            "volume; less is noise."
+        )
+    if change.mean_change is not None:
+        sentences.append(multiplicity_sentence(change.methods))
+    return sentences
+
+
+@dataclass(frozen=True)
+class _VolumeUnit:
+    """A unit of volumes: its name and its size in mm³."""
+
+    name: str
+    mm3: float
+
+    @staticmethod
+    def of(*mm3: float | FloatArray) -> _VolumeUnit:
+        """Return ml if the largest of the volumes (mm³) is at least `_LEAST_ML_MM3`, else mm³."""
+        largest = max((float(np.abs(one).max(initial=0.0)) for one in map(np.asarray, mm3)), default=0.0)
+        return _VolumeUnit("mm³", 1.0) if largest < _LEAST_ML_MM3 else _VolumeUnit("ml", 1000.0)
+
+    def text(self, mm3: float) -> str:
+        """Return a volume, mm³, in this unit with its sign."""
+        return f"{mm3 / self.mm3:+.2f}" if self.mm3 > 1 else f"{mm3:+.3g}"
+
+
+def _test_sentence(change: ChangeResult, test: MapTest, quantity: str, other: str) -> str:
+    vertex = int(np.abs(test.t).argmax())
+    significant = test.p <= _LEVEL
+    low, high = test.interval(vertex)
+    vertices = (
+        f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) {100 * significant.mean():.0f} % of the vertices "
+        "differ, "
+        f"clearest by {test.effect[vertex]:+.2f} mm{_per_time(change)} (simultaneous 95 % interval {low:+.2f} to "
+        f"{high:+.2f} "
+        "mm)"
+        if significant.any()
+        else f"vertex by vertex (family-wise error {100 * _LEVEL:g} %) none differs (smallest p = {test.p[vertex]:.3g})"
+    )
+    differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
+    if significant.any() and test.omnibus_p > _LEVEL:
+        vertices = f"exploratory, since the test of the whole surface is not significant: {vertices}"
+    limit = (
+        f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
+    )
+    return f"As a whole {quantity} {differs} {other} ({_p_text(test.omnibus_p)}); {vertices}{limit}."
+
+
+def _p_text(p: float) -> str:
+    return f"p = {p:.3g}"
+
+
+def _per_time(change: ChangeResult) -> str:
+    return f" per {change.time_unit}" if change.config.rate else ""
+
+
+def _mean_change_parts(change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    test = tests.surface
+    unit = f"mm{_per_time(change)}"
+    arrays |= {
+        "mean": blank_where(test.effect, change.blank),
+        "mean_t": test.t,
+        "mean_p": test.p,
+        "mean_found": test.p <= _LEVEL,
+    }
+    grey = "" if change.blank is None else f" {blank_sentence(int(change.blank.sum()), len(change.blank))}"
+    least = 1 / test.permutations
+    marked = (
+        f"No p can be below {least:.2g} with so few, so that nothing is marked."
+        if least > _LEVEL
+        else f"In full colour where the family-wise p is at most {_LEVEL:g}, by the maximum over vertices of |t| in "
+        f"{test.permutations} sign flips{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
+    )
+    note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. {marked}{grey}"
+    parts: list[Part] = [
+        SurfaceMapPart(
+            title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
+            mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
+        ),
+        _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change"),
+    ]  # fmt: skip
+    if len(change.regions) > 1:
+        parts.append(_region_table(change, tests.volumes))
+    if tests.landmarks is not None:
+        header, rows = _landmark_summary(change, tests.landmarks)
+        kinds = ("text", "mm", "mm", "mm", "mm", "p")
+        columns = tuple(TableColumn(name=name, kind=kind) for name, kind in zip(header, kinds, strict=True))  # type: ignore[arg-type]
+        parts.append(
+            TablePart(
+                title="Landmarks", columns=columns, rows=tuple(tuple(row) for row in rows),
+                note=f"Along the normals, {unit}, with the 95 % interval of the mean; p with the error over all held.",
+            )
+        )  # fmt: skip
+    return parts
+
+
+def _region_table(change: ChangeResult, test: MapTest) -> Part:
+    rows: list[tuple[Any, ...]] = []
+    volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
+    unit = _VolumeUnit.of(volumes.mean(axis=0))
+    for k, name in enumerate(change.regions):
+        own = volumes[:, k] / unit.mm3
+        rows.append((name, float(own.mean()), *interval_of_mean(own), float(test.p[k])))
+    return TablePart(
+        title="Volumes swept",
+        columns=(
+            TableColumn(name="of"),
+            *(TableColumn(name=name, kind="number") for name in (f"mean, {unit.name}", "low", "high")),
+            TableColumn(name="p", kind="p"),
+        ),
+        rows=tuple(rows),
+        note="With the 95 % interval of the mean; p with the error over all parts held.",
+    )
+
+
+def _landmark_summary(change: ChangeResult, test: MapTest) -> tuple[Sequence[str], list[list[Any]]]:
+    rows: list[list[Any]] = []
+    maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
+    for k, (name, values) in enumerate(zip(change.landmarks.names, change.landmarks.interpolate(maps.T), strict=True)):
+        low, high = interval_of_mean(values)
+        rows.append([name, values.mean(), values.std(ddof=1), low, high, test.p[k]])
+    return ("landmark", "mean", "stddev", "low", "high", "p"), rows
+
+
+def _group_difference_parts(
+    change: ChangeResult, tests: GroupDifferenceTests, arrays: dict[str, npt.NDArray[Any]]
+) -> list[Part]:
+    (first, second), test = tests.groups, tests.surface
+    arrays |= {
+        "difference": blank_where(test.effect, change.blank),
+        "difference_p": test.p,
+        "difference_found": test.p <= _LEVEL,
+    }
+    note = (
+        f"Mean change of {second} ({test.n[1]} subjects) less that of {first} ({test.n[0]}). In full colour where the "
+        f"family-wise p is at most {_LEVEL:g}, by {test.permutations} "
+        f"{'sign flips, with unequal variances' if test.unequal_variances else 'permutations of subjects'}"
+        f"{' (all there are)' if test.every else ''}."
+    )
+    return [
+        SurfaceMapPart(
+            title=f"{second} beside {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
+            mask="difference_found", unit=f"mm{_per_time(change)}", note=note,
+        )
+    ]  # fmt: skip
+
+
+def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    repeatability = change.repeatability
+    if repeatability is None:
+        text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
+        return [TextPart(title="What is noise", level=2, text=text)]
+    arrays |= {"smallest_mm": repeatability.smallest_mm, "icc": repeatability.icc}
+    rows: list[tuple[Any, ...]] = [
+        (
+            "surface (mm, median)",
+            *(float(np.median(of)) for of in (repeatability.within_mm, repeatability.smallest_mm)),
+            repeatability.shape_icc,
+        ),
+        *(
+            (
+                f"volume of {name} (mm3)",
+                float(repeatability.volumes_within_mm3[k]),
+                float(repeatability.volumes_smallest_mm3[k]),
+                repeatability.volume_icc if k == 0 else None,
+            )
+            for k, name in enumerate(change.regions)
+        ),
+        *(
+            (f"{name} (mm)", float(within), float(smallest), float(icc))
+            for name, within, smallest, icc in zip(
+                change.landmarks.names,
+                repeatability.landmarks_within_mm,
+                repeatability.landmarks_smallest_mm,
+                change.landmarks.interpolate(repeatability.icc),
+                strict=True,
+            )
+        ),
+    ]
+    few = (
+        f" {repeatability.freedom} degrees of freedom are few, so these are rough."
+        if repeatability.freedom < _FEW
+        else ""
+    )
+    return [
+        SurfaceMapPart(
+            title="What is noise", level=2, arrays=ARRAYS, vertices="before",
+            values="smallest_mm", signed=False,
+            note="The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of "
+            f"{repeatability.scans} scans of {repeatability.visits} visits. A change of one scan against another "
+            "that is "
+            f"smaller is noise.{few}",
+        ),
+        TablePart(
+            title="Repeatability",
+            columns=(
+                TableColumn(name="of"), TableColumn(name="within-subject stddev", kind="number"),
+                TableColumn(name="smallest detectable change", kind="number"), TableColumn(name="ICC", kind="number"),
+            ),
+            rows=tuple(rows),
+        ),
+    ]  # fmt: skip
+
+
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part]:
+    every = len(change.subjects)
+    more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
+    volumes = (one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS])
+    unit = _VolumeUnit.of(*volumes)
+    columns = [
+        TableColumn(name="subject"), TableColumn(name="first"), TableColumn(name="last"),
+        TableColumn(name="RMS", kind="mm"), TableColumn(name="beyond its uncertainty", kind="percent"),
+        *(TableColumn(name=f"{what}, {unit.name}", kind="number") for what in ("volume", "stddev")),
+    ]  # fmt: skip
+    if change.is_closed:
+        columns.append(TableColumn(name="of the volume before", kind="percent"))
+    has_groups = change.group_difference is not None
+    if has_groups:
+        columns.append(TableColumn(name="group"))
+    rows: list[tuple[Any, ...]] = []
+    for one in change.subjects[:MOST_ROWS]:
+        volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
+        row = [one.name, one.visits[0].label, one.visits[-1].label, one.rms_mm, one.beyond_share]
+        row += [volume / unit.mm3, _finite_or_none(stddev / unit.mm3)]
+        row += [volume / one.volume_before_mm3] if change.is_closed else []
+        rows.append((*row, *([one.group] if has_groups else [])))
+    parts: list[Part] = [
+        TablePart(
+            title="Subjects", level=2, columns=tuple(columns), rows=tuple(rows),
+            note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
+        )
+    ]  # fmt: skip
+    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
+    for number, subject in enumerate(most, 1):
+        before, after = change.surfaces(subject.name)
+        key = f"subject{number}"
+        arrays |= {
+            f"{key}_before": before.vertices,
+            f"{key}_after": after.vertices,
+            f"{key}_change": blank_where(subject.change.along_mm, subject.unobserved),
+            f"{key}_beyond": subject.change.beyond,
+        }
+        parts.append(
+            SurfaceMapPart(
+                title=f"{subject.name}, {subject.visits[0].label} to {subject.visits[-1].label}", arrays=ARRAYS,
+                vertices=f"{key}_before", values=f"{key}_change", mask=f"{key}_beyond",
+                note=f"Outwards positive; in full colour where it exceeds {subject.change.quantile:.2f} standard "
+                f"deviations (median of these {np.median(subject.change.stddev_mm):.2f} mm).",
+            )
+        )  # fmt: skip
+        if number == 1:
+            parts.append(
+                _morph(
+                    f"{subject.name} from before to after", arrays, f"{key}_before", f"{key}_after",
+                    subject.visits[0].label, subject.visits[-1].label,
+                )
+            )  # fmt: skip
+    if len(change.subjects) > MOST_MAPS:
+        parts.append(TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}."))
+    return parts
+
+
+def _morph(
+    title: str, arrays: dict[str, npt.NDArray[Any]], low: str, high: str, low_label: str, high_label: str
+) -> MorphPart:
+    """Return the morph between two shapes of `arrays`; if triangles would flip, the difference is drawn smaller."""
+    before, change = arrays[low], arrays[high] - arrays[low]
+    times = factor_to_draw(1.0, flip_factor(before, change, arrays["faces"]))
+    if times < 1:
+        high = f"{high}_drawn"
+        arrays[high] = before + times * change
+    return MorphPart(
+        title=title, arrays=ARRAYS, low=low, high=high, low_label=low_label, high_label=high_label, times=times,
+        note="" if times == 1 else REDUCED_MORPH_NOTE,
+    )  # fmt: skip
+
+
+def _time_series(change: ChangeResult) -> list[Part]:
+    if not change.time_unit or all(len(one.visits) < 3 for one in change.subjects):
+        return []
+    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:MOST_CURVES] for visit in one.visits))
+    series = tuple(
+        Series(
+            label=one.name,
+            x=tuple(visit.time for visit in one.visits),
+            y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
+        )
+        for one in change.subjects[:MOST_CURVES]
+    )
+    every = len(change.subjects)
+    more = f" The first {MOST_CURVES} of {every}; all are in visits.csv." if every > MOST_CURVES else ""
+    return [
+        CurvePart(
+            title="Over time",
+            level=2,
+            series=series,
+            x=change.time_unit,
+            y=f"volume since the first visit, {unit.name}",
+            note=f"Rates are the slopes of straight lines through these, in subjects.csv.{more}",
+        )
+    ]
+
+
+def _subject_rows(change: ChangeResult) -> tuple[list[str], list[list[Any]]]:
+    header = [
+        "subject", "group", "first", "last", "rms_mm", "most_mm", "beyond_share", "volume_change_mm3",
+        "volume_change_stddev_mm3", "volume_change_share", "visits", "scans", "median_stddev_mm",
+    ]  # fmt: skip
+    if change.time_unit:
+        header += ["rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit"]
+    rows: list[list[Any]] = []
+    for one in change.subjects:
+        row: list[Any] = [
+            one.name,
+            one.group,
+            one.visits[0].label,
+            one.visits[-1].label,
+            one.rms_mm,
+            _largest(one),
+            one.beyond_share,
+            float(one.change.volumes_mm3[0]),
+            _finite_or_none(one.change.volumes_stddev_mm3[0]),
+            _finite_or_none(one.change.volumes_mm3[0] / one.volume_before_mm3),
+            len(one.visits),
+            sum(visit.scans for visit in one.visits),
+            float(np.median(one.change.stddev_mm)),
+        ]
+        if one.rate is not None:
+            row += [
+                float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
+                float(one.rate.volumes_mm3[0]),
+                _finite_or_none(one.rate.volumes_stddev_mm3[0]),
+                change.time_unit,
+            ]
+        rows.append(row)
+    return header, rows
+
+
+def _tables(change: ChangeResult) -> dict[str, Rows]:
+    tables: dict[str, Rows] = {"subjects.csv": _subject_rows(change)}
+    tables["visits.csv"] = (
+        ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
+        [
+            (one.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
+            for one in change.subjects
+            for visit in one.visits
+        ],
+    )
+    if len(change.regions) > 1:
+        tables["regions.csv"] = (
+            ("subject", "region", "volume_change_mm3", "stddev_mm3"),
+            [
+                (one.name, name, float(one.change.volumes_mm3[k]), _finite_or_none(one.change.volumes_stddev_mm3[k]))
+                for one in change.subjects
+                for k, name in enumerate(change.regions)
+            ],
+        )
+    if change.landmarks:
+        tables["landmarks.csv"] = (
+            ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
+             "along_normal_stddev_mm", "smallest_detectable_mm"),
+            [row for one in change.subjects for row in _landmark_rows(change, one)],
+        )  # fmt: skip
+        if change.mean_change is not None and change.mean_change.landmarks is not None:
+            tables["group_landmarks.csv"] = _landmark_summary(change, change.mean_change.landmarks)
+    return tables
+
+
+def _landmark_rows(change: ChangeResult, subject: SubjectChange) -> list[Sequence[object]]:
+    estimate, repeatability = subject.change, change.repeatability
+    along, stddev = change.landmarks.interpolate(np.stack([estimate.along_mm, estimate.stddev_mm], axis=1)).T
+    smallest = (
+        [None] * len(change.landmarks)
+        if repeatability is None
+        else list(map(float, repeatability.landmarks_smallest_mm))
+    )
+    return [
+        (
+            subject.name,
+            name,
+            *map(float, estimate.landmarks_mm[k]),
+            float(np.linalg.norm(estimate.landmarks_mm[k])),
+            float(estimate.landmarks_stddev_mm[k]),
+            float(along[k]),
+            float(stddev[k]),
+            smallest[k],
+        )
+        for k, name in enumerate(change.landmarks.names)
+    ]
+
+
+def _largest(subject: SubjectChange) -> float:
+    """Return the largest change, mm, of the vertices that are observed."""
+    along = subject.change.along_mm if subject.observed is None else subject.change.along_mm[subject.observed]
+    return float(along[np.abs(along).argmax()])
+
+
+def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
+    maps = {
+        "subjects": np.array([one.name for one in change.subjects]),
+        "change_mm": np.stack([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]).astype(
+            np.float32
+        ),
+        "stddev_mm": np.stack([one.change.stddev_mm for one in change.subjects]).astype(np.float32),
+    }
+    maps["beyond"] = np.stack([one.change.beyond for one in change.subjects])
+    if change.time_unit:
+        rates = [change_or_rate(one, rate=True) for one in change.subjects]
+        maps["rate_mm"] = np.stack([one.along_mm for one in rates]).astype(np.float32)
+        maps["rate_stddev_mm"] = np.stack([one.stddev_mm for one in rates]).astype(np.float32)
+    return maps
+
+
+def _notes(change: ChangeResult) -> list[str]:
+    notes: list[str] = []
+    if change.single_visit_subjects:
+        alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
+        notes.append(
+            f"{alone} of {every} subjects are left out, who have one visit ({named(change.single_visit_subjects)})."
+        )
+    ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
+    if not change.time_unit and len(ends) > 1:
+        pairs_of_visits = named([f"{first} to {last}" for first, last in sorted(ends)])
+        notes.append(f"Not all subjects have the same first and last visit ({pairs_of_visits}).")
+    if change.is_model_only:
+        notes.append(
+            "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
+            "give --surfaces dense."
+        )
+    return notes
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,503 @@
+"""Report of a comparison: sentences, tables, maps and morphs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shapespace.cohort.cohort import Cohort
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods_section import (
+    dispersion_sentence,
+    effect_size_sentence,
+    is_dispersion_warning,
+    methods_parts,
+    multiplicity_sentence,
+)
+from shapespace.report.analyses.shape_data import add_shape_data, blank_sentence, model_hashes
+from shapespace.schemas import (
+    Counts,
+    CurvePart,
+    HistogramPart,
+    MorphPart,
+    Part,
+    Series,
+    SurfaceMapPart,
+    TableColumn,
+    TablePart,
+    TextPart,
+)
+from shapespace.statistics.compare import MOST_LEVELS, CompareResult, ShapeEffect
+from shapespace.statistics.compare_maps import EffectMap, Tested
+from shapespace.statistics.observation_weights import blank_where
+from shapespace.types import BoolArray, FloatArray, Mesh
+
+_LARGEST_SHARE = 0.05
+"""A morph shows changes exaggerated to about this share of the size."""
+_EXAGGERATIONS = (1, 2, 3, 5, 10, 20, 50)
+_BINS = 40
+_FEWEST_ARRANGEMENTS = 20
+"""Number of different arrangements below which no p value can be small."""
+_PALE = "Vertices that are not found to differ are pale."
+_NO_FACES = np.zeros((0, 3), dtype=np.int32)
+
+
+def compare_report(result: CompareResult) -> AnalysisReport:
+    """Return a comparison with all that its report shows; files are numbered as its effects are."""
+    effects = result.effects
+    parts: list[Part] = [
+        *_term_parts(result),
+        *_pair_parts(result),
+        *_angle_parts(result),
+        *(part for number, effect in enumerate(effects, 1) for part in _effect_parts(result, effect, number)),
+        *methods_parts(result.methods),
+    ]
+    report = AnalysisReport(
+        question="compare",
+        title=f"Shape {result.design.formula.strip()}",
+        summary=tuple(_summary(result)),
+        parts=tuple(parts),
+        tables=_tables(result),
+        arrays={f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)},
+        meshes=dict(_meshes(result)),
+        notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
+        settings={
+            "formula": result.design.formula,
+            "squares": result.config.anova_type,
+            "blocks": result.config.blocks,
+            "random": result.config.random,
+            "permutations": result.config.permutations,
+            "seed": result.config.seed,
+            "bump_width_mm": result.config.bump_width_mm,
+            "level": result.config.alpha,
+            "unequal_variances": result.config.unequal_variances,
+            "effect_size": result.config.effect_size,
+            "gauge": result.cohort.gauge,
+            "shapes": len(result.cohort),
+            "subjects": result.n_subjects,
+        },
+        model_hashes=model_hashes(result.cohort),
+        methods=result.methods,
+    )
+    return add_shape_data(report, result.cohort)
+
+
+def _summary(result: CompareResult) -> Iterator[str]:
+    level, shapes = result.config.alpha, len(result.cohort)
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
+    for test in result.tests:
+        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
+        stratum = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
+        if test.p <= level:
+            yield f"Shape differs with {test.term}{stratum} ({figures})."
+        else:
+            yield f"No difference of shape with {test.term}{stratum} is found ({figures})."
+    for effect in result.effects:
+        if effect.map is not None:
+            yield _map_sentence(result, effect, effect.map)
+            if effect.map.blank is not None:
+                yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
+            if effect.map.bump is not None and effect.map.bump_mm is not None:
+                yield _bump_sentence(result, effect, effect.map.bump, effect.map.bump_mm)
+    yield from compare_warnings(result)
+    of_subjects = f" of {result.n_subjects} subjects" if result.n_subjects < shapes else ""
+    yield f"{shapes} shapes{of_subjects}, {result.config.permutations} arrangements, the observed one among them."
+    yield multiplicity_sentence(result.methods)
+
+
+def compare_warnings(result: CompareResult) -> tuple[str, ...]:
+    """Return sentences on limitations of the tests."""
+    unequal = result.config.unequal_variances
+    return (
+        *(
+            dispersion_sentence(dispersion, unequal, result.cohort.unit)
+            for dispersion in result.methods.dispersions
+            if is_dispersion_warning(dispersion, unequal_variances=unequal)
+        ),
+        *_subject_warnings(result),
+        *_arrangement_warnings(result),
+        *_repeated_measures_warnings(result),
+        *_uncentred_warnings(result),
+        *(
+            f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
+            for one in result.design.variables
+            if len(one.levels) > MOST_LEVELS
+        ),
+    )
+
+
+def _subject_warnings(result: CompareResult) -> Iterator[str]:
+    table, blocks = result.cohort.table, result.config.blocks
+    if blocks is None:
+        names = table.columns.get("subject", ())
+        if all(names) and len(set(names)) < len(names):
+            yield (
+                f"The {len(names)} shapes are of {len(set(names))} subjects and are taken for independent, which makes "
+                "differences look surer than they are; say --blocks subject."
+            )
+        return
+    counts = Counter(table.texts(blocks))
+    if max(counts.values()) == 1:
+        yield f"No {blocks} has two shapes, so --blocks changes nothing."
+    elif len(set(counts.values())) > 1 and result.strata[0].stratum.startswith("between"):
+        yield (
+            f"There are {min(counts.values())} to {max(counts.values())} shapes of a {blocks}; each counts "
+            "once, by its mean, and p is approximate where means of few scans are noisier."
+        )
+
+
+def _arrangement_warnings(result: CompareResult) -> Iterator[str]:
+    for stratum in result.strata:
+        if stratum.log_arrangements < math.log(_FEWEST_ARRANGEMENTS):
+            name = f" {stratum.stratum}" if stratum.stratum else ""
+            yield (
+                f"There are only {round(math.exp(stratum.log_arrangements))} arrangements{name} that differ, so no p "
+                "can be small."
+            )
+
+
+def _repeated_measures_warnings(result: CompareResult) -> Iterator[str]:
+    repeated, blocks = result.repeated_measures, result.config.blocks
+    if repeated is None:
+        return
+    if repeated.common_effects:
+        yield (
+            f"All {blocks}s are assumed to respond alike to {', '.join(repeated.common_effects)}; if they do not, p "
+            f"within {blocks}s is too small. Without --random the responses may differ between {blocks}s."
+        )
+    for effect, count in repeated.subjects_without_effect.items():
+        yield (
+            f"{count} of {result.n_subjects} {blocks}s lack conditions from which {effect} can be estimated, and "
+            "are left out of its test."
+        )
+
+
+def _uncentred_warnings(result: CompareResult) -> Iterator[str]:
+    design = result.design
+    for one in design.variables:
+        # A function of the variable, such as center(age), defines its own zero.
+        has_interaction = any(
+            one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
+            for term in design.terms
+        )
+        if result.config.anova_type == "III" and has_interaction and not one.levels and one.low * one.high > 0:
+            yield (
+                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
+                f"center({one.name}) in the formula, or take type II."
+            )
+
+
+def _repeated_measures_notes(result: CompareResult) -> Iterator[str]:
+    repeated, blocks = result.repeated_measures, result.config.blocks
+    if repeated is None:
+        return
+    if repeated.n_cells < len(result.cohort):
+        yield (
+            f"{len(result.cohort)} shapes are averaged to {repeated.n_cells} cells of one {blocks} and condition; "
+            "repeated shapes of a cell do not count as further observations."
+        )
+    if repeated.random_effects:
+        yield (
+            f"Each {blocks} may respond differently to {', '.join(repeated.random_effects)}: each of these effects is "
+            f"tested on one estimate per {blocks}; the signs of the estimates are flipped, or the estimates are "
+            f"permuted between {blocks}s."
+        )
+    if repeated.adjusted_conditions:
+        labels = ", ".join(repeated.adjusted_conditions)
+        yield (
+            f"The shapes of each {blocks} are not of the same conditions: the means of {labels} per {blocks} are "
+            f"covariates of the model between {blocks}s, so that its F contains the uncertainty of this adjustment."
+        )
+
+
+_EXPLORATORY = "exploratory, since its term is not significant: "
+
+
+def _map_sentence(result: CompareResult, effect: ShapeEffect, shown: EffectMap) -> str:
+    """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
+    level = result.config.alpha
+    scope = f"family-wise error {100 * level:g} % within this map"
+    significant = shown.shown.p_family <= level
+    if not significant.any():
+        return f"{effect.label}: no vertex differs ({scope})."
+    return (
+        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{100 * significant.mean():.1f} % of the vertices "
+        f"differ ({scope}), the clearest by {_clearest(result, shown)}."
+    )
+
+
+def _clearest(result: CompareResult, shown: EffectMap) -> str:
+    """Return the change at the vertex with the largest F, with its simultaneous interval."""
+    lengths, vertex = _lengths(result), int(shown.shown.f.argmax())
+    low, high = shown.interval_mm(vertex)
+    sign = "" if shown.normal_mm is None else "+"
+    return (
+        f"{lengths.text(shown.shown_mm[vertex], sign)} (simultaneous {100 * (1 - result.config.alpha):g} % interval "
+        f"{lengths.number(low, sign)} to {lengths.text(high, sign)}){_near_landmark(result.cohort, vertex)}"
+    )
+
+
+def _bump_sentence(result: CompareResult, effect: ShapeEffect, bump: Tested, bump_mm: FloatArray) -> str:
+    level, vertex = result.config.alpha, int(bump.f.argmax())
+    scope = f"family-wise error {100 * level:g} % within this map"
+    if bump.p_family[vertex] > level:
+        return f"{effect.label}: no bump is found beyond the variation between shapes ({scope})."
+    return (
+        f"{effect.label}: a bump of {_lengths(result).text(bump_mm[vertex], '+')} or more is found"
+        f"{_near_landmark(result.cohort, vertex)} ({scope})."
+    )
+
+
+def _lengths(result: CompareResult) -> LengthFormat:
+    return LengthFormat(result.cohort.unit)
+
+
+def _p_text(p: float) -> str:
+    return f"p {p:.3g}"
+
+
+def _near_landmark(cohort: Cohort, vertex: int) -> str:
+    """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
+    if not cohort.landmarks:
+        return ""
+    landmarks = cohort.landmarks.interpolate(cohort.reference)
+    distances = np.linalg.norm(landmarks - cohort.reference[vertex], axis=1)
+    return f" near {cohort.landmarks.names[int(distances.argmin())]}"
+
+
+def _column(name: str, kind: Any = "text") -> TableColumn:
+    return TableColumn(name=name, kind=kind)
+
+
+def _term_parts(result: CompareResult) -> Iterator[Part]:
+    strata, lengths = any(test.stratum for test in result.tests), _lengths(result)
+    rows: list[tuple[Any, ...]] = []
+    for stratum in result.strata:
+        tests = [test for test in result.tests if test.stratum == stratum.stratum]
+        rows += [(t.term, t.stratum, t.df, t.squares, t.squares / t.df, t.r2, t.f, t.z, t.p) for t in tests]
+        share = stratum.squares / stratum.squares_total
+        rows.append(
+            ("residual", stratum.stratum, stratum.df, stratum.squares, stratum.squares / stratum.df, share, *[None] * 3)
+        )
+        rows.append(("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, *[None] * 3))
+    columns = (
+        _column("term"), _column("tested"), _column("df", "count"),
+        _column(lengths.label("sum of squares", "²"), "number"),
+        _column(lengths.label("mean square", "²"), "number"), _column("R²", "percent"), _column("F", "number"),
+        _column("Z", "number"), _column("p", "p"),
+    )  # fmt: skip
+    if not strata:
+        columns = (*columns[:1], *columns[2:])
+        rows = [(*row[:1], *row[2:]) for row in rows]
+    note = (
+        f"Type {result.config.anova_type} sums of squares of Procrustes distances. {_f_sentence(result)} "
+        f"{effect_size_sentence(result.config.effect_size)} R² is the share of the total of its stratum."
+    )
+    yield TablePart(title="What shape varies with", level=2, note=note, columns=columns, rows=tuple(rows))
+    for test in result.tests:
+        f = np.log10(np.maximum(test.arrangements, 1e-12))
+        counts, edges = np.histogram(f, bins=_BINS)
+        yield HistogramPart(
+            title=f"F of {test.term} among its arrangements",
+            edges=_floats(edges),
+            series=(Counts(counts=_floats(counts), label="arrangements"),),
+            x="log10 F",
+            observed=float(f[0]),
+            observed_label="observed",
+        )
+
+
+def _pair_parts(result: CompareResult) -> Iterator[Part]:
+    rows = tuple((e.name, e.label, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family) for e in result.effects)
+    yield TablePart(
+        title="How far apart",
+        level=2,
+        note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
+        "summed over vertices, the RMS is a vertex's share. The last column counts all pairs of one variable.",
+        columns=(
+            _column("variable"), _column("from, to"), _lengths(result).column("Procrustes distance"),
+            _lengths(result).column("RMS"),
+            _column("F", "number"), _column("Z", "number"), _column("p", "p"), _column("p of all pairs", "p"),
+        ),
+        rows=rows,
+    )  # fmt: skip
+
+
+def _angle_parts(result: CompareResult) -> Iterator[Part]:
+    if result.angles:
+        yield TablePart(
+            title="Angles between changes of shape",
+            note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes.",
+            columns=(_column("one"), _column("other"), _column("angle, degrees", "number"), _column("p", "p")),
+            rows=tuple((a.first, a.second, a.degrees, a.p) for a in result.angles),
+        )
+
+
+def _effect_parts(result: CompareResult, effect: ShapeEffect, number: int) -> Iterator[Part]:
+    file, level = f"effect_{number}.npz", f"{100 * result.config.alpha:g} %"
+    yield TextPart(
+        title=effect.label,
+        level=2,
+        text=_size_sentence(result, effect),
+    )
+    if effect.map is not None:
+        arrays = _arrays(result, effect)
+        blank = effect.map.blank
+        note = _PALE if blank is None else f"{_PALE} {blank_sentence(int(blank.sum()), len(blank))}"
+        for title, values, mask in (
+            (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
+            (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
+            (f"In any direction, family-wise error {level}", "length_mm", "length_family"),
+            (f"Bumps beside how shapes vary, family-wise error {level}", "bump_mm", "bump_family"),
+        ):
+            if values in arrays:
+                yield SurfaceMapPart(
+                    title=title,
+                    arrays=file,
+                    values=values,
+                    mask=mask,
+                    signed=values != "length_mm",
+                    unit=_lengths(result).of_map,
+                    note=f"{_EXPLORATORY.capitalize().removesuffix(': ')}. {note}" if effect.exploratory else note,
+                )
+    if result.cohort.faces is not None:
+        times = _exaggeration(result, effect)
+        yield MorphPart(
+            title="From low to high",
+            note="" if times == 1 else f"Exaggerated {times} times.",
+            arrays=file,
+            low_label=effect.low,
+            high_label=effect.high,
+            times=float(times),
+        )
+    yield from _score_parts(result, effect)
+
+
+def _size_sentence(result: CompareResult, effect: ShapeEffect) -> str:
+    """Return how large a change is: over all vertices, and where it is clearest."""
+    size = f"The change is {_lengths(result).text(effect.rms_mm)} (RMS over vertices)."
+    if effect.map is None:
+        return size
+    direction = "" if effect.map.normal_mm is None else ", outwards positive"
+    label = " The map is exploratory, since no term of this effect is significant." if effect.exploratory else ""
+    return f"{size} It is clearest by {_clearest(result, effect.map)}{direction}.{label}"
+
+
+def _f_sentence(result: CompareResult) -> str:
+    if result.config.unequal_variances:
+        return (
+            "F is the squared effect divided by its variance, with a variance for each subject (of two classes the "
+            "squared Welch t), compared with sign flips of residuals."
+        )
+    return "F is the mean square by that of the residuals, compared with its arrangements (see Methods)."
+
+
+def _score_parts(result: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
+    """Yield regression scores against a number: shapes projected on what it changes."""
+    one = next((v for v in result.design.variables if v.name == effect.name and not v.levels), None)
+    length = float(np.linalg.norm(effect.change))
+    if one is None or length == 0:
+        return
+    x = np.array(result.design.values[one.column], dtype=np.float64)
+    y = (result.cohort.coefficients - result.mean) @ effect.change / length
+    slope = length / (one.high - one.low)
+    ends = np.array([one.low, one.high])
+    yield CurvePart(
+        title=f"Regression score of {one.name}",
+        note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
+        x=one.name,
+        y=_lengths(result).label("score"),
+        series=(
+            Series(x=_floats(x), y=_floats(y), label="shapes", points=True),
+            Series(x=_floats(ends), y=_floats(slope * (ends - one.middle)), label="model"),
+        ),
+    )
+
+
+def _exaggeration(result: CompareResult, effect: ShapeEffect) -> int:
+    cohort = result.cohort
+    moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
+    size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
+    return max((one for one in _EXAGGERATIONS if one * moved <= _LARGEST_SHARE * size), default=1)
+
+
+def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:
+    cohort, level = result.cohort, result.config.alpha
+    times = _exaggeration(result, effect)
+    half = (times - 1) / 2 * effect.change
+    out: dict[str, npt.NDArray[Any]] = {
+        "vertices": cohort.vertices(result.mean),
+        "faces": _NO_FACES if cohort.faces is None else cohort.faces,
+        "low": cohort.vertices(effect.at_low - half),
+        "high": cohort.vertices(effect.at_high + half),
+    }
+    effect_map = effect.map
+    if effect_map is None:
+        return out
+    out |= {"change_mm": effect_map.change_mm, "length_mm": blank_where(effect_map.length_mm, effect_map.blank)}
+    if effect_map.weight is not None:
+        out["information"] = effect_map.weight
+    named = {"length": effect_map.any_way}
+    if effect_map.along is not None and effect_map.normal_mm is not None:
+        out["normal_mm"] = blank_where(effect_map.normal_mm, effect_map.blank)
+        named["normal"] = effect_map.along
+    if effect_map.bump is not None and effect_map.bump_mm is not None:
+        out["bump_mm"] = blank_where(effect_map.bump_mm, effect_map.blank)
+        named["bump"] = effect_map.bump
+    for name, test in named.items():
+        out |= {f"{name}_f": test.f, f"{name}_p": test.p, f"{name}_p_family": test.p_family, f"{name}_q": test.q}
+        masks: dict[str, BoolArray] = {f"{name}_family": test.p_family <= level, f"{name}_fdr": test.q <= level}
+        out |= masks
+    return out
+
+
+def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
+    if result.cohort.faces is None:
+        return
+    for at, effect in enumerate(result.effects, 1):
+        for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
+            yield f"effect_{at}_{end}.ply", result.cohort.mesh(shape, name)
+
+
+def _tables(result: CompareResult) -> Mapping[str, Rows]:
+    terms: list[tuple[object, ...]] = [(t.term, t.stratum, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in result.tests]
+    for left in result.strata:
+        share = left.squares / left.squares_total
+        terms.append(("residual", left.stratum, left.df, left.squares, share, "", "", ""))
+        terms.append(("total", left.stratum, left.df_total, left.squares_total, 1.0, "", "", ""))
+    field = _lengths(result).field
+    tables: dict[str, Rows] = {
+        "terms.csv": (("term", "stratum", "df", field("squares", "2"), "r2", "f", "z", "p"), terms),
+        "effects.csv": (
+            (
+                "number",
+                "variable",
+                "from",
+                "to",
+                "stratum",
+                field("distance"),
+                field("rms"),
+                "f",
+                "z",
+                "p",
+                "p_of_all_pairs",
+            ),
+            [
+                (at, e.name, e.low, e.high, e.stratum, e.distance_mm, e.rms_mm, e.f, e.z, e.p, e.p_family)
+                for at, e in enumerate(result.effects, 1)
+            ],
+        ),
+    }
+    if result.angles:
+        rows = [(a.first, a.second, a.degrees, "" if a.p is None else a.p) for a in result.angles]
+        tables["angles.csv"] = (("first", "second", "degrees", "p"), rows)
+    return tables
+
+
+def _floats(values: FloatArray | npt.NDArray[np.int64] | Sequence[float]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

@@ -1,0 +1,253 @@
+"""Report of a regression on shape, and of predictions: sentences, tables and pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from shapespace.cohort.cohort import Cohort, subjects_of
+from shapespace.report.analyses.analysis_report import AnalysisReport, LengthFormat, Rows
+from shapespace.report.analyses.methods_section import methods_parts
+from shapespace.report.analyses.shape_data import add_shape_data, model_hashes
+from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TableColumn, TablePart, TextPart
+from shapespace.statistics.observation_weights import blank_where, weights_of
+from shapespace.statistics.predictor import Predictions, Predictor
+from shapespace.statistics.regression import (
+    SMALL,
+    AccuracyMeasure,
+    RegressionResult,
+    compare_with,
+    permutation_scheme,
+    share_of,
+)
+from shapespace.types import Mesh
+
+_FILE = "regression.npz"
+_MOST_ROWS = 20
+_MEASURE_NAMES = {
+    "r2": "R²", "rmse": "RMSE", "mae": "mean absolute error", "slope": "calibration slope",
+    "intercept": "calibration intercept", "coverage": "coverage of intervals", "width": "width of intervals",
+}  # fmt: skip
+
+
+def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] | None = None) -> AnalysisReport:
+    """Return the answer to what number goes with a shape, with what is predicted of new shapes."""
+    parts: list[Part] = [_measures_part(result), _calibration_part(result)]
+    if new is not None:
+        parts.append(_prediction_part(result.predictor, new[1]))
+    arrays, pictures = _maps_and_morphs(result)
+    tables = {"predictions.csv": _rows(result), "measures.csv": _measure_rows(result)}
+    if new is not None:
+        tables["new.csv"] = _prediction_rows(*new)
+    faces = result.cohort.faces
+    meshes = {
+        f"{name}.ply": Mesh(result.shape_at(at), faces, name=f"{result.target} {at:g}")
+        for name, at in (("low", result.low_at), ("high", result.high_at))
+    }
+    report = AnalysisReport(
+        question="regress",
+        title=f"{result.target} from shape",
+        summary=_summary(result, new),
+        parts=(*parts, *pictures, *methods_parts(result.methods)),
+        tables=tables,
+        arrays={_FILE: arrays},
+        meshes=meshes,
+        notes=(*result.cohort.notes, *(() if new is None else new[0].notes)),
+        settings={
+            "target": result.target, "gauge": result.cohort.gauge, "shapes": len(result.cohort),
+            "subjects": result.n_subjects, "folds": result.folds, "permutations": result.permutations,
+            "level": result.confidence, "choice": result.choice.words(), "seed": result.seed,
+        },
+        model_hashes=model_hashes(result.cohort),
+        methods=result.methods,
+    )  # fmt: skip
+    return add_shape_data(report, result.cohort)
+
+
+def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predictions) -> AnalysisReport:
+    """Return the answer of a predictor that was learned earlier."""
+    report = AnalysisReport(
+        question="regress",
+        title=f"{predictor.target} from shape",
+        summary=(
+            f"{predictor.target} of {len(predictions.names)} shapes, by {predictor.method} of {predictor.subjects} "
+            "subjects.",
+            _outside_sentence(predictor, predictions),
+        ),
+        parts=(_prediction_part(predictor, predictions),),
+        tables={"new.csv": _prediction_rows(cohort, predictions)},
+        notes=cohort.notes,
+        settings={"target": predictor.target, "gauge": predictor.gauge, "level": predictor.confidence},
+        model_hashes=(predictor.model_hash,) if predictor.model_hash else (),
+    )
+    return add_shape_data(report, cohort)
+
+
+def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
+    m, level = result.measures, f"{100 * result.confidence:.0f} %"
+    sentences = [
+        f"Shape predicts {result.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
+        f"({level} interval {_interval_text(m['rmse'])}), beside {result.baseline_rmse:.3g} by the mean alone: "
+        f"R² = {m['r2'].value:.2f} ({_interval_text(m['r2'])})"
+        + ("." if result.p is None else f", p = {result.p:.2g}."),
+        f"{level} intervals are {m['width'].value:.3g} wide on average, and hold {100 * m['coverage'].value:.0f} % of "
+        f"the subjects left out; the observed rises by {m['slope'].value:.2f} ({_interval_text(m['slope'])}) for "
+        "one predicted.",
+        f"The predictor uses {result.choice.words()}, {result.effective:.1f} degrees of freedom for "
+        f"{result.n_subjects} "
+        "subjects.",
+    ]
+    if len(result.cohort) > result.n_subjects:
+        sentences.append(
+            f"{len(result.cohort)} scans of {result.n_subjects} subjects: in means, fit, figures and intervals each "
+            "scan "
+            "has the weight 1 / number of scans of its subject."
+        )
+    if result.p is not None:
+        sentences.append(permutation_scheme(result.subjects, result.observed))
+    if result.small:
+        sentences.insert(1, f"{result.n_subjects} subjects are a small sample (fewer than {SMALL}): another would "
+                            "give other figures, within the intervals stated.")  # fmt: skip
+    if new is not None:
+        cohort, predictions = new
+        sentences.append(
+            f"{len(predictions.names)} new shapes are predicted. {_outside_sentence(result.predictor, predictions)}"
+        )
+        observed = _observed_target(cohort, result.target)
+        if observed is not None and len(observed) > 1:
+            column = result.subject if result.subject in cohort.table.columns else None
+            r2, rmse, coverage = compare_with(predictions, observed, share_of(subjects_of(cohort, column)))
+            sentences.append(
+                f"Their {result.target} is known: RMSE {rmse:.3g}, R² {r2:.2f}, and {100 * coverage:.0f} % lie in the "
+                f"{level} intervals."
+            )
+    return tuple(sentences)
+
+
+def _outside_sentence(predictor: Predictor, predictions: Predictions) -> str:
+    outside = [name for name, reason in zip(predictions.names, predictions.outside, strict=True) if reason]
+    if not outside:
+        return "All lie within what was learned from."
+    return f"{len(outside)} of {len(predictions.names)} lie outside what was learned from ({outside[0]}: " + (
+        f"{next(reason for reason in predictions.outside if reason)}), and what is predicted of them is a guess."
+    )
+
+
+def _interval_text(measure: AccuracyMeasure) -> str:
+    return f"{measure.low:.3g} to {measure.high:.3g}"
+
+
+def _observed_target(cohort: Cohort, target: str) -> Any:
+    """Return the target of new shapes where all of them have it, else None."""
+    if target not in cohort.table.columns:
+        return None
+    values = cohort.table.numbers(target)
+    return None if np.isnan(values).any() else values
+
+
+def _measures_part(result: RegressionResult) -> TablePart:
+    level = f"{100 * result.confidence:.0f} %"
+    numbers = (TableColumn(name=name, kind="number") for name in ("value", "low", "high"))
+    columns = (TableColumn(name="measure"), *numbers)
+    rows: list[tuple[object, ...]] = []
+    for name, measure in result.measures.items():
+        rows.append((_MEASURE_NAMES[name], *(_finite_or_none(v) for v in (measure.value, measure.low, measure.high))))
+        if name in ("rmse", "mae"):
+            rows.append((f"{_MEASURE_NAMES[name]} of the mean alone", getattr(result, f"baseline_{name}"), None, None))
+    if result.p is not None:
+        rows.append(("p of R², by permutation", result.p, None, None))
+    return TablePart(
+        title="On subjects left out", columns=columns, rows=tuple(rows),
+        note=f"Nested cross-validation in {result.folds} folds of subjects, each of whom counts once; {level} "
+        "intervals by bootstrap of subjects.",
+    )  # fmt: skip
+
+
+def _measure_rows(result: RegressionResult) -> Rows:
+    return ("measure", "value", "low", "high"), [(n, m.value, m.low, m.high) for n, m in result.measures.items()]
+
+
+def _calibration_part(result: RegressionResult) -> CurvePart:
+    order = np.argsort(result.predicted, kind="stable")
+    x = result.predicted[order]
+    slope, intercept = result.measures["slope"].value, result.measures["intercept"].value
+    ends = np.array([x[0], x[-1]])
+    rows = Series(x=tuple(x.tolist()), y=tuple(result.observed[order].tolist()), label="subjects left out", points=True)
+    line = Series(x=tuple(ends.tolist()), y=tuple((intercept + slope * ends).tolist()), label="observed on predicted")
+    return CurvePart(
+        title="Calibration", series=(rows, line) if np.isfinite(slope) else (rows,), x=f"{result.target} predicted",
+        y=f"{result.target} observed", diagonal=True,
+    )  # fmt: skip
+
+
+def _maps_and_morphs(result: RegressionResult) -> tuple[dict[str, Any], list[Part]]:
+    low, high = result.shape_at(result.low_at), result.shape_at(result.high_at)
+    blank = weights_of(result.cohort.observed_share) == 0
+    arrays: dict[str, Any] = {"low": low, "high": high, "vertices": (low + high) / 2.0}
+    arrays["per_unit_mm"] = blank_where(result.map, blank)
+    if result.cohort.faces is None:
+        return arrays, []
+    arrays["faces"] = result.cohort.faces
+    return arrays, [
+        MorphPart(
+            title=f"The shape that goes with {result.target}", arrays=_FILE,
+            low_label=f"{result.target} {result.low_at:.3g}", high_label=f"{result.target} {result.high_at:.3g}",
+            note="The mean shape at the 5th and the 95th percentile, by regression of shape on the number.",
+        ),
+        SurfaceMapPart(
+            title=f"Change of shape for one unit of {result.target}", arrays=_FILE, values="per_unit_mm",
+            unit=LengthFormat(result.cohort.unit).of_map,
+            note="Along the normals of the mean; shapespace compare tests where this is more than chance.",
+        ),
+    ]  # fmt: skip
+
+
+def _rows(result: RegressionResult) -> Rows:
+    header = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
+    columns = (result.observed, result.predicted, result.low, result.high, result.baseline)
+    return header, [
+        (name, result.subjects[k], *(float(column[k]) for column in columns))
+        for k, name in enumerate(result.cohort.names)
+    ]
+
+
+def _prediction_rows(cohort: Cohort, predictions: Predictions) -> Rows:
+    return ("scan", "predicted", "low", "high", "outside"), [
+        (
+            name,
+            float(predictions.value[k]),
+            float(predictions.low[k]),
+            float(predictions.high[k]),
+            predictions.outside[k],
+        )
+        for k, name in enumerate(cohort.names)
+    ]
+
+
+def _prediction_part(predictor: Predictor, predictions: Predictions) -> Part:
+    level = f"{100 * predictor.confidence:.0f} %"
+    columns = (
+        TableColumn(name="scan"), TableColumn(name="predicted", kind="number"), TableColumn(name="low", kind="number"),
+        TableColumn(name="high", kind="number"), TableColumn(name="outside"),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            predictions.names[k],
+            float(predictions.value[k]),
+            float(predictions.low[k]),
+            float(predictions.high[k]),
+            predictions.outside[k],
+        )
+        for k in range(min(_MOST_ROWS, len(predictions.names)))
+    )
+    if not rows:
+        return TextPart(title="New shapes", text="There are none.")
+    return TablePart(
+        title=f"{predictor.target} of new shapes", columns=columns, rows=rows,
+        note=f"With {level} intervals; all of them stand in new.csv.",
+    )  # fmt: skip
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

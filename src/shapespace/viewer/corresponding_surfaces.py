@@ -1,0 +1,150 @@
+"""Data of the viewer's page of corresponding surfaces: single surfaces, and the position of a vertex on all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.io.tables.table_io import table_text
+from shapespace.report.blocks.wording import without_folders
+from shapespace.report.inputs.correspondence_folder import Corresponded
+from shapespace.report.inputs.triage import Concern, concerns_of, distance_share, scan_status, sentence
+from shapespace.report.render import palette as colours
+from shapespace.report.render.checkerboard import SQUARES, checker_places
+from shapespace.report.render.scene import pack, quantised
+from shapespace.version import __version__
+
+MAX_MARKED = 100
+"""Vertices whose positions can be asked for at a time."""
+
+_PAGE, _PAGE_BYTES = 11, 24 * 2**20
+_BYTES_PER_VERTEX = 6
+_STATUS_ORDER = ("unreadable", "set aside", "look", "corresponding")
+
+
+class Surfaces:
+    """A folder in correspondence for the page.
+
+    Args:
+        folder: that `shapespace correspond` wrote.
+
+    Raises:
+        FileError: correspondence.json or the mean shape cannot be read.
+        FileFormatError: one of them is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._corresponded = Corresponded(folder)
+        self._lock = Lock()
+        self._packed_mean: bytes | None = None
+        self.packed_surface = lru_cache(maxsize=2 * _PAGE)(self._pack_surface)
+
+    def about(self) -> dict[str, Any]:
+        """Return the counts and colours that the page needs first, without reading surfaces."""
+        run = self._corresponded.run
+        page = _PAGE_BYTES // (_BYTES_PER_VERTEX * max(len(self._corresponded.mean.vertices), 1))
+        return {
+            "version": __version__,
+            "name": self._corresponded.root.resolve().name,
+            "scans": len(self._corresponded.records) + len(self._corresponded.unread),
+            "corresponding": len(self._corresponded.corresponding),
+            "vertices": len(self._corresponded.mean.vertices),
+            "rounds": list(run.rounds),
+            "page": max(1, min(_PAGE, page)),
+            "most_marked": MAX_MARKED,
+            "clay": colours.CLAY,
+            "unknown_colour": colours.UNKNOWN_COLOUR,
+            "sequential": colours.as_list(colours.SEQUENTIAL),
+            "squares": SQUARES.round(3).tolist(),
+            "marks": [list(colour) for colour in colours.CATEGORIES],
+        }
+
+    def packed_mean(self) -> bytes:
+        """Return the mean shape, upright, its checkerboard, and the number of scans that show each vertex."""
+        with self._lock:
+            if self._packed_mean is None:
+                self._packed_mean = self._pack_mean()
+            return self._packed_mean
+
+    def _pack_mean(self) -> bytes:
+        population = self._corresponded.population()
+        mean = self._corresponded.mean
+        along, across = checker_places(mean)
+        arrays = {
+            "positions": mean.vertices,
+            "faces": np.asarray(mean.faces, dtype=np.uint32),
+            "places": np.stack([along, across], axis=1),
+            "seen": population.seen_count.astype(np.int32),
+        }
+        return pack(arrays, {"scans": len(population.names)})
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the list of scans, those with concerns first."""
+        with self._lock:
+            population = self._corresponded.population()
+        concerns = concerns_of(self._corresponded)
+        sizes = dict(zip(population.names, population.sizes.tolist(), strict=True))
+        rows: list[dict[str, Any]] = [
+            {"name": name, "status": "unreadable", "reason": self.public(reason), "weight": 0.0, "distance": None}
+            for name, reason in self._corresponded.unread.items()
+        ]
+        for name, record in self._corresponded.records.items():
+            status = scan_status(record, concerns)
+            reason = record.reason or population.unread.get(name) or concerns.get(name, Concern()).told
+            share = distance_share(record, "mean", sizes[name]) if name in sizes else math.nan
+            rows.append(
+                {
+                    "name": name,
+                    "status": status,
+                    "reason": self.public(sentence(reason)),
+                    "weight": concerns.get(name, Concern()).weight,
+                    "distance": share if math.isfinite(share) else None,
+                    "seen": record.seen_share,
+                }
+            )
+        return sorted(rows, key=lambda row: (_STATUS_ORDER.index(row["status"]), -row["weight"], row["name"]))
+
+    def _pack_surface(self, name: str) -> bytes:
+        """Return the surface of the scan `name`, moved onto the mean shape.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged.
+            KeyError: there is no such scan in correspondence.
+        """
+        if self._corresponded.records[name].status != "corresponding":
+            raise KeyError(name)
+        with self._lock:
+            self._corresponded.population()
+        vertices = self._corresponded.placed(name).vertices
+        return pack({"positions": quantised(vertices, coded=True)}, {"name": name})
+
+    def positions_csv(self, vertices: Sequence[int]) -> str:
+        """Return a CSV of the positions of `vertices` on every scan, in its own frame and unit; empty where missing.
+
+        Raises:
+            InputError: a number is not that of a vertex, or there are too many.
+        """
+        count = len(self._corresponded.mean.vertices)
+        if not 0 < len(vertices) <= MAX_MARKED or not all(0 <= vertex < count for vertex in vertices):
+            raise InputError(f"Give 1 to {MAX_MARKED} numbers of vertices, each from 0 to {count - 1}.")
+        rows: list[tuple[object, ...]] = []
+        for record in self._corresponded.corresponding:
+            try:
+                points = self._corresponded.surface(record.name).vertices[list(vertices)]
+            except ShapespaceError:
+                points = np.full((len(vertices), 3), np.nan)
+            for vertex, point in zip(vertices, points.tolist(), strict=True):
+                rows.append((record.name, vertex, *(value if math.isfinite(value) else "" for value in point)))
+        return table_text(("scan", "vertex", "x", "y", "z"), rows)
+
+    def public(self, sentence: str) -> str:
+        """Return `sentence` without the folders of this machine."""
+        return without_folders(sentence)
